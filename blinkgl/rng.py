@@ -1,8 +1,8 @@
-"""Where every random number comes from.
+"""The source of every random number.
 
-One run has one integer seed (0 is a seed like any other). Each sequence and each role in it gets an
-independent child stream, so that adding a draw in one role moves nothing in another and sequence 17 is the
-same whether or not sequences 0-16 were made in this run, by this worker, or at all.
+One run has one integer seed (0 is valid). Each sequence and each role in it gets an independent child stream. So an
+additional draw in one role changes no other role, and sequence 17 is the same whether or not sequences 0-16 were made
+in this run, by this worker, or at all.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ class Role(IntEnum):
 
 
 def seed_sequence(seed: int, sequence: int, role: Role, sensor: int = 0) -> np.random.SeedSequence:
-    """Child of ``seed`` keyed by (sequence, role), and by the number of a rig's sensor beyond the first, which is as a
-    single camera; independent of any other child drawn before it."""
+    """Return the child of ``seed`` for (sequence, role), and for the number of a rig's sensor after the first, which
+    has the stream of a single camera. It does not depend on children drawn before."""
     return np.random.SeedSequence(seed, spawn_key=(int(sequence), int(role), *((int(sensor),) if sensor else ())))
 
 
 def generator(seed: int, sequence: int, role: Role, sensor: int = 0) -> np.random.Generator:
-    """PCG64 generator on :func:`seed_sequence`."""
+    """Return a PCG64 generator on :func:`seed_sequence`."""
     return np.random.default_rng(seed_sequence(seed, sequence, role, sensor))
 
 
 def kernel_seed(seed: int, sequence: int, role: Role, sensor: int = 0) -> int:
-    """64-bit key for the counter-based generators inside numba kernels."""
+    """Return a 64-bit key for the counter-based generators inside numba kernels."""
     return int(seed_sequence(seed, sequence, role, sensor).generate_state(1, np.uint64)[0])

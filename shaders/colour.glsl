@@ -1,7 +1,7 @@
 #version 430 core
 // Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED,
 // LIGHTS, HUED, TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
-// SHOW_LOOKUP, the shader debugger's: also writes what was looked up, see lookup.glsl.
+// SHOW_LOOKUP, for the shader debugger: also writes the texture lookups, see lookup.glsl.
 
 #include "needs.glsl"
 #include "vertex.glsl"
@@ -48,7 +48,7 @@ void main()
 #ifdef TINTED
     radiance *= tint;
 #endif
-// The light on the surface: of surface.glsl (below), of the vertex stage, of light.glsl, or none.
+// The light on the surface: from surface.glsl (below), from the vertex stage, from light.glsl, or none.
 #ifdef SURFACED
     float side = SIDE;
 #elif defined(LIT_AT_CORNERS)
@@ -58,7 +58,7 @@ void main()
 #else
     const float light = 1.0;
 #endif
-    vec3 added = vec3(0.0); // to what goes through the albedo
+    vec3 added = vec3(0.0); // light that is not multiplied by the albedo
 #ifdef SURFACED
 #ifdef BUMPED
     vec4 along = tangent;
@@ -68,7 +68,7 @@ void main()
 #ifndef NEEDS_UV
     const vec2 uv = vec2(0.0);
 #endif
-// radiated() gives everything; what goes through the albedo is taken off again and multiplied at the end.
+// radiated() returns the sum; the part for the albedo is subtracted and multiplied at the end.
 #ifdef GLOSSY
     Spot spot = Spot(radiance, normal, along, local, uv);
     added = radiated(spot, side);
@@ -89,7 +89,7 @@ void main()
     added += emission;
 #endif
 #endif
-// For the shader debugger alone: the terms of the light, in the luminance of what they fall on.
+// Only for the shader debugger: the terms of the light, as luminance on this surface.
 #ifdef SHOW_LOOKUP
 #ifndef LIT
     const float shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;

@@ -1,7 +1,7 @@
 #version 430 core
-// The shader debugger's own pass (blinkgl/shader_debugger): which primitive wrote the pixel, and where on it.
-// Generation never asks for this program. It repeats the vertex stage of luminance.glsl and label.glsl, so that it
-// covers the same fragments. What those look up and compute on the way they show themselves: see include/lookup.glsl.
+// The pass of the shader debugger (blinkgl/shader_debugger): the primitive that wrote the pixel, and the place on it.
+// Generation does not use it. It repeats the vertex stage of luminance.glsl and label.glsl, so that it covers the same
+// fragments. Those programs show their own lookups and intermediate values: see include/lookup.glsl.
 //
 //   OUT_TRIANGLE  gl_PrimitiveID + 1 within the part (0: nothing hit)
 //   OUT_LOCAL     object-local position, part number + 1

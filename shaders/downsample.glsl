@@ -9,7 +9,7 @@ uniform sampler2D fine;
 
 void main()
 {
-    // Texels of the fine picture that this pixel is the mean of; texelFetch, so that no filter adds neighbours.
+    // Texels of the fine picture for this pixel; texelFetch, so that no filter adds neighbours.
     ivec2 corner = ivec2(gl_FragCoord.xy) * FACTOR;
     vec4 sum = vec4(0.0);
     for (int y = 0; y < FACTOR; ++y)

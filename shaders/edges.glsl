@@ -1,21 +1,20 @@
 #version 430 core
-// Silhouettes and creases of a picture that has one sample a pixel, as the pixels would have them that take the mean of
-// their whole squares.
+// Silhouettes and creases of a picture with one sample per pixel: pixels on them get the mean over their square.
 //
-// A pixel's centre is inside of a surface or not: 1 or 0, where the mean over its square is a share in between. Their
-// difference is a sum over the lines that bound the surface: each adds the area that lies between it and the square's
-// own boundary as seen from the centre, signed. So corners, ends of lines and surfaces that are narrower than a pixel
-// come out right, whatever the order of the lines.
+// A pixel's centre is inside a surface or not: 1 or 0, while the mean over its square is a share in between. Their
+// difference is a sum over the lines that bound the surface: each adds the area between it and the square's own
+// boundary as seen from the centre, signed. So corners, ends of lines and surfaces narrower than a pixel are correct,
+// for any order of the lines.
 //
 // An outline of triangles smaller than a pixel is a zigzag: some of its lines run back, and their shares cancel those
-// of others. So all lines of a pixel have to mean the same two surfaces by "in front" and "behind", whichever way they
-// run: those that the depth buffer shows around the pixel, before and behind the line's depth.
+// of others. So all lines of a pixel must use the same two surfaces as "in front" and "behind", in either direction:
+// those that the depth buffer shows around the pixel, before and behind the line's depth.
 //
-// Which lines cross which pixels, and with what share, is known before (contours.py). Here is one vertex, and one
-// point, for each pixel that has any: the pixels around it are looked at once, whatever the number of lines.
+// contours.py computes which lines cross which pixels, and their shares. Here one vertex and one point are drawn for
+// each crossed pixel, so that its neighbours are read once for any number of lines.
 //
-// LIGHT: the type of what a pixel shows, OF: its components in the picture. The sum is held to 0, since what
-// lines of different surfaces do not know of each other may take more away than there is.
+// LIGHT: the type of a pixel's value, OF: its components in the picture. The sum is at least 0, because lines of
+// different surfaces may together subtract more than there is.
 
 #ifndef LIGHT
 #define LIGHT vec4
@@ -23,7 +22,7 @@
 #endif
 
 #ifdef VERTEX_SHADER
-in ivec4 in_pixel; // its place; the first of its crossings and the one after the last
+in ivec4 in_pixel; // its position; the first of its crossings and the one after the last
 flat out vec4 light;
 
 uniform vec2 image_size;
@@ -32,9 +31,9 @@ uniform sampler2D picture;
 uniform sampler2D depths;
 uniform sampler2D crossings;
 
-// By how much depths (near / Z) differ, in parts. The first two in widths of a pixel where the surface is, since a body
-// of some pixels is round by some: what is farther than GAP lies behind; what is nearer than COVER hides the line,
-// unless the pixel's centre is on its surface, which may come nearer by SAME. NEARER: where nothing is clearly behind.
+// Relative differences of depth (near / Z). The first two are in widths of a pixel at the surface, because a body of a
+// few pixels is curved by that much: farther than GAP lies behind; nearer than COVER hides the line, unless the pixel's
+// centre is on its surface, which may be nearer by SAME. NEARER: where nothing is clearly behind.
 const float GAP = 3.0;
 const float COVER = 6.0;
 const float SAME = 0.25;
@@ -42,7 +41,7 @@ const float NEARER = 0.001;
 const float DIAGONAL = 0.25; // weight of a pixel that touches at a corner
 const int ALONG = 12; // px, less one
 const float SNAP = 1.0 / 128.0; // px: rasterisers place corners on a grid of 1/256
-// Of sums of shares: up to FEW they are those of an outline, a wire, a corner or a fold; from MANY on a tangle.
+// Sums of shares: up to FEW they belong to an outline, a wire, a corner or a fold; from MANY on to a tangle.
 const float FEW = 1.4;
 const float MANY = 2.0;
 const int ROW = 512; // crossings in a row of their texture
@@ -77,8 +76,8 @@ void main()
     }
     LIGHT plain = seen[4], change = LIGHT(0.0);
     float own = there[4];
-    // Sums of the silhouettes' shares and their sizes; of the creases' shares, the ways to their other sides, and the
-    // sizes of those that are no seams.
+    // Sums of the silhouettes' shares and their sizes; of the creases' shares, the directions to their other sides, and
+    // the sizes of those that are not seams.
     float shares = 0.0, sizes = 0.0, creases = 0.0, bent = 0.0;
     vec2 towards = vec2(0.0);
 
@@ -94,7 +93,8 @@ void main()
         bool crease = kind > 0.5, seam = kind > 1.5, back_again = kind < -0.5;
 
         if (crease) {
-            // Or something else is there. Seams are those of small parts of bent bodies, and near what is behind them.
+            // Otherwise the pixel shows something else. Seams are those of small parts of bent bodies, near what is
+            // behind them.
             if (own <= depth * (1.0 + COVER * pixel) && own >= depth * (1.0 - (seam ? GAP * pixel : SAME))) {
                 creases += share;
                 towards += share * left;
@@ -107,8 +107,7 @@ void main()
         vec2 inwards = back_again ? -left : left;
         bool on_left = room > 0.0, inside = back_again != on_left;
         float behind = depth * (1.0 - GAP * pixel), before = depth * (1.0 + SAME);
-        // Of a plane that ends at the horizon the depth beside the line is another one altogether; continued, it is the
-        // line's.
+        // Of a plane that ends at the horizon the depth beside the line differs much; extrapolated, it is the line's.
         ivec2 aside = ivec2(round(1.2 * inwards)), to_front = inside ? here : here + aside;
         float front_depth = depth_at(to_front), within = depth_at(inside_picture(to_front) + aside);
         float reached = front_depth + (front_depth - within) * clamp(inside ? abs(room) : 1.0 - abs(room), 0.0, 1.0);
@@ -126,7 +125,7 @@ void main()
             in_front += near ? weight : 0.0;
         }
         bool known;
-        // Something behind the line is seen around the pixel: the picture has a step here.
+        // Something behind the line is visible around the pixel: the picture has a step here.
         if (at_back > 0.0) {
             if (own > (inside ? before : depth * (1.0 + COVER * pixel)))
                 continue; // something else hides the line
@@ -137,11 +136,11 @@ void main()
             else if (known)
                 front = fronts / in_front;
         } else {
-            // Two surfaces that meet or nearly so: those to the line's left and right. What lies behind it, continued
-            // as a plane to the line, is not nearer. (A floor that a body stands on is nearer beside it.)
+            // Two surfaces that meet or nearly so: to the line's left and right. The one behind, extrapolated as a
+            // plane to the line, is not nearer. (A floor under a body is nearer beside it.)
             ivec2 to_back = here - aside;
             float back_depth = depth_at(to_back);
-            if (abs(room) < SNAP) { // what was drawn there decides
+            if (abs(room) < SNAP) { // the drawn value decides
                 front_depth = depth_at(here + aside);
                 inside = abs(own - front_depth) < abs(own - back_depth);
                 to_front = inside ? here : here + aside;
@@ -161,7 +160,7 @@ void main()
             front = seen_at(to_front);
             back = seen_at(to_back);
         }
-        // Where it is narrower than a pixel the surface may be between all centres around, and seen further along.
+        // A surface narrower than a pixel may be between all centres around, and visible further along.
         if (!known) {
             vec2 onwards = vec2(left.y, -left.x) / max(abs(left.x), abs(left.y));
             for (int k = 0; k < 2 * ALONG && !known; ++k) {
@@ -175,7 +174,7 @@ void main()
         }
         if (!known)
             continue;
-        // A centre on the line is to its left where the surface that it shows is.
+        // A centre on the line is to its left where its visible surface is.
         if (abs(room) < SNAP && on_left != (back_again != inside)) {
             on_left = !on_left;
             float least = turn - 8.0 * round(turn / 8.0), other = least;
@@ -189,21 +188,21 @@ void main()
         sizes += abs(share);
     }
 
-    // A surface that is folded within the pixel covers parts of it twice: more than the whole is the whole. Where it
-    // covers the centre twice the sum starts from two.
+    // A surface folded within the pixel covers parts of it twice: limit to the whole. Where it covers the centre twice
+    // the sum starts from two.
     float whole = 1.0;
     if (shares < -1.0)
         whole = max(shares + 1.0, -1.0) / shares;
     else if (shares > 1.0)
         whole = 1.0 / shares;
     LIGHT result = plain + change * whole;
-    // What is rough by less than a pixel has too many layers there to know how many hide the centre: a mean of them.
+    // A surface rough below a pixel has too many layers to count those over the centre: use their mean.
     LIGHT around = LIGHT(0.0);
     for (int k = 0; k < 9; ++k)
         around += (k == 4 ? 0.25 : k % 2 == 1 ? 0.125 : 0.0625) * seen[k];
     result = mix(result, around, smoothstep(FEW, MANY, sizes));
 
-    // Of a crease the centre shows the one side: the other has the sum's share, whatever its sign.
+    // Of a crease the centre shows one side: the other has the sum's share, with either sign.
     if (towards != vec2(0.0)) {
         float weights = 0.0, level = (bent > 0.0 ? SAME : COVER * pixel) * own;
         LIGHT others = LIGHT(0.0);

@@ -1,15 +1,15 @@
 #version 430 core
-// A lens's picture out of a flat one (blinkgl/render/lens.py): what of the flat picture is nearest to each pixel's ray,
-// or (SMOOTH) its mean over the pixel.
+// A lens's picture from the pinhole picture (blinkgl/render/lens.py): the value nearest to each pixel's ray, or
+// (SMOOTH) the mean over the pixel.
 //
 // SAMPLER_k, TEXEL_k   types of the k-th output, its sampler's and its own
-// COLUMNS, ROWS        SMOOTH: places in a pixel. Counts that a pixel finds for itself cost five times as much.
+// COLUMNS, ROWS        SMOOTH: samples per pixel. Numbers computed per pixel would cost five times as much.
 
 #include "cover.glsl"
 
 #ifdef FRAGMENT_SHADER
-uniform sampler2D places;   // where each pixel's centre is in the flat picture, px from its corner
-uniform vec2 flat_size;     // px of the flat picture in which places are
+uniform sampler2D places;   // position of each pixel's centre in the pinhole picture, px from its corner
+uniform vec2 flat_size;     // size, px, of the pinhole picture that places refer to
 #ifdef SMOOTH
 uniform sampler2D slopes;   // d(place) / d(px), columns
 #endif
@@ -43,13 +43,13 @@ PICKED(7, SAMPLER_7, TEXEL_7)
 
 void main()
 {
-    // Places are px of the flat picture; its target may have more samples than that.
+    // Places are px of the pinhole picture; its target may have more samples.
     ivec2 pixel = ivec2(gl_FragCoord.xy);
     vec2 size = vec2(textureSize(picked_0, 0)), scale = size / flat_size;
     vec2 place = texelFetch(places, pixel, 0).xy * scale;
 #ifdef SMOOTH
-    // As many places as a pixel has pixels of the flat picture where it has most, each between the four around it: what
-    // every one of them has of the pixel's area.
+    // As many samples as a pixel has pixels of the pinhole picture at most, each interpolated between four pixels, so
+    // that each of those gets its share of the pixel's area.
     vec4 slope = texelFetch(slopes, pixel, 0);
     vec2 right = slope.xy * scale, down = slope.zw * scale;
     vec4 sum = vec4(0.0);

@@ -1,13 +1,12 @@
 #version 430 core
-// Label pass: any subset of the labels that the shader draws, in one go. The renderer defines OUT_<NAME> as the
-// attachment number of each label that somebody asks for; the others do not exist. What a label writes stands in
-// include/labels/<name>.glsl, or with its row (blinkgl/labels); the includes labels_need.glsl and labels.glsl are made
-// from the table of labels (blinkgl/labels/shader.py).
+// Label pass: any subset of the shader's labels at once. The renderer defines OUT_<NAME> as the attachment number of
+// each requested label. include/labels/<name>.glsl, or the label's row (blinkgl/labels), computes a label; the includes
+// labels_need.glsl and labels.glsl are generated from the table of labels (blinkgl/labels/shader.py).
 //
-// A label is a function label_<name>(), which may look at
+// A label is a function label_<name>(), which may use
 //   local        object-local position, and uniform vec2 image_size (include/image_size.glsl), px of the target
 //   facing()     normal in the object's axes, on the camera's side, not normalised
-//   INVERSE_DEPTH, FRAGMENT_XY   gl_FragCoord.w and .xy of the ray that is looked along (include/along_ray.glsl)
+// INVERSE_DEPTH, FRAGMENT_XY   gl_FragCoord.w and .xy of the ray through the fragment (include/along_ray.glsl)
 // TWO_SIDED: as in luminance.glsl.
 
 #include "labels_need.glsl"

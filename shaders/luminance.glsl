@@ -1,24 +1,24 @@
 #version 430 core
-// Event pass: linear luminance into one R32F target, nothing else (the event kernel takes the logarithm).
+// Event pass: linear luminance into one R32F target (the event kernel takes the logarithm).
 //
 // Variants   TEXTURED   albedo luminance from a one-channel texture, else the uniform alone
 //            LIT        Lambert, of the light of light.glsl: a white sun and sky; else unlit
 //            TAPS4      four texture lookups per pixel instead of one, each one mip level finer
-//            STRETCHED  with TAPS4: they lie along the way in which the surface is foreshortened
+//           STRETCHED  with TAPS4: the taps lie along the direction of foreshortening
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
 //                       pixels
 //            FOG        seen through fog, see fog.glsl
-//            LIGHTS     more light than that, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
-//                       luminance, since coloured light takes of each as much as it has
+//           LIGHTS     other lights, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
+//                       luminance, because coloured light scales each channel separately
 //            TINTED     times the vertices' colours
-//            EMISSIVE   light of its own, EMISSION_MAP: from a texture of its luminance
+//           EMISSIVE   emitted light, EMISSION_MAP: from a texture of its luminance
 //            GLOSSY, BUMPED, GLOSS_MAP   see surface.glsl
 //            MASKED     has holes, see vertex.glsl
-//            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
+//           SHOW_LOOKUP  for the shader debugger: also writes the texture lookups, see lookup.glsl
 
-// CHANGES: the surface's own look differs from pixel to pixel, so that its motion changes the luminance.
+// CHANGES: the surface varies from pixel to pixel, so that its motion changes the luminance.
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG) || defined(TINTED))
 #define CHANGES
 #endif
@@ -38,7 +38,7 @@
 #ifdef HUED
 #define ALBEDO vec3
 #define CHANNELS rgb
-#define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // of the luminance, Rec. 709, which the albedo has in it
+#define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // weights of the luminance, Rec. 709
 #else
 #define ALBEDO float
 #define CHANNELS r
@@ -81,7 +81,7 @@ uniform ALBEDO albedo;
 #ifdef HUED
 #define TINT(colour) colour
 #else
-uniform vec3 tint_shares; // of r, g and b in the luminance of what is tinted
+uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface
 #define TINT(colour) dot(colour, tint_shares)
 #endif
 #endif
@@ -109,8 +109,8 @@ void main()
 #ifdef TEXTURED
 #ifdef TAPS4
 #ifdef STRETCHED
-    // The longer way of the pixel over the surface, and the shorter: four taps in a square where they are alike, in a
-    // row along the longer one where the surface is seen at a grazing angle; each of the level that fits.
+    // The longer and the shorter side of the pixel on the surface: four taps in a square where they are similar, in a
+    // row along the longer one at a grazing angle; each with the level that fits.
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv), texels = vec2(textureSize(albedo, 0));
     float across = dot(right * texels, right * texels), along = dot(down * texels, down * texels);
     if (across > along) {
@@ -123,7 +123,7 @@ void main()
     }
     float row = clamp(along / max(4.0 * across, 1e-3 * along + 1e-20) - 0.5, 0.0, 1.0);
     right = mix(right, 0.5 * down, row);
-    // Squares of the spacing of the taps over the surface, two and one texel apart: half of log2 is the level.
+    // Squares of the spacing of the taps on the surface, two texels and one texel: half of log2 is the level.
     float level = 0.5 * log2(max(mix(4.0 * along, max(along, 16.0 * across), row), 1e-30));
     ALBEDO luminance = 0.25 * (textureLod(albedo, uv - right - down, level).CHANNELS
                              + textureLod(albedo, uv + right - down, level).CHANNELS
@@ -139,7 +139,7 @@ void main()
                              + texture(albedo, uv + right + down, -1.0).CHANNELS);
 #endif
 #elif defined(EVERY)
-    // Neighbours in the target are n px of the image apart; the level is chosen as if they were one.
+    // Neighbours in the target are n px of the image apart; the level is chosen as for one.
     ALBEDO luminance = texture(albedo, uv, -log2(every)).CHANNELS;
 #else
     ALBEDO luminance = texture(albedo, uv).CHANNELS;
@@ -150,7 +150,7 @@ void main()
 #ifdef RATE
     ALBEDO change = ALBEDO(0.0);
 #endif
-// How the albedo changes: the texture slides by with the image motion.
+// Rate of the albedo: the texture slides by with the image motion.
 #ifdef CHANGES
     vec2 motion = velocity(rate, local, image_size);
 #ifdef TEXTURED
@@ -183,7 +183,7 @@ void main()
     map_bias = -log2(every);
 #endif
 #ifdef CHANGES
-    // L of the surface as a whole, a little before and after.
+    // L of the whole surface, a little before and after.
     vec3 turn_rate = seen_rate(normal, motion), local_rate = seen_rate(local, motion);
     Spot spot_change = Spot(change / WEIGHTS, turn_rate, vec4(0.0), local_rate, vec2(0.0));
 #ifdef BUMPED
@@ -214,8 +214,8 @@ void main()
     vec3 facing = TURNED(normal);
     ILLUMINANT light = irradiance(facing);
 #ifdef CHANGES
-    // L = albedo E(n): the product rule. ``luminance`` is still the albedo here, and the normal seen changes as the
-    // surface slides by.
+    // L = albedo E(n): the product rule. ``luminance`` is still the albedo here, and the visible normal changes as
+    // the surface slides by.
     vec3 facing_rate = seen_rate(facing, motion);
 #ifdef DEFORM
     // and as the surface itself turns
@@ -239,7 +239,7 @@ void main()
 #endif
 #endif
 #ifdef HUED
-    // The albedo has the luminance's weights in it.
+    // The albedo includes the luminance's weights.
     float seen = luminance.r + luminance.g + luminance.b;
 #ifdef RATE
     float seen_change = change.r + change.g + change.b;
@@ -250,7 +250,7 @@ void main()
     float seen_change = change;
 #endif
 #endif
-// Light of its own goes through no albedo.
+// Emitted light is not multiplied by the albedo.
 #ifdef EMISSIVE
 #ifdef EMISSION_MAP
     vec2 emission_uv = emission_map_place * vec3(uv, 1.0);
@@ -262,7 +262,7 @@ void main()
     float own = emission;
 #endif
 #endif
-// For the shader debugger alone: the terms of the light, in the luminance of what they fall on.
+// Only for the shader debugger: the terms of the light, as luminance on this surface.
 #ifdef SHOW_LOOKUP
 #ifdef SURFACED
     ILLUMINANT light = shown_matt;

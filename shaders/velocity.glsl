@@ -1,7 +1,7 @@
 #version 430 core
-// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture of
-// the image, whose pixels are image_scale px of the image apart; velocity is still the image's. LENS: it is that of the
-// picture of a lens.
+// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture
+// whose pixels are image_scale px of the image apart; velocity is still the image's. LENS: it is that of a lens's
+// picture.
 
 #define NEEDS_LOCAL
 #define NEEDS_RATE
@@ -20,7 +20,7 @@ uniform vec2 image_scale;
 void main()
 {
     image_velocity = velocity(rate, local, image_size);
-// motion.glsl takes image_size as the target's: from px of the small picture to px of the image.
+// motion.glsl uses the target's image_size: convert px of the small picture to px of the image.
 #if defined(SMALL) && !defined(LENS)
     image_velocity *= image_scale;
 #endif

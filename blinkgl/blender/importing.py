@@ -1,10 +1,10 @@
-"""Scenes of Blender and of the formats it reads, as a GLB.
+"""Import of Blender's scenes, and of the formats it reads, as a GLB.
 
     came = import_scene("shop.blend", "shop.glb")
-    came.counts, came.left_out                      # what came, and what could not
+    came.counts, came.left_out                      # what was imported, and what was not
 
-Blender opens the file in a process of its own (:mod:`blinkgl.blender.process`) and exports it by its own exporter of
-glTF, modifiers applied; the GLB is read back by BlinkGL's own importer before it gets its name.
+Blender opens the file in a separate process (:mod:`blinkgl.blender.process`) and exports it with its own exporter of
+glTF, modifiers applied. BlinkGL's own importer reads the GLB back before it gets its final name.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ _FRAME = 1_048_574  # Blender's own limit of frame numbers
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import brought.
+    """The result of an import.
 
-    blender : version.   counts : of what is in the GLB (meshes, triangles …).   left_out : what is not, a line each.
-    cameras : names; camera : the scene's own, None without.
+    blender : version.   counts : of the GLB's contents (meshes, triangles …).   left_out : what is missing, a line
+    each.
+    cameras : names; camera : the scene's active one, None without.
     size : (width, height) px of its render.   frames : (first, last) of the file.   fps : of the file.
-    duration_s : of the animation.   omissions : what BlinkGL does not draw of the GLB, a line each.
+    duration_s : of the animation.   omissions : parts of the GLB that BlinkGL does not draw, a line each.
     """
 
     path: Path
@@ -57,7 +58,7 @@ class Imported:
     omissions: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it as plain data, for JSON."""
+        """Return all of it as plain data, for JSON."""
         return {**asdict(self), "path": str(self.path)}
 
 
@@ -74,14 +75,14 @@ def import_scene(
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Imported:
-    """Writes the GLB ``out``, whole or not at all.
+    """Write the GLB ``out``, complete or not at all.
 
     scene : name of the file's scene; None: the one it was saved in.   frames : (first, last); None: the scene's.
-    fps : frames per second; None: the file's, 24 where its format does not say (USD, Collada, Alembic).
-    keys_per_frame : key frames written per frame; between them glTF goes straight.
-    clips : an animation per action instead of one of the scene as it plays.
-    time_limit_s : seconds that Blender may take altogether.   progress : told what it does.
-    Raises AssetError (the file), ConfigError (an option), OutputError, BlinkGLError (no Blender, or it crashed).
+    fps : frames per second; None: the file's, 24 if its format does not contain it (USD, Collada, Alembic).
+    keys_per_frame : key frames written per frame; between them glTF interpolates linearly.
+    clips : an animation per action instead of one for the whole scene.
+    time_limit_s : seconds that Blender may take in total.   progress : is called with what it does. Raises AssetError
+    (the file), ConfigError (an option), OutputError, BlinkGLError (no Blender, or it crashed).
     """
     source, out = Path(source), Path(out)
     _check_options(source, out, frames, fps, keys_per_frame, time_limit_s)
@@ -146,7 +147,7 @@ def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, time_li
 
 
 def _run(folder: Path, source: Path, limit_s: float, progress: Callable[[str], None]) -> dict[str, Any]:
-    """The report of Blender's side, which has written ``folder``/scene.glb."""
+    """Return the report of Blender's side, which has written ``folder``/scene.glb."""
     report = None
     with Blender(PROGRAM, folder, limit_s) as blender:
         for words in blender.answers():
@@ -162,7 +163,8 @@ def _run(folder: Path, source: Path, limit_s: float, progress: Callable[[str], N
 
 
 def _read_back(path: Path, out: Path) -> tuple[str, ...]:
-    """Loads the GLB as a scene; what is not drawn of it, under its final name. AssetError when it cannot be loaded."""
+    """Load the GLB as a scene and return lines of what is not drawn, with the name of ``out``. AssetError if it cannot
+    be loaded."""
     still = StaticPath(np.eye(4), 0, 1)
     try:
         document = gltf.read(path, max_faces=_MOST_FACES, max_texture=16384)

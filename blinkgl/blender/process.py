@@ -1,12 +1,12 @@
-"""Blender as a process: which interpreter has it, what it is given, and how it ends.
+"""Blender as a process: its interpreter, its input, and its end.
 
     with Blender(PROGRAM, folder, limit_s=600) as blender:
         for words in blender.answers():      # dict per line of JSON on the program's standard output
             ...
 
-The program gets the folder's path as its argument and an environment of its own: no preferences, add-ons or scripts of
-the user's Blender, no ``PYTHON*``, nothing that this process set for its own OpenGL. It ends with the ``with``, also
-when that is left by an exception.
+The program gets the folder's path as its argument and a separate environment: no preferences, add-ons or scripts of the
+user's Blender, no ``PYTHON*``, no OpenGL settings of this process. It ends with the ``with``, also after an
+exception.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ REMEDY = (
     "run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter "
     f"in {ENVIRONMENT} (or install it here)"
 )
-# What Blender needs to find its libraries, a display and a card. Everything else is the user's own business.
+# Variables that Blender needs to find its libraries, a display and a card. Others are not passed on.
 _HANDED_ON = ("PATH", "LANG", "LC_", "TZ", "DISPLAY", "WAYLAND_", "XAUTHORITY", "LD_LIBRARY_PATH", "SYSTEMROOT")
 _CARDS = ("LIBGL_", "MESA_", "EGL_", "__EGL_", "GALLIUM_", "VK_", "CUDA_", "NVIDIA_", "HIP_")
 
 
 def interpreter() -> str:
-    """The Python that runs Blender: the environment's, or this one."""
+    """Return the Python that runs Blender: the environment's, or this one."""
     return os.environ.get(ENVIRONMENT) or sys.executable
 
 
 def available() -> str:
-    """'' when a bpy is there (not whether it loads: that takes seconds and is found out by using
-    it), else a line that says what to do."""
+    """Return '' if bpy is installed (without loading it, which takes seconds), otherwise a line that tells what to
+    do."""
     chosen = interpreter()
     if chosen == sys.executable:
         found = importlib.util.find_spec("bpy") is not None
@@ -57,13 +57,13 @@ def available() -> str:
 
 
 def require() -> None:
-    """Raises BlinkGLError when there is no bpy."""
+    """Raise BlinkGLError if there is no bpy."""
     if missing := available():
         raise BlinkGLError(missing)
 
 
 def environment(home: Path) -> dict[str, str]:
-    """What Blender's process is given: ``home``, an empty folder, stands for everything that is the user's."""
+    """Return the environment of Blender's process: ``home``, an empty folder, replaces all of the user's folders."""
     given = {key: value for key, value in os.environ.items() if key.startswith(_HANDED_ON + _CARDS)}
     for key in ("HOME", "TMPDIR", "BLENDER_USER_RESOURCES", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
         given[key] = str(home)
@@ -73,9 +73,8 @@ def environment(home: Path) -> dict[str, str]:
 class Blender:
     """One process that runs ``program`` (a file, or a folder with a __main__.py) with ``folder`` as its argument.
 
-    limit_s : seconds that it may take altogether; None: as long as it likes.
-    Raises BlinkGLError when there is no bpy; its answers raise it when Blender refuses, does not come to an end, or
-    stops.
+    limit_s : seconds that it may take in total; None: no limit.
+    Raises BlinkGLError if there is no bpy; its answers raise it when Blender refuses, exceeds the limit, or stops.
     """
 
     def __init__(self, program: Path, folder: Path, limit_s: float | None = None):
@@ -102,7 +101,7 @@ class Blender:
         self.close()
 
     def close(self) -> None:
-        """Ends the process, and what it may have started."""
+        """End the process and its children."""
         if self._process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -112,8 +111,8 @@ class Blender:
         self._log.close()
 
     def answers(self) -> Iterator[dict[str, Any]]:
-        """Each line's object, until the program closes its standard output. A ``{"doing": …}`` is kept for errors and
-        handed on; an ``{"error": …, "accepted": …}`` is raised."""
+        """Yield each line's object, until the program closes its standard output. A ``{"doing": …}`` is stored for
+        errors and yielded; an ``{"error": …, "accepted": …}`` is raised."""
         for line in self._lines():
             try:
                 words = json.loads(line)
@@ -127,11 +126,11 @@ class Blender:
             yield words
 
     def status(self) -> int:
-        """Exit status, once the answers have ended; negative: the number of the signal that ended it."""
+        """Return the exit status, after the answers have ended; negative: the number of the signal that ended it."""
         return self._process.wait()
 
     def last_words(self) -> str:
-        """The last line that Blender printed for people."""
+        """Return the last line that Blender printed."""
         self._log.flush()
         lines = (self.folder / "blender.log").read_text(errors="replace").strip().splitlines()
         return lines[-1].strip() if lines else "no message"
@@ -154,7 +153,7 @@ class Blender:
 
 
 def how_it_ended(status: int) -> str:
-    """Of an exit status: "stopped (status 3)", or "crashed (SIGSEGV)" for a negative one."""
+    """Return the text of an exit status: "stopped (status 3)", or "crashed (SIGSEGV)" for a negative one."""
     if status >= 0:
         return f"stopped (status {status})"
     try:

@@ -1,5 +1,6 @@
-"""Camera models: where a point is seen, along which ray a pixel looks, and what of the world can be in the picture.
-Float64, no OpenGL, no poses, no YAML; nothing else in BlinkGL knows a camera's mathematics.
+"""Camera models: the pixel of a point, the ray of a pixel, and bounds on what the picture can show.
+
+Float64, without OpenGL, poses and YAML; all of BlinkGL's camera mathematics is here.
 
 In:    points in camera axes (OpenCV: x right, y down, z forward), pixels
 Out:   pixels, rays, Jacobians, planes, matrices

@@ -1,5 +1,5 @@
-"""What lenses that distort have in common: inverses by Newton's method, and bounds found along the border of the
-picture."""
+"""Common parts of the models with distortion: inverses by Newton's method, and bounds found along the picture's
+border."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from blinkgl.camera.model import CameraModel
 from blinkgl.errors import ConfigError
 
 STEPS = 100
-"""Steps of a solver at most; five or six are usual, halving brackets takes about sixty where the derivative
+"""Largest number of a solver's steps; five or six are usual, halving brackets takes about sixty where the derivative
 vanishes."""
-_GRID = 33  # places along either side of the picture where the magnification is looked at
+_GRID = 33  # grid points along each side of the picture at which the magnification is computed
 
 
 def radius_limit(coefficients: tuple[float, ...]) -> float:
-    """Where ``g(r) = r (1 + k1 r^2 + k2 r^4 + …)`` stops growing: the smallest r > 0 with g'(r) = 0; inf where it
-    grows for ever."""
+    """Return the smallest r > 0 with g'(r) = 0, where ``g(r) = r (1 + k1 r^2 + k2 r^4 + …)`` stops growing; inf if it
+    always grows."""
     slopes = [(2 * i + 3) * k for i, k in enumerate(coefficients)]
     roots = np.roots([*reversed(slopes), 1.0])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
@@ -29,7 +29,7 @@ def radius_limit(coefficients: tuple[float, ...]) -> float:
 
 
 def radial(r: np.ndarray | float, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """``g(r) / r = 1 + k1 r^2 + k2 r^4 + …`` and g'(r)."""
+    """Return ``g(r) / r = 1 + k1 r^2 + k2 r^4 + …`` and g'(r)."""
     squared = np.square(r)
     ratio, slope = np.zeros_like(squared), np.zeros_like(squared)
     for i in range(len(coefficients) - 1, -1, -1):  # Horner, from the highest power
@@ -39,11 +39,11 @@ def radial(r: np.ndarray | float, coefficients: tuple[float, ...]) -> tuple[np.n
 
 
 def radial_inverse(y: np.ndarray, coefficients: tuple[float, ...], limit: float) -> np.ndarray:
-    """(...) r in [0, limit] with g(r) = y for (...) y >= 0; nan above g(limit).
+    """Return (...) r in [0, limit] with g(r) = y for (...) y >= 0; nan above g(limit).
 
-    Newton's method inside a bracket that every step tightens, halving it where a step would leave it (and every other
-    time once there were many, which is where a high power slows Newton's method down): g grows up to the limit, so
-    this converges from anywhere, quadratically but for the limit itself, where g' = 0; to the last place or two, in
+    Newton's method inside a bracket that every step tightens. A step that would leave the bracket halves it instead;
+    after many steps every other one does, because a high power slows Newton's method down. g grows up to the limit, so
+    this converges from any start, quadratically except at the limit itself, where g' = 0; to the last place or two, in
     :data:`STEPS` steps at most."""
     y = np.asarray(y, np.float64)
     low, high = np.zeros_like(y), np.full_like(y, min(1.0, limit))
@@ -71,11 +71,10 @@ def radial_inverse(y: np.ndarray, coefficients: tuple[float, ...], limit: float)
 
 @dataclass(frozen=True)
 class DistortedModel(CameraModel):
-    """Bounds of models that are smooth and one-to-one in the whole picture: what is farthest out is then seen on its
+    """Base class of models that are smooth and one-to-one in the whole picture: its extreme rays are then on its
     border.
 
-    Raises ConfigError for a picture with pixels through which no ray goes, because the distortion turns back before
-    its corners."""
+    Raises ConfigError for a picture with pixels without a ray, because the distortion folds back before its corners."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,18 +95,18 @@ class DistortedModel(CameraModel):
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Radius on the image plane up to which the radial distortion grows; inf where it does for ever."""
+        """Radius on the image plane up to which the radial distortion grows; inf if it always grows."""
 
     @property
     def plane_limit(self) -> float:
-        """Largest hypot(X, Y) / Z that is seen; a very large number where there is no limit."""
+        """Largest hypot(X, Y) / Z that is visible; a very large number where there is no limit."""
         return 1e18
 
     # ---- the border of the picture -----------------------------------------------------------------------------
 
     @cached_property
     def _border(self) -> np.ndarray:
-        """(4, n, 2) px along the picture's sides, top, bottom, left, right, a pixel apart or less."""
+        """Return (4, n, 2) px along the picture's sides (top, bottom, left, right), a pixel apart or less."""
         n = max(self.width, self.height) + 1
         x, y = np.linspace(-0.5, self.width - 0.5, n), np.linspace(-0.5, self.height - 0.5, n)
         ends = [np.full(n, v) for v in (-0.5, self.height - 0.5, self.width - 0.5)]
@@ -115,7 +114,7 @@ class DistortedModel(CameraModel):
 
     @cached_property
     def plane_edges(self) -> tuple[float, float, float, float] | None:
-        """Least and greatest X / Z, least and greatest Y / Z in the picture; None where it sees half of space."""
+        """Smallest and largest X / Z, smallest and largest Y / Z in the picture; None if it shows half of space."""
         rays = self.rays(self._border)
         if not (rays[..., 2] > 0).all():
             return None
@@ -124,16 +123,16 @@ class DistortedModel(CameraModel):
 
     @cached_property
     def half_angle(self) -> float:
-        """Largest angle between the optical axis and what is in the picture, rad, or a little more."""
+        """Largest angle between the optical axis and a visible point, rad, or slightly more."""
         rays = self.rays(self._border)
         angles = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
-        # The border is looked at in steps: what lies between two may be as much larger as they differ.
+        # The border is sampled: between two samples the angle may exceed them by as much as they differ.
         return float(angles.max() + np.abs(np.diff(angles, axis=-1)).max())
 
     @cached_property
     def magnification(self) -> float:
         """A displacement d at depth Z > 0 moves the image by at most ``magnification * d / Z`` px."""
-        # Looked at on a grid; between its places it changes by no more than from one to the next.
+        # Sampled on a grid: between grid points it changes by no more than from one to the next.
         x, y = np.linspace(-0.5, self.width - 0.5, _GRID), np.linspace(-0.5, self.height - 0.5, _GRID)
         rays = self.rays(np.stack(np.meshgrid(x, y), axis=-1))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,11 +145,11 @@ class DistortedModel(CameraModel):
 
     @cached_property
     def near_corner(self) -> float:
-        """Distance from the camera's centre to the farthest point of the near plane that is in the picture."""
+        """Distance from the camera's centre to the farthest visible point of the near plane."""
         return math.inf if self.half_angle >= math.pi / 2 else self.near / math.cos(self.half_angle)
 
     def frustum_planes(self) -> np.ndarray:
-        """(5, 3): of the narrowest pin-hole picture that holds this one; (0, 3) where this one sees half of space."""
+        """(5, 3): of the smallest pin-hole picture that contains this one; (0, 3) if this one shows half of space."""
         if self.plane_edges is None:
             return np.zeros((0, 3))
         left, right, top, bottom = self.plane_edges
@@ -159,14 +158,13 @@ class DistortedModel(CameraModel):
 
 
 def largest_stretch(J: np.ndarray) -> np.ndarray:
-    """(n,) largest singular values of (n, 2, 3) Jacobians: by how much the longest step is lengthened."""
+    """Return the (n,) largest singular values of (n, 2, 3) Jacobians: the largest factor on a step's length."""
     a, b, c = (J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)
     return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
 
 
 def _extremes(sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest coordinates, (2,) each, of curves through (4, n, 2) points. A curve leaves the chord between
-    neighbours by an
-    eighth of its second difference; a quarter is allowed for."""
+    """Return the smallest and the largest coordinates, (2,) each, of curves through (4, n, 2) points. A curve differs
+    from the chord between neighbours by an eighth of its second difference; a quarter is added."""
     bow = 0.25 * np.abs(np.diff(sides, n=2, axis=1)).max(axis=(0, 1)) if sides.shape[1] > 2 else 0.0
     return sides.min(axis=(0, 1)) - bow, sides.max(axis=(0, 1)) + bow

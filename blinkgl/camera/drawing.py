@@ -1,4 +1,4 @@
-"""The pin-hole picture out of which a lens's picture is made: rasterisers draw nothing else."""
+"""The pin-hole picture from which a lens's picture is made: rasterisers draw only pin-hole pictures."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from blinkgl.camera.pinhole import PinHole
 from blinkgl.errors import ConfigError
 
 DENSITY = 1.42
-"""Pixels of the pin-hole picture per pixel of the lens's, along the direction and at the place where there are fewest.
-Above the square root of 2, so that no two pixels have the same nearest one."""
+"""Pixels of the pin-hole picture per pixel of the lens's, at the place and along the direction of the smallest ratio.
+It is above the square root of 2, so that no two pixels have the same nearest one."""
 WIDEST = math.radians(70)
-"""Largest angle off the optical axis. A pin-hole picture grows with its tangent."""
+"""Largest angle from the optical axis. The size of a pin-hole picture grows with its tangent."""
 LARGEST = 16384
-"""Pixels along a side of the pin-hole picture."""
+"""Largest number of pixels along a side of the pin-hole picture."""
 MARGIN = 2
-"""Its pixels on every side beyond what the lens shows: neighbours are looked at."""
+"""Its additional pixels on every side of the lens's view: neighbours are read."""
 
 
 def seen_through(camera: CameraModel) -> PinHole:
-    """The pin-hole camera that is drawn for ``camera``, at the same place: ``camera`` itself, or one that sees all that
-    a lens shows, at :data:`DENSITY` at least.
+    """Return the pin-hole camera that is drawn for ``camera``, at the same place: ``camera`` itself, or one that
+    contains the lens's whole view, with :data:`DENSITY` at least.
 
-    Raises ConfigError for a lens that shows too much for one flat picture, and for models that no shader knows."""
+    Raises ConfigError for a lens whose view is too wide for one flat picture, and for models without a shader."""
     if isinstance(camera, PinHole):
         return camera
     if not camera.shader:
-        camera.clip_from_cam()  # says that there is none
+        camera.clip_from_cam()  # raises: it has none
     assert isinstance(camera, DistortedModel)
     return _seen_through(camera)
 
@@ -49,8 +49,8 @@ def _seen_through(camera: DistortedModel) -> PinHole:
             accepted=f"at most {math.degrees(WIDEST):.0f} degrees: a longer focal length, or fewer pixels",
         )
     edges = camera.plane_edges
-    assert edges is not None  # it sees less than half of space
-    # d(X / Z, Y / Z) / d px; the derivative's smallest singular value says where pixels are closest to each other.
+    assert edges is not None  # it shows less than half of space
+    # d(X / Z, Y / Z) / d px: its smallest singular value tells where pixels are closest to each other.
     z = rays[:, 2, None]
     slopes = camera.ray_jacobian(xy)
     slopes = (slopes[:, :2] - rays[:, :2, None] / z[..., None] * slopes[:, 2:]) / z[..., None]

@@ -1,12 +1,12 @@
-"""The fisheye of Kannala and Brandt (2006), as OpenCV's ``fisheye`` and Kalibr's ``equidistant`` have it.
+"""The fisheye model of Kannala and Brandt (2006), as in OpenCV's ``fisheye`` and Kalibr's ``equidistant``.
 
-A point whose direction makes the angle theta with the optical axis is seen at the distance
+A point whose direction makes the angle theta with the optical axis has the distance
 
     theta' = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
-from the principal point (times fx in x, fy in y), in the direction of (X, Y). The angle is that of the point,
-atan2(hypot(X, Y), Z), up to 180 degrees, so that a camera may see more than half of space (OpenCV takes atan of the
-tangent and does not). The model is used as far out as theta' grows with theta; a point beyond is not seen (nan).
+from the principal point (times fx in x, fy in y), in the direction of (X, Y). The angle is
+atan2(hypot(X, Y), Z), up to 180 degrees, so a camera may show more than half of space (OpenCV uses atan of the tangent,
+so it cannot). The model is valid while theta' grows with theta; points beyond are not visible (nan).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from blinkgl.camera.distorted import DistortedModel, radial, radial_inverse, rad
 
 @dataclass(frozen=True)
 class Equidistant(DistortedModel):
-    """Coefficients without unit: k1 … k4. Rays are unit vectors, and Z <= 0 in them beyond 90 degrees."""
+    """Fisheye camera. Coefficients without unit: k1 … k4. Rays are unit vectors; beyond 90 degrees their Z is <= 0."""
 
     kind: ClassVar[str] = "equidistant"
     shader: ClassVar[str] = "EQUIDISTANT"
@@ -40,7 +40,7 @@ class Equidistant(DistortedModel):
 
     @cached_property
     def _limit(self) -> float:
-        """Largest angle, rad."""
+        """Return the largest angle, rad."""
         return min(math.pi, radius_limit(self._k))
 
     @property
@@ -53,7 +53,8 @@ class Equidistant(DistortedModel):
         return self._limit * float(radial(np.float64(self._limit), self._k)[0])
 
     def _polar(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
-        """rho, cos and sin of the direction of (X, Y) (1, 0 on the axis), theta; nan where the model does not see."""
+        """Return rho, cos and sin of the direction of (X, Y) (1, 0 on the axis), and theta; nan where the model is not
+        valid."""
         x, y, z = np.moveaxis(points, -1, 0)
         rho = np.hypot(x, y)
         theta = np.arctan2(rho, z)
@@ -67,15 +68,15 @@ class Equidistant(DistortedModel):
         )
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2) px; nan beyond the largest angle."""
+        """Return (..., 2) px; nan beyond the largest angle."""
         points = np.asarray(points, np.float64)
         _, c, s, theta = self._polar(points)
         distance = theta * radial(theta, self._k)[0]
         return np.stack([self.fx * distance * c + self.cx, self.fy * distance * s + self.cy], axis=-1)
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2, 3): theta' changes along (X, Y) with d theta = (Z d rho - rho dZ) / R^2, the direction across it
-        with 1 / rho."""
+        """Return (..., 2, 3): theta' changes along (X, Y) with d theta = (Z d rho - rho dZ) / R^2, and across it with 1
+        / rho."""
         points = np.asarray(points, np.float64)
         rho, c, s, theta = self._polar(points)
         z = points[..., 2]
@@ -93,7 +94,8 @@ class Equidistant(DistortedModel):
         return np.array([[self.fx], [self.fy]]) * out
 
     def _angles(self, xy: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Distance on the image plane, cos and sin of the direction, theta; nan where the model has no ray."""
+        """Return the distance on the image plane, cos and sin of the direction, and theta; nan where the model has no
+        ray."""
         u, v = np.moveaxis((xy - [self.cx, self.cy]) / [self.fx, self.fy], -1, 0)
         distance = np.hypot(u, v)
         off = distance > 0
@@ -104,12 +106,13 @@ class Equidistant(DistortedModel):
         return distance, cos, sin, radial_inverse(distance, self._k, self._limit)
 
     def rays(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3) unit vectors; nan where the model has none."""
+        """Return (..., 3) unit vectors; nan where there is no ray."""
         _, c, s, theta = self._angles(np.asarray(xy, np.float64))
         return np.stack([np.sin(theta) * c, np.sin(theta) * s, np.cos(theta)], axis=-1)
 
     def ray_jacobian(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3, 2): along the direction by d theta = d theta' / theta''s slope, across it by sin theta / theta'."""
+        """Return (..., 3, 2): along the direction d theta = d theta' / slope of theta', across it sin theta /
+        theta'."""
         distance, c, s, theta = self._angles(np.asarray(xy, np.float64))
         slope = radial(theta, self._k)[1]
         across = np.divide(np.sin(theta), distance, out=np.ones_like(distance), where=distance > 0)

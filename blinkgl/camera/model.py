@@ -1,4 +1,4 @@
-"""What a camera model has to know, and what follows from it for every model."""
+"""The interface of a camera model, and what is computed from it for every model."""
 
 from __future__ import annotations
 
@@ -16,23 +16,22 @@ Self = TypeVar("Self", bound="CameraModel")
 
 @dataclass(frozen=True)
 class CameraModel(ABC):
-    """A camera's mathematics. Points are in camera axes (OpenCV: x right, y down, z forward); pixels are (x, y), +x
-    right, +y down, with (0, 0) the centre of the top-left pixel, so that the image is
+    """Base class of camera models. Points are in camera axes (OpenCV: x right, y down, z forward); pixels are (x, y),
+    +x right, +y down, with (0, 0) the centre of the top-left pixel, so the image is
     [-0.5, width - 0.5) x [-0.5, height - 0.5).
 
-    Every model puts a point on an image plane at distance 1 in its own way and goes from there to pixels by
-    ``x = fx u + cx``, ``y = fy v + cy``.
+    Each model maps a point to an image plane at distance 1; then ``x = fx u + cx``, ``y = fy v + cy`` gives pixels.
 
-    width, height : px.   fx, fy, cx, cy : px.   near : nothing whose Z is smaller is seen, world units.
+    width, height : px.   fx, fy, cx, cy : px.   near : points with a smaller Z are not visible, world units.
     kind : the model's name in the table (:mod:`blinkgl.camera.table`).
-    Raises ConfigError for values that no camera has.
+    Raises ConfigError for invalid values.
     """
 
     kind: ClassVar[str]
     coefficients: ClassVar[tuple[str, ...]] = ()
-    """Names of its own parameters, in the order in which calibrations give them."""
+    """Names of the model's own parameters, in the order of calibrations."""
     shader: ClassVar[str] = ""
-    """The macro by which ``shaders/include/lens.glsl`` knows a model that distorts; "": it is not drawn."""
+    """Macro of a model with distortion in ``shaders/include/lens.glsl``; "": it cannot be drawn."""
 
     width: int
     height: int
@@ -62,66 +61,65 @@ class CameraModel(ABC):
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2) px where (..., 3) points are seen; nan where the model sees no such point (behind a pin-hole
-        camera)."""
+        """Return the (..., 2) px of (..., 3) points; nan where a point is not visible (behind a pin-hole camera)."""
 
     @abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2, 3) d px / d point of :meth:`project` at (..., 3) points, px per world unit; nan where that is."""
+        """Return the (..., 2, 3) d px / d point of :meth:`project` at (..., 3) points, px per world unit; nan where
+        that is nan."""
 
     @abstractmethod
     def rays(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3) directions, of any length, in which the points lie that are seen at (..., 2) px; nan where there
-        are none."""
+        """Return (..., 3) directions, of any length, of the points visible at (..., 2) px; nan where there are none."""
 
     @abstractmethod
     def ray_jacobian(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3, 2) d ray / d px of :meth:`rays` at (..., 2) px; nan where that is."""
+        """Return the (..., 3, 2) d ray / d px of :meth:`rays` at (..., 2) px; nan where that is nan."""
 
     # ---- bounds of what is in the picture ----------------------------------------------------------------------
 
     @property
     @abstractmethod
     def half_angle(self) -> float:
-        """Largest angle between the optical axis and what is in the picture, rad, or a little more."""
+        """Largest angle between the optical axis and a visible point, rad, or slightly more."""
 
     @property
     @abstractmethod
     def magnification(self) -> float:
         """A displacement d of any direction at depth Z moves the image by at most ``magnification * d / Z`` px,
-        wherever in the picture."""
+        anywhere in the picture."""
 
     @property
     @abstractmethod
     def near_corner(self) -> float:
-        """Distance from the camera's centre to the farthest point of the near plane that is in the picture; inf where
-        that is half of space."""
+        """Distance from the camera's centre to the farthest visible point of the near plane; inf if half of space is
+        visible."""
 
     @abstractmethod
     def frustum_planes(self) -> np.ndarray:
-        """(n, 3) inward unit normals, camera axes, of planes through the centre: what is in the picture is on the
-        inner side of each."""
+        """(n, 3) inward unit normals, camera axes, of planes through the centre: visible points are on the inner side
+        of each."""
 
     @property
     def px_per_slope(self) -> float:
-        """How far, px, the image of a point moves at most when (X / Z, Y / Z) changes by a step of length 1."""
+        """Largest distance, px, by which a point's image moves when (X / Z, Y / Z) changes by a step of length 1."""
         return self.magnification
 
     # ---- what follows ------------------------------------------------------------------------------------------
 
     def disparity(self, depth: np.ndarray, baseline: float) -> np.ndarray:
-        """px of the flat picture between the two eyes of a rectified pair, ``baseline`` world units apart: f b / Z of
-        ``depth`` (…), world units."""
+        """Return the disparity, px of the flat picture, between the two eyes of a rectified pair, ``baseline`` world
+        units apart: f b / Z of ``depth`` (…), world units."""
         return self.fx * baseline / depth
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy."""
+        """The values fx, fy, cx, cy."""
         return self.fx, self.fy, self.cx, self.cy
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """Values of its ``coefficients``."""
+        """The values of its ``coefficients``."""
         return tuple(getattr(self, name) for name in self.coefficients)
 
     @property
@@ -131,13 +129,13 @@ class CameraModel(ABC):
 
     @property
     def summary(self) -> str:
-        """Size and focal length in words."""
+        """Size and focal length as text."""
         return f"{self.width}x{self.height}, fx {self.fx:.0f} px"
 
     def clip_from_cam(self) -> np.ndarray:
-        """(4, 4) float64 from camera axes to clip space (:mod:`blinkgl.render.moment`).
+        """Return the (4, 4) float64 matrix from camera axes to clip space (:mod:`blinkgl.render.moment`).
 
-        Raises ConfigError: only a pin-hole image is a matrix's work; for a lens one is drawn
+        Raises ConfigError: only a pin-hole camera has such a matrix; for a lens one is drawn
         (:func:`blinkgl.camera.drawing.seen_through`)."""
         raise ConfigError(
             "this camera model cannot be drawn",
@@ -147,15 +145,13 @@ class CameraModel(ABC):
         )
 
     def displacement(self, rays: np.ndarray, depth: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """(n, 2) px by which points move in the image that are seen along (n, 3) rays at (n,) depth Z and move by (n,
-        3) change; nan where they
-        are not seen before or after."""
+        """Return the (n, 2) px by which points move in the image that are visible along (n, 3) rays at (n,) depth Z and
+        move by (n, 3) change; nan where they are not visible before or after."""
         points = rays * (depth / rays[:, 2])[:, None]
         return self.project(points + change) - self.project(points)
 
     def part(self: Self, x0: int, y0: int, x1: int, y1: int, scale: int = 1) -> Self:
-        """The camera that sees pixels x0 <= x < x1, y0 <= y < y1 of this one alone, ``scale`` times finer in x and
-        y."""
+        """Return the camera of the pixels x0 <= x < x1, y0 <= y < y1 alone, ``scale`` times finer in x and y."""
         # Pixel x is [x - 0.5, x + 0.5): its left edge, not its centre, is a multiple of the scale.
         return replace(
             self,
@@ -168,7 +164,7 @@ class CameraModel(ABC):
         )
 
     def resized(self: Self, width: int, height: int) -> Self:
-        """The camera that sees the same with width x height pixels."""
+        """Return the camera with the same view and width x height pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,

@@ -12,29 +12,30 @@ from blinkgl.camera.model import CameraModel
 
 
 def focal_length(size: float, angle: float) -> float:
-    """px, of a pin-hole camera that sees ``angle`` rad across ``size`` px whose middle is on the optical axis."""
+    """Return the focal length, px, of a pin-hole camera whose view is ``angle`` rad across ``size`` px, centred on the
+    optical axis."""
     return 0.5 * size / math.tan(angle / 2)
 
 
 @dataclass(frozen=True)
 class PinHole(CameraModel):
-    """A point (X, Y, Z), Z > 0, is seen at (fx X / Z + cx, fy Y / Z + cy). Rays have Z = 1."""
+    """Pin-hole camera: a point (X, Y, Z), Z > 0, is visible at (fx X / Z + cx, fy Y / Z + cy). Rays have Z = 1."""
 
     kind: ClassVar[str] = "pinhole"
 
     @classmethod
     def centred(cls, width: int, height: int, fx: float, fy: float | None = None, near: float = 0.05) -> PinHole:
-        """With the principal point in the middle of the image; ``fy``: as fx."""
+        """Return a camera with the principal point in the middle of the image; ``fy``: default fx."""
         return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
 
     def from_lens_point(self, a: float, b: float, focus: float) -> PinHole:
-        """What a point (a, b) of a lens before this camera sees, in place at depth ``focus``: a camera whose centre is
-        (a, b, 0), its picture moved."""
+        """Return the camera of a point (a, b) of a lens in front of this camera, focused at depth ``focus``: its centre
+        is (a, b, 0), and its picture is shifted."""
         return replace(self, cx=self.cx + self.fx * a / focus, cy=self.cy + self.fy * b / focus)
 
     @property
     def px_per_slope(self) -> float:
-        """How far, px, the image of a point moves at most when X / Z or Y / Z changes by 1."""
+        """Largest distance, px, by which a point's image moves when X / Z or Y / Z changes by 1."""
         return max(self.fx, self.fy)
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -61,13 +62,13 @@ class PinHole(CameraModel):
         return np.broadcast_to([[1 / self.fx, 0.0], [0.0, 1 / self.fy], [0.0, 0.0]], (*np.shape(xy)[:-1], 3, 2)).copy()
 
     def displacement(self, rays: np.ndarray, depth: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Without a difference of two projections: rays (r, 1) give ``f (d - r dZ) / (Z + dZ)``."""
+        """Computed without a difference of two projections: rays (r, 1) give ``f (d - r dZ) / (Z + dZ)``."""
         after = depth + change[:, 2]
         after = np.where((depth > 0) & (after > 0), after, np.nan)
         return np.array([self.fx, self.fy]) * (change[:, :2] - rays[:, :2] * change[:, 2:]) / after[:, None]
 
     def _edge(self) -> tuple[float, float]:
-        """|X / Z| and |Y / Z| of the picture's farthest corner from the optical axis."""
+        """Return |X / Z| and |Y / Z| of the picture's farthest corner from the optical axis."""
         return max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx, max(
             self.cy + 0.5, self.height - 0.5 - self.cy
         ) / self.fy
@@ -93,24 +94,24 @@ class PinHole(CameraModel):
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """(x0, y0, x1, y1): pixels x0 <= x < x1, y0 <= y < y1 are all that the convex hull of (n, 3) points can touch,
-        with a pixel to spare on every side. The whole image where the hull meets the near plane; None when it is out of
+        """Return (x0, y0, x1, y1): the convex hull of (n, 3) points can touch only pixels x0 <= x < x1, y0 <= y < y1,
+        with a margin of a pixel on every side. The whole image if the hull meets the near plane; None if it is outside
         the picture."""
-        # Of a convex body in front of the camera the corners are seen farthest out.
+        # Of a convex body in front of the camera the corners are the extreme points of the image.
         z = points[:, 2]
         if z.min() <= self.near:
             return (0, 0, self.width, self.height) if z.max() > self.near else None
-        # Not by `project`: asked of every moving thing in every frame, and nothing here is behind the camera.
+        # Not by `project`, to save time: this runs for every moving body in every frame, and no point here is behind
+        # the camera.
         x, y = self.fx * points[:, 0] / z + self.cx, self.fy * points[:, 1] / z + self.cy
         x0, x1 = max(0, math.floor(x.min()) - 1), min(self.width, math.ceil(x.max()) + 2)
         y0, y1 = max(0, math.floor(y.min()) - 1), min(self.height, math.ceil(y.max()) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
     def clip_from_cam(self) -> np.ndarray:
-        """(4, 4) float64: x right, y down, w = Z, depth = near / Z (reversed, the far plane at infinity).
+        """Return (4, 4) float64: x right, y down, w = Z, depth = near / Z (reversed, the far plane at infinity).
 
-        A point is seen at pixel x = fx X / Z + cx, that is at window coordinate x + 0.5, that is at ndc 2 (x + 0.5) /
-        width - 1."""
+        A point at pixel x = fx X / Z + cx has the window coordinate x + 0.5, thus ndc 2 (x + 0.5) / width - 1."""
         w, h = self.width, self.height
         return np.array(
             [
@@ -123,19 +124,19 @@ class PinHole(CameraModel):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The pin-hole camera that a distorted one becomes when its pictures are rectified, and the map from the one's pixels
-# to the other's.
+# Rectification of a distorted camera's pictures: the pin-hole camera, and the map between the two cameras' pixels.
 
 
 def rectified(camera: CameraModel) -> PinHole:
-    """The pin-hole camera of the same size and intrinsics at the same place. What of the distorted picture lies outside
-    of its picture (the corners, of a lens that draws them in) is not in it."""
+    """Return the pin-hole camera of the same size and intrinsics at the same place. Parts of the distorted picture may
+    lie outside its picture (the corners, for barrel distortion)."""
     return PinHole(camera.width, camera.height, *camera.intrinsics, camera.near)
 
 
 def rectify_map(camera: CameraModel, to: PinHole | None = None) -> np.ndarray:
-    """(H, W, 2) float32, DSEC's convention: ``map[y, x] = (x_rect, y_rect)``, where what the camera's pixel (x, y)
-    shows is in the rectified picture, px; also outside of it. nan where a ray does not point forward.
+    """Return the (H, W, 2) float32 map, DSEC's convention: ``map[y, x] = (x_rect, y_rect)``, the position, px, in the
+    rectified picture of what the camera's pixel (x, y) shows; also outside of it. nan where a ray does not point
+    forward.
 
     to : the rectified camera; default :func:`rectified`'s."""
     to = rectified(camera) if to is None else to

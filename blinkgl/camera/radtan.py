@@ -1,12 +1,12 @@
-"""Radial and tangential distortion (Brown 1966), as OpenCV's ``projectPoints`` and Kalibr's ``radtan`` have it.
+"""Radial and tangential distortion (Brown 1966), as in OpenCV's ``projectPoints`` and Kalibr's ``radtan``.
 
-A point at (x, y) = (X / Z, Y / Z), r^2 = x^2 + y^2, is seen as a pin-hole camera sees (x', y') with
+A point at (x, y) = (X / Z, Y / Z), r^2 = x^2 + y^2, appears where a pin-hole camera shows (x', y') with
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y.
 
-The model is used where that is one-to-one: as far out as the radial part grows with r and the derivative keeps its
-orientation. The polynomial has values beyond, which OpenCV reports; a point there is not seen here (nan).
+The model is valid where that is one-to-one: while the radial part grows with r and the derivative keeps its
+orientation. The polynomial has values beyond, which OpenCV returns; here such a point is not visible (nan).
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from blinkgl.camera.distorted import STEPS, DistortedModel, radial, radial_inver
 
 @dataclass(frozen=True)
 class Radtan(DistortedModel):
-    """Coefficients without unit, in OpenCV's order: k1, k2, p1, p2, k3. Rays have Z = 1."""
+    """Camera with this distortion. Coefficients without unit, in OpenCV's order: k1, k2, p1, p2, k3. Rays have Z =
+    1."""
 
     kind: ClassVar[str] = "radtan"
     shader: ClassVar[str] = "RADTAN"
@@ -53,8 +54,8 @@ class Radtan(DistortedModel):
         )
 
     def _distort(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 2) distorted and (n, 2, 2) its derivative, of (n, 2) points of the image plane; nan outside of where it
-        is one-to-one."""
+        """Return (n, 2) distorted points and their (n, 2, 2) derivative, of (n, 2) points of the image plane; nan where
+        it is not one-to-one."""
         x, y = u[:, 0], u[:, 1]
         r2 = x * x + y * y
         ratio = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -76,11 +77,11 @@ class Radtan(DistortedModel):
         return out, D
 
     def _undistort(self, d: np.ndarray) -> np.ndarray:
-        """(n, 2) points of the image plane that are distorted to (n, 2) d; nan where there are none.
+        """Return the (n, 2) points of the image plane that are distorted to (n, 2) d; nan where there are none.
 
-        Newton's method in the plane from the inverse of the radial part alone, each point's step halved as long as it
-        would leave the domain or not come nearer. It converges quadratically, to about 1e-15, wherever the radial
-        part keeps growing; beyond, nan."""
+        Newton's method in the plane, from the inverse of the radial part alone. Each point's step is halved while it
+        would leave the domain or not come nearer. It converges quadratically, to about 1e-15, wherever the radial part
+        keeps growing; beyond, nan."""
         distance = np.linalg.norm(d, axis=1)
         r = radial_inverse(distance, (self.k1, self.k2, self.k3), self._limit)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -89,8 +90,8 @@ class Radtan(DistortedModel):
             return np.where((distance <= self.reach)[:, None] & (np.hypot(u[:, :1], u[:, 1:]) < self._limit), u, np.nan)
         at, D = self._distort(u)
         lost = np.isnan(at[:, 0])
-        # A start outside of the domain (the tangential part may bring it back): from the middle, where the model is the
-        # identity.
+        # A start outside the domain (the tangential part may bring it back): start in the middle, where the model is
+        # the identity.
         u[lost] = 0.0
         at[lost], D[lost] = self._distort(u[lost])
         error, scale = at - d, np.ones(len(u))
@@ -110,14 +111,14 @@ class Radtan(DistortedModel):
         return np.where((size <= 1e-12 * (1 + distance))[:, None], u, np.nan)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2) px; nan for Z <= 0 and outside of the domain."""
+        """Return (..., 2) px; nan for Z <= 0 and outside the domain."""
         points = np.asarray(points, np.float64)
         flat = points.reshape(-1, 3)
         u = flat[:, :2] / np.where(flat[:, 2:] > 0, flat[:, 2:], np.nan)
         return (self._distort(u)[0] * [self.fx, self.fy] + [self.cx, self.cy]).reshape(*points.shape[:-1], 2)
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2, 3), by the chain rule."""
+        """Return (..., 2, 3), by the chain rule."""
         points = np.asarray(points, np.float64)
         flat = points.reshape(-1, 3)
         z = np.where(flat[:, 2] > 0, flat[:, 2], np.nan)
@@ -129,13 +130,13 @@ class Radtan(DistortedModel):
         return out.reshape(*points.shape[:-1], 2, 3)
 
     def rays(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3) with Z = 1; nan where the model has none."""
+        """Return (..., 3) with Z = 1; nan where there is no ray."""
         xy = np.asarray(xy, np.float64)
         u = self._undistort(((xy - [self.cx, self.cy]) / [self.fx, self.fy]).reshape(-1, 2))
         return np.concatenate([u, np.where(np.isnan(u[:, :1]), np.nan, 1.0)], axis=1).reshape(*xy.shape[:-1], 3)
 
     def ray_jacobian(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3, 2), the inverse of the distortion's derivative."""
+        """Return (..., 3, 2), the inverse of the distortion's derivative."""
         xy = np.asarray(xy, np.float64)
         u = self.rays(xy).reshape(-1, 3)[:, :2]
         D = self._distort(u)[1]

@@ -1,4 +1,4 @@
-"""Which camera models there are: one table of classes.
+"""The table of camera models: its rows are classes.
 
 @register
 @dataclass(frozen=True)
@@ -14,14 +14,14 @@ from typing import Any
 from blinkgl.camera.model import CameraModel
 
 CAMERA_MODELS: dict[str, type[CameraModel]] = {}
-"""By ``kind``."""
+"""Camera models by ``kind``."""
 
 
 def register(model: type[CameraModel]) -> type[CameraModel]:
-    """Puts a class into the table; returns it, so that it may stand above the class. That its parts agree with each
-    other, tests/camera/test_camera_models.py finds for every model of the table.
+    """Add a class to the table and return it, so that this is usable as a decorator. tests/camera/test_camera_models.py
+    checks for every model of the table that its parts agree.
 
-    Raises TypeError naming the model and the part that is missing; nothing is then registered."""
+    Raises TypeError naming the model and the missing part; nothing is then registered."""
     kind = _checked(model)
     if CAMERA_MODELS.get(kind, model) is not model:
         raise TypeError(f"camera model '{kind}': there is one already, {CAMERA_MODELS[kind].__name__}")
@@ -30,7 +30,7 @@ def register(model: type[CameraModel]) -> type[CameraModel]:
 
 
 def unregister(kind: str) -> None:
-    """Takes the model of this name out again. Raises KeyError where there is none."""
+    """Remove the model of this name. Raises KeyError if there is none."""
     del CAMERA_MODELS[kind]
 
 

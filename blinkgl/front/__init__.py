@@ -1,6 +1,7 @@
-"""The front door: what ``import blinkgl`` gives a person in Python (``blinkgl/__init__.py`` has the table of names).
+"""The public Python interface: the functions and classes behind ``import blinkgl`` (``blinkgl/__init__.py`` has the
+table of names).
 
-In:    plain Python values, every argument checked by name.
-Out:   the data classes and configurations that a YAML file becomes, and what the rooms make of them.
+In:    plain Python values; every argument is checked by name.
+Out:   the data classes and configurations that a YAML file gives, and the results of the rooms.
 Start: scenes.py; runs.py, drawing.py, files.py and sensors.py call one kind of room each.
 """

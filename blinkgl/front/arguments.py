@@ -1,4 +1,4 @@
-"""Arguments of a person's call: what is wrong with one is said in a line that begins with its name."""
+"""Checks of the arguments of public functions: an error message begins with the argument's name."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def public(function: Callable[Given, Made]) -> Callable[Given, Made]:
 
     @functools.wraps(function)
     def called(*args: Given.args, **kwargs: Given.kwargs) -> Made:
-        # What other keywords a function takes, it checks itself.
+        # A function with ``**keywords`` checks those itself.
         for key in () if more else kwargs:
             if key not in known:
                 raise unknown_argument(key, known, prefix)
@@ -48,7 +48,8 @@ def public(function: Callable[Given, Made]) -> Callable[Given, Made]:
 
 
 def unknown_argument(name: str, known: Iterable[str], prefix: str = "") -> ConfigError:
-    """The error of an argument that is none of the ``known``: the nearest of them, or where an emulator's key goes."""
+    """Return the error of an unknown argument: it suggests the nearest of the ``known``, or where an emulator's key
+    belongs."""
     from blinkgl.config.events import EmulatorConfig
     from blinkgl.config.problems import nearest
 
@@ -62,7 +63,8 @@ def unknown_argument(name: str, known: Iterable[str], prefix: str = "") -> Confi
 
 
 def plain(value: Any) -> Any:
-    """Lists and numbers of arrays, tuples and NumPy scalars, as a YAML file would have given them."""
+    """Return the value as plain lists and numbers instead of arrays, tuples and NumPy scalars, as a YAML file gives
+    it."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, np.generic):
@@ -75,19 +77,19 @@ def plain(value: Any) -> Any:
 
 
 def given(**arguments: Any) -> dict[str, Any]:
-    """The arguments that are not None, as plain data."""
+    """Return the arguments that are not None, as plain data."""
     return {name: plain(value) for name, value in arguments.items() if value is not None}
 
 
 def path(value: Any, where: str) -> Path:
-    """Raises ConfigError: no path."""
+    """Return a path. Raises ConfigError: not a path."""
     if not isinstance(value, (str, os.PathLike)) or not str(value):
         raise ConfigError("not a path", where=where, value=value, accepted="text or a pathlib.Path")
     return Path(value)
 
 
 def existing(value: Any, where: str) -> str:
-    """The path of a file that is there, as text. Raises ConfigError."""
+    """Return the path of an existing file, as text. Raises ConfigError."""
     if not path(value, where).expanduser().is_file():
         raise ConfigError("no such file", where=where, value=os.fspath(value), accepted="an existing file")
     return os.fspath(value)
@@ -96,7 +98,7 @@ def existing(value: Any, where: str) -> str:
 def number(
     value: Any, where: str, *, least: float = -math.inf, most: float = math.inf, above: float = -math.inf
 ) -> float:
-    """A finite number in [least, most] and greater than ``above``. Raises ConfigError."""
+    """Return a finite number in [least, most] and greater than ``above``. Raises ConfigError."""
     bounds = (
         [f"greater than {above:g}"] * (above > -math.inf)
         + [f"at least {least:g}"] * (least > -math.inf)
@@ -114,19 +116,19 @@ def number(
 
 
 def whole(value: Any, where: str, least: int, most: int) -> int:
-    """A whole number in [least, most]. Raises ConfigError."""
+    """Return a whole number in [least, most]. Raises ConfigError."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not least <= int(value) <= most:
         raise ConfigError("not a whole number in range", where=where, value=value, accepted=f"{least} to {most}")
     return int(value)
 
 
 def seed(value: Any, where: str = "seed") -> int:
-    """A whole number that a seed can be. Raises ConfigError."""
+    """Return a whole number that is valid as a seed. Raises ConfigError."""
     return whole(value, where, 0, 2**63 - 1)
 
 
 def one_of(value: Any, where: str, kinds: type | tuple[type, ...], accepted: str) -> Any:
-    """``value`` where it is of one of the classes. Raises ConfigError."""
+    """Return ``value`` if it is an instance of one of the classes. Raises ConfigError."""
     if not isinstance(value, kinds):
         kind = type(value).__name__
         raise ConfigError(f"not accepted: {kind}", where=where, value=value, accepted=accepted)
@@ -134,7 +136,7 @@ def one_of(value: Any, where: str, kinds: type | tuple[type, ...], accepted: str
 
 
 def array(value: Any, where: str, shape: tuple[int | None, ...], accepted: str) -> np.ndarray:
-    """A numeric array of the shape (None: any length). Raises ConfigError."""
+    """Return a numeric array of the shape (None: any length). Raises ConfigError."""
     try:
         made = np.asarray(value)
     except ValueError:  # rows of different lengths

@@ -25,9 +25,9 @@ _LATEST_S = 1e7
 class Renderer:
     """Draws one sequence's scene at any time. Holds OpenGL: ``with Renderer(scene) as renderer: renderer.image(0.2)``.
 
-    source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.   quality : as of
+    source : :class:`Scene` or the result of :func:`load`.   index : number of the sequence.   quality : as of
     :func:`record`. Times are seconds on the scene's clock, from ``start_s`` to ``end_s``;
-    outside them everything stands still.
+    outside them nothing moves.
     Raises ConfigError, AssetError, GLError."""
 
     @check.public
@@ -72,10 +72,11 @@ class Renderer:
         to: float | None = None,
         back_to: float | None = None,
     ) -> LabelFrame:
-        """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
+        """Return the :class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32
+        linear.
 
-        labels : as of :func:`record`, "events" left out, which is of no time.
-        to, back_to : s, where forward and backward lead; default: one label interval on and back."""
+        labels : as of :func:`record`, except "events", which has no single time.
+        to, back_to : s, end times of the forward and backward flow; default: one label interval later and earlier."""
         if of_events := [name for name in OF_EVENTS if name in label_names(labels)]:
             raise ConfigError(
                 "a label of events has no value at a time", where="labels", value=of_events[0], accepted="record()"
@@ -101,10 +102,10 @@ def _ns(seconds: float, where: str) -> int:
 def render_frame(
     source: Source, t: float, labels: Sequence[str | float] = ("images",), *, index: int = 0, to: float | None = None
 ) -> LabelFrame:
-    """Return one :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
+    """Return one :class:`LabelFrame` at t s; for many, use a :class:`Renderer`, which creates the OpenGL context once.
 
     labels : as of :func:`record`; images are ``.colour``, (H, W, 3) float32 linear, flow is
     ``.forward``, px, others have their own names.
-    to : s, time that the flow leads to; default: one label interval on.   Raises as :class:`Renderer`."""
+    to : s, end time of the flow; default: one label interval later.   Raises as :class:`Renderer`."""
     with Renderer(source, index=index) as renderer:
         return renderer.frame(t, labels, to=to)

@@ -1,6 +1,6 @@
-"""Events and flow in files, frames to events, two recordings side by side.
+"""Files of events and flow, conversion of frames to events, comparison of two recordings.
 
-What a function needs is imported when it is called: whoever reads one event file waits for no emulator."""
+Each function imports what it needs when it is called, so that reading an event file loads no emulator."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _SIDE = 65535
 @check.public
 def open_events(path: str | os.PathLike) -> EventFile:
     """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
-    ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs.
-    Formats and endings: docs/formats.md. Of .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
+    ``height``, ``width`` in px, None if the file does not contain them (``file.sized()`` computes them), times in µs.
+    Formats and endings: docs/formats.md. For .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
     ``file.imu()``, its inertial unit.
 
-    Raises AssetError: missing, unknown ending, or not what the ending says."""
+    Raises AssetError: missing file, unknown ending, or content of another format."""
     return formats.open_events(check.path(path, "path"))
 
 
@@ -42,8 +42,8 @@ def open_events(path: str | os.PathLike) -> EventFile:
 def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
     """Return all :class:`Events` of a file, t in µs, in memory.
 
-    truth : also read what made them (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
-    Raises AssetError and EventDataError (times that run backwards …)."""
+    truth : also read their causes (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
+    Raises AssetError and EventDataError (decreasing times …)."""
     with open_events(path) as file:
         events = file.read()
     if not check.one_of(truth, "truth", bool, "True or False"):
@@ -64,8 +64,8 @@ def write_events(
     time_unit: str = "s",
     overwrite: bool = True,
 ) -> int:
-    """Write events, or chunks in order, of a sensor of height x width px; the file appears
-    whole or not at all. Returns how many.
+    """Write events, or chunks in order, of a sensor of height x width px, and return their number. The file appears
+    complete or not at all.
 
     path : its ending names the format (docs/formats.md).   t_offset_us : DSEC's, µs.
     time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
@@ -109,9 +109,9 @@ def convert(
     time_unit: str = "s",
     overwrite: bool = True,
 ) -> int:
-    """Copy events from one file format to another, in pieces. Returns how many events.
+    """Copy events from one file format to another, in pieces. Returns the number of events.
 
-    size : (height, width), px, where ``source`` does not say.   time_unit : as of :func:`write_events`.
+    size : (height, width), px, if ``source`` does not contain it.   time_unit : as of :func:`write_events`.
     zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
     return formats.convert(
         check.path(source, "source"),
@@ -124,7 +124,7 @@ def convert(
 
 
 def _size(size: Any) -> tuple[int, int]:
-    """(height, width), px. Raises ConfigError."""
+    """Return (height, width), px. Raises ConfigError."""
     pair = check.one_of(size, "size", (list, tuple), "(height, width)")
     if len(pair) != 2:
         raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
@@ -145,7 +145,7 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
     of a .png (DSEC), .flo or .npy file.
 
-    Raises AssetError: missing, damaged, or no flow."""
+    Raises AssetError: missing, damaged, or not flow."""
     from blinkgl.io import flow as flow_files
 
     return flow_files.read_flow(check.path(path, "path"))
@@ -156,7 +156,7 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
     """Write flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16
     bit), .flo or .npy, by the ending.
 
-    Returns how many valid pixels the format could not hold; they are stored as invalid. Raises
+    Returns the number of valid pixels whose flow exceeds the format's range; they are stored as invalid. Raises
     OutputError, ConfigError."""
     from blinkgl.io import flow as flow_files
 
@@ -175,8 +175,8 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
 def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
 
-    form : "tum" or "euroc"; None: EuRoC's where lines have commas.
-    Raises AssetError, naming the line: no pose, times that do not increase, a gap."""
+    form : "tum" or "euroc"; None: EuRoC if lines contain commas.
+    Raises AssetError with the line: invalid pose, times that do not increase, a gap."""
     from blinkgl.io import trajectories
 
     if form not in (None, *trajectories.FORMATS):
@@ -186,8 +186,8 @@ def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tupl
 
 @check.public
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
-    """Write poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw: those of a sequence's
-    ``poses.npz`` are ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
+    """Write poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw. A sequence's
+    ``poses.npz`` has them as ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
     from blinkgl.io import trajectories
 
     times = check.array(t_ns, "t_ns", (None,), "an array (N,) of whole ns")
@@ -210,12 +210,12 @@ def compare(
     zero_time: bool = False,
     judge: bool = False,
 ) -> Comparison:
-    """Compare two event files over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
+    """Compare two event files over their common time: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: only ``a`` is described.
-    frames : video or folder of images both are compared with.   fps : of the frames, Hz.
+    frames : video or folder of images that both are compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
-    judge : also how well a classifier tells b from a, and the halves of each: ``told_apart``, ``halves``.
+    judge : also compute how well a classifier separates b from a, and the halves of each: ``told_apart``, ``halves``.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
 
@@ -253,15 +253,15 @@ def calibrate(
     seed: int = 0,
     **reading: Unpack[ReadingOptions],
 ) -> Calibration:
-    """Fit an emulator to a camera's own recording. ``config`` of the result is the emulator as fitted, ``values`` and
-    ``uncertainty`` belong to its fitted keys, ``untold`` says why others were not fitted, ``judged`` how near it
-    comes in the fitted half and in the other, ``sensor()`` is the table of a sensor file.
+    """Fit an emulator to a camera's own recording. Of the result, ``config`` is the fitted emulator, ``values`` and
+    ``uncertainty`` belong to its fitted keys, ``untold`` gives the reasons why others were not fitted, ``judged`` is
+    the difference from the recording in the fitted half and in the other, ``sensor()`` is the table of a sensor file.
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
-    name, or a mapping from which the fit begins.   fixed : its keys that stay as they are there.   still : a scene that
-    stands still in constant light, without frames: noise alone.   fps : of the frames, Hz.   timestamps : file
-    of the frames' times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them,
-    "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: found.
+    name, or a mapping of initial values.   fixed : keys that keep their initial values.   still : a static scene in
+    constant light, without frames: only noise is fitted.   fps : of the frames, Hz.   timestamps : file of the frames'
+    times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
+    "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: estimated.
     starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import calibration
@@ -294,7 +294,7 @@ def calibrate(
 
 
 class FrameOptions(TypedDict, total=False):
-    """Options of frames that become events; :func:`blinkgl.simulate` describes them."""
+    """Options of frames that are converted to events; :func:`blinkgl.simulate` describes them."""
 
     fps: float | None
     emulator: EmulatorSettings
@@ -310,19 +310,19 @@ class FrameOptions(TypedDict, total=False):
 def simulate(
     frames: Iterable, *, report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
-    """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
+    """Yield the :class:`Events` of any stream of frames, a chunk per step, t in µs; only the current frames are stored.
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
     t_ns). uint8, uint16, or float (1.0 is white).
-    emulator : as of :func:`record`, "esim" if not said.   seed : of its noise, 0 if not said.
-    sensor : the read-out limit of that camera, and with an emulator's name its values; frames keep their size.
-    gamma : "srgb", "linear" or an exponent; default: linear for floats, srgb for integers but grey ones of the size
-    of ``sensor``, which are taken for its own (``report.assumed_gamma``).   keep_noise : make events of the noise of
-    integer frames, too, which otherwise makes none (``report.noise``).
-    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, which frames need
-    between which things move further than 2 px (``report.guessed_over_px``).
+    emulator : as of :func:`record`, default "esim".   seed : of its noise, default 0.
+    sensor : camera whose read-out limit is used and, with an emulator's name, its values; frames keep their size.
+    gamma : "srgb", "linear" or an exponent; default: linear for floats, srgb for integers, except grey ones of the size
+    of ``sensor``, which count as its own (``report.assumed_gamma``).   keep_noise : also make events from the noise of
+    integer frames, which otherwise causes none (``report.noise``).
+    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, necessary for frames
+    between which motion exceeds 2 px (``report.guessed_over_px``).
     report : a SimulationReport to be filled.
-    Raises ConfigError at once; EventDataError as frames come, naming the frame."""
+    Raises ConfigError at once; EventDataError during iteration, naming the frame."""
     from blinkgl.recordings import simulation
 
     if not isinstance(frames, Iterable) or isinstance(frames, (str, os.PathLike)):
@@ -344,13 +344,13 @@ def simulate_file(
     overwrite: bool = True,
     **frames: Unpack[FrameOptions],
 ) -> SimulationReport:
-    """Turn a video, a folder of images or .npy frames (N, H, W[, 3]) into an event file, as
-    ``blinkgl simulate``; files appear whole or not at all.
+    """Convert a video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
+    ``blinkgl simulate``; files appear complete or not at all.
 
-    timestamps : file of times, one a frame.   size : (height, width), px, that frames are cropped and scaled to; None:
+    timestamps : file of times, one a frame.   size : (height, width), px, to which frames are cropped and scaled; None:
     that of ``sensor``, or else the frames' own.   preview : a video of frames and events to write.
-    frames : fps, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of :func:`simulate`.
-    Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
+    frames : fps, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of :func:`simulate`. Returns a
+    report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
     use, options = _options(**frames)
@@ -377,7 +377,7 @@ def _options(
     seed: int = 0,
     sensor: str | None = None,
 ) -> tuple[FrameUse, dict[str, Any]]:
-    """How frames become light, and what :func:`frames_to_events` takes beside it."""
+    """Return the conversion of frames to light, and the other arguments of :func:`frames_to_events`."""
     from blinkgl.config.sensor import load_sensor
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import simulation
@@ -406,7 +406,7 @@ def _fps(fps: float | None) -> float | None:
 
 
 def _frames(frames: Iterable) -> Iterator:
-    """The items, those that are no frames named by their number."""
+    """Yield the items; an error names an invalid frame by its number."""
     for k, item in enumerate(frames):
         try:
             array, *rest = item if isinstance(item, tuple) else (item,)

@@ -1,4 +1,4 @@
-"""Sequences rendered while they are used: samples for training, without files."""
+"""Sequences rendered during their use: samples for training, without files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_WINDOW_MS = 60_000
 
 
 class OnlineSequences:
-    """Samples of a recipe without an end, rendered by worker processes while you use them; no file is kept.
+    """Endless samples of a recipe, rendered by worker processes during their use; no file is kept.
 
         with OnlineSequences("recipe.yaml", window_ms=(5, 50), workers=2) as sequences:
             for sample in sequences:                 # the process that trains, or
@@ -30,28 +30,28 @@ class OnlineSequences:
             for batch in DataLoader(sequences.batches(8, collate), batch_size=None, num_workers=2):
                 ...                                  # torch: the same batches whatever num_workers
 
-    source : a recipe's path, or what :func:`load` gave of one. Groups are drawn by their numbers of sequences; each
-        sequence is drawn anew, so a recipe without anything to draw gives other windows of one scene.
-    kind : "windows" gives :class:`WindowSample`, two windows that meet and the flow over each; "streams" gives
-        :class:`StreamSample`, ``steps`` windows that follow each other and the flow over each.
+    source : a recipe's path, or the result of :func:`load` for one. Groups are drawn in proportion to their numbers of
+        sequences. Each sequence is drawn anew, so a recipe without random values gives other windows of one scene.
+    kind : "windows" gives :class:`WindowSample`, two adjacent windows and the flow over each; "streams" gives
+        :class:`StreamSample`, ``steps`` successive windows and the flow over each.
     window_ms : (shortest, longest) or one length, drawn log-uniformly for each sample; default: the recipe's label
         interval.   steps : windows of a sample of kind "streams".
-    per_sequence : samples out of one sequence, mixed with those of seven others.
+    per_sequence : samples from one sequence, mixed with those of seven others.
     min_events : fewest events in each window.   max_flow : longest median of a sample's flow, px.   min_density :
         fewest events per pixel of a window and px of its mean flow.   split : "train" or "test" groups.
-    workers : rendering processes, each with an OpenGL context and one thread; 0: this process, when asked.
-    seed : of everything.   rank, world : this process and the number of them in a distributed training: each renders
-        every ``world``-th block of one stream. Together they have each sample once, the same ones whatever ``world``.
-        Default: what `torchrun` (``RANK``, ``WORLD_SIZE``) or Ray Train say of this process; then its workers render on
-        one of several graphics cards, that of its ``LOCAL_RANK``. ``world=1``: the whole stream in every process.
-    first : the sample to continue with; samples before it are not rendered, but for those mixed with it.
+    workers : rendering processes, each with an OpenGL context and one thread; 0: this process renders on request.
+    seed : of everything.   rank, world : number of this process and of all processes in a distributed training: each
+        renders every ``world``-th block of one stream. Together they have each sample once, the same ones whatever
+        ``world``. Default: the values of `torchrun` (``RANK``, ``WORLD_SIZE``) or Ray Train; the workers then render on
+        one of several graphics cards, that of ``LOCAL_RANK``. ``world=1``: the whole stream in every process.
+    first : the sample to continue with; earlier samples are not rendered, except those mixed with it.
 
-    Sample n is a function of (recipe, seed, rank, world, n): not of workers, of who takes it, or of what came before.
-    Every sample is given once. Two blocks (of ``block`` samples, from eight sequences) are rendered ahead, then
-    rendering waits. Workers that die are replaced, sequences that fail are replaced by the next in a fixed order, and
-    counted; when half fail, the next sample raises. Memory does not grow with the number of samples.
+    Sample n is a function of (recipe, seed, rank, world, n) only: not of workers, readers or earlier samples. Every
+    sample is given once. Two blocks (of ``block`` samples, from eight sequences) are rendered ahead, then rendering
+    waits. Dead workers are replaced. Failed sequences are replaced by the next in a fixed order, and counted; when half
+    fail, the next sample raises. Memory does not grow with the number of samples.
 
-    stats : :class:`StreamStats`.   block : samples that are mixed with each other.   stream : what is below, a
+    stats : :class:`StreamStats`.   block : samples that are mixed with each other.   stream : the underlying
         :class:`~blinkgl.online.stream.SampleStream`.
     Raises ConfigError (a bad recipe, or bad arguments here; a recipe that gives no samples, at the sample), AssetError,
     GLError; EventDataError: a sample that was taken before, or after :meth:`close`."""
@@ -118,16 +118,16 @@ class OnlineSequences:
         return self.stream.take(check.whole(n, "n", self.first, 2**62))
 
     def __iter__(self) -> Iterator[WindowSample | StreamSample]:
-        """Iterate over samples from ``first`` on, without an end."""
+        """Iterate endlessly over samples from ``first`` on."""
         return (self.stream.take(n) for n in itertools.count(self.first))
 
     def batches(self, size: int, collate: Callable[[list], Any] = list, *, count: int | None = None) -> Batches:
-        """A ``torch.utils.data.IterableDataset`` of batches: batch k is ``collate`` of the samples from
-        first + k · size on. For ``DataLoader(…, batch_size=None, num_workers=N)``: ``collate`` runs in the loader's
-        processes, and the batches and their order are the same whatever N.
+        """Return a ``torch.utils.data.IterableDataset`` of batches: batch k is ``collate`` of the samples from first +
+        k · size on. For ``DataLoader(…, batch_size=None, num_workers=N)``: ``collate`` runs in the loader's processes,
+        and the batches and their order are the same whatever N.
 
-        collate : list of samples -> what a training step takes; of a module, so that loader processes find it.
-        count : how many batches; None: no end.   Raises ConfigError: torch is not installed."""
+        collate : list of samples -> input of a training step; a function of a module, so that loader processes find it.
+        count : number of batches; None: endless.   Raises ConfigError: torch is not installed."""
         size = check.whole(size, "size", 1, 1_000_000)
         count = None if count is None else check.whole(count, "count", 0, 2**62)
         try:
@@ -141,7 +141,7 @@ class OnlineSequences:
         return Batches(self.stream, self.first, size, collate, count)
 
     def close(self) -> None:
-        """End the workers and remove everything that they keep."""
+        """End the workers and remove all their files."""
         self.stream.close()
 
     def __enter__(self) -> OnlineSequences:

@@ -1,4 +1,4 @@
-"""Where bodies and cameras are, in Python: the pieces of a motion."""
+"""Poses and motions of bodies and cameras in Python."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ P = TypeVar("P")
 
 
 class Piece:
-    """A value that is checked when it is made. ``tree``: itself as plain data, as the YAML has it."""
+    """A value that is checked at creation. ``tree``: itself as plain data, as in the YAML."""
 
     tree: dict[str, Any]
 
@@ -30,8 +30,8 @@ class Piece:
             cls.__init__ = check.public(cls.__init__)
 
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
-        """``tree`` as it is, when the model takes it. renamed : what keys of the model are
-        called as arguments; "": by their own keys."""
+        """Return ``tree`` unchanged if the model accepts it. renamed : arguments of the model's keys
+        that have other names; "": the keys' own names."""
         try:
             validate(model, tree)
         except ConfigError as error:
@@ -47,9 +47,9 @@ class Piece:
 
 
 def signed_by(model: type[Config], **called: str) -> Callable[[type[P]], type[P]]:
-    """Gives a class whose constructor takes ``**keys`` of a model a signature that shows them, for help() and editors.
+    """Give a class whose constructor takes ``**keys`` of a model a signature that shows them, for help() and editors.
 
-    called : what keys of the model are called as arguments."""
+    called : argument names of the model's keys."""
 
     def sign(kind: type[P]) -> type[P]:
         own = [p for p in inspect.signature(kind.__init__).parameters.values() if p.name not in ("self", "keys")]
@@ -74,8 +74,8 @@ class Pose(Piece):
     """Position and orientation of a body or a camera; give at most one form of the orientation.
 
     position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
-    look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At
-    rest a camera looks along +x with z up.
+    look_at : (3,) m, the point towards which a camera's z axis, or a body's x axis, is turned. Without orientation a
+    camera looks along +x with z up.
     Raises ConfigError."""
 
     def __init__(
@@ -92,8 +92,8 @@ class Pose(Piece):
 
     @classmethod
     def from_matrix(cls, T: ArrayLike, where: str = "Pose.from_matrix") -> Pose:
-        """The pose of T_world_body or T_world_cam, (4, 4): from the body's axes to the world's, z up; a camera's are
-        x right, y down, z forward. Raises ConfigError: not rigid."""
+        """Return the pose of T_world_body or T_world_cam, (4, 4): from the body's axes to the world's, z up; a camera's
+        are x right, y down, z forward. Raises ConfigError: not rigid."""
         matrix = check.array(T, where, (4, 4), "an array (4, 4)")
         try:
             check_rigid(check.plain(matrix), where)
@@ -113,12 +113,12 @@ def look_at(position: Vector, target: Vector) -> Pose:
 
 
 class Keyframes(Piece):
-    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before
+    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, constant before
     the first time and after the last.
 
     poses : time in s -> :class:`Pose`, two or more; from one to the next less than half a turn.
-    interpolation : "spline" (twice continuously differentiable) or "linear" (straight lines and slerp).
-    Raises ConfigError."""
+    interpolation : "spline" (twice continuously differentiable) or "linear" (straight lines and slerp). Raises
+    ConfigError."""
 
     def __init__(self, poses: Mapping[float, Pose], interpolation: Literal["spline", "linear"] = "spline"):
         check.one_of(poses, "Keyframes.poses", Mapping, "a table of times and poses")
@@ -136,7 +136,7 @@ class Keyframes(Piece):
     def from_arrays(
         cls, times_s: ArrayLike, T: ArrayLike, *, interpolation: Literal["spline", "linear"] = "spline"
     ) -> Keyframes:
-        """The motion through poses at times_s, (N,) s, increasing: T is (N, 4, 4), each as of
+        """Return the motion through poses at times_s, (N,) s, increasing: T is (N, 4, 4), each as of
         :meth:`Pose.from_matrix`. Raises ConfigError."""
         times = check.array(times_s, "Keyframes.from_arrays.times_s", (None,), "an array (N,), s")
         poses = check.array(T, "Keyframes.from_arrays.T", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
@@ -154,12 +154,12 @@ class Keyframes(Piece):
 class Trajectory(Piece):
     """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
 
-    file : path.   form : "tum", "euroc"; "auto": EuRoC's where lines have commas.   start : s on the file's clock that
-    are 0 s on the scene's; None: its first pose is where the sequence begins.   smooth : s, each pose becomes the mean
-    of those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
-    T_body_sensor : where the camera or body that follows it is on the body whose poses these are: (4, 4), or the path
-    of EuRoC's sensor.yaml, whose T_BS that is; None: it is that body.
-    Raises ConfigError; a file that does not cover the sequence is found when the scene is built."""
+    file : path.   form : "tum", "euroc"; "auto": EuRoC if lines contain commas.   start : time on the file's clock, s,
+    of 0 s on the scene's; None: the sequence begins at the first pose.   smooth : s, each pose becomes the mean of
+    those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
+    T_body_sensor : pose of the camera or body of this motion on the body of the file's poses: (4, 4), or the path of
+    EuRoC's sensor.yaml, whose T_BS it is; None: the same body.
+    Raises ConfigError; a file that does not cover the sequence raises when the scene is built."""
 
     def __init__(
         self,
@@ -185,7 +185,7 @@ class Trajectory(Piece):
 
 
 def motion_tree(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:
-    """A position alone is a pose. others : what else may be given, for the message."""
+    """Return the table of a motion; a position alone is a pose. others : other accepted values, for the message."""
     if isinstance(pose, (Pose, Keyframes, Trajectory)):
         return pose.tree
     if np.shape(pose) == (4, 4):

@@ -1,4 +1,4 @@
-"""Rigs in Python: the pieces of ``sensors:``, checked by the same models.
+"""Rigs in Python: the parts of ``sensors:``, checked by the same models.
 
     rig = Rig(
         RigSensor("left", camera=Camera(640, 480, fov=70), pair="right"),
@@ -6,8 +6,8 @@
         RigSensor("imu", imu="adis16448", position=(0.05, 0.02, 0)),
     )
 
-The camera of the :class:`~blinkgl.front.scenes.Scene` moves the rig: its pose is the rig's, and keys that a sensor's
-camera does not set come from it.
+The pose of the :class:`~blinkgl.front.scenes.Scene`'s camera is the rig's, and this camera also gives the keys that a
+sensor's camera does not set.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from blinkgl.front.sections import (
 class RigSensor(Piece):
     """One device on a rig: an event camera, a frame camera, an inertial unit, or several of them behind one lens.
 
-    name : of its folder, and by which it is found in a recording.
+    name : of its folder and of its part of a recording.
     position : (3,) m on the rig's axes, x right, y down, z forward.   euler : (3,) degrees about the rig's x, y, z
-    axes; or quaternion : (4,) w, x, y, z; or matrix : (4, 4) T_rig_sensor, from the sensor's axes to the rig's, in the
-    place of all of them.
+    axes; or quaternion : (4,) w, x, y, z; or matrix : (4, 4) T_rig_sensor, from the sensor's axes to the rig's, instead
+    of all of them.
     pair : name of the other eye of a rectified stereo pair.
     camera : :class:`Camera` without a pose, or a table of ``camera:`` over the scene's; None: the scene's.
-    events : whether it makes events; None: where it has neither images nor imu.
-    emulator, sensor, labels, images, imu, tracks : as of :func:`record`; None: emulator, sensor and labels are the
-    run's, the others are not there.   readout : a table of ``readout:``.
+    events : whether it makes events; None: if it has neither images nor imu.
+    emulator, sensor, labels, images, imu, tracks : as of :func:`record`; None: emulator, sensor and labels of the run,
+    and none of the others.   readout : a table of ``readout:``.
     Raises ConfigError."""
 
     def __init__(
@@ -95,12 +95,13 @@ class RigSensor(Piece):
             if given is not None:
                 tree[key] = section_tree(key, given)
         said = {key: value for key, value in tree.items() if key not in ("events", "sensor", "camera")}
-        self._checked(RigSensorConfig, said)  # those three are whole when the run's are laid under them
+        self._checked(RigSensorConfig, said)  # these three are complete after merging with the run's
         self.tree = tree
 
 
 def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
-    """All keys of a Camera, so that none of the run's camera shows through; those of a table."""
+    """Return all keys of a Camera, so that none of the run's camera is merged into it; only the given ones of a
+    table."""
     if isinstance(camera, Mapping):
         return check.given(**camera)
     check.one_of(camera, "RigSensor.camera", Camera, "a Camera, or a table such as {'fov': 80}")
@@ -118,14 +119,14 @@ class Rig(Piece):
     """Sensors that move together: ``record_rig(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
 
     sensors : :class:`RigSensor`, with different names.   preset : "stereo", "davis", "dsec" or "mvsec": its sensors
-    first, changed by those of ``sensors`` with the same names (docs/rigs.md).
+    come first, changed by those of ``sensors`` with the same names (docs/rigs.md).
     Raises ConfigError; what depends on the scene's camera is checked when the rig is used."""
 
     def __init__(self, *sensors: RigSensor, preset: str | None = None):
         for k, one in enumerate(sensors):
             check.one_of(one, f"Rig.sensors[{k}]", RigSensor, "a RigSensor")
         self.sensors = sensors
-        # both keys: a rig takes the place of that which a configuration has
+        # both keys: a rig replaces the one of a configuration
         self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors] or None}
         try:
             spelled_out(self.tree, ())
@@ -138,10 +139,10 @@ class Rig(Piece):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of ``sensors``; a preset has its own in addition."""
+        """Return the names of ``sensors``; a preset has further ones."""
         return tuple(one.tree["name"] for one in self.sensors)
 
 
 def rig_of(given: Rig | str) -> Rig:
-    """A rig, or that of a preset's name. Raises ConfigError."""
+    """Return a rig, or that of a preset's name. Raises ConfigError."""
     return Rig(preset=given) if isinstance(given, str) else check.one_of(given, "rig", Rig, "a Rig, or a preset's name")

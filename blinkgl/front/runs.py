@@ -1,4 +1,4 @@
-"""Runs from Python: a YAML file or a :class:`~blinkgl.front.scenes.Scene` in, a data set out."""
+"""Runs from Python: from a YAML file or a :class:`~blinkgl.front.scenes.Scene` to a data set."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Timeline:
 
 @check.public
 def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
-    """Read and check the run that a YAML file describes, for :func:`generate`, :func:`record`, :func:`render_frame`.
+    """Read and check the run of a YAML file, for :func:`generate`, :func:`record`, :func:`render_frame`.
 
     overrides : "path.to.key=value", as ``--set``.   seed : instead of the file's.
     ``load(path).sequence(3)`` is the configuration of sequence 3, every value drawn.
@@ -75,7 +75,7 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 
 
 class Settings(TypedDict, total=False):
-    """Values over those of a run's source; :func:`blinkgl.record` describes them. None keeps the source's."""
+    """Values that replace those of a run's source; :func:`blinkgl.record` describes them. None keeps the source's."""
 
     emulator: EmulatorSettings | None
     sensor: str | None
@@ -98,14 +98,14 @@ def generate(
     rig: Rig | str | None = None,
     **settings: Unpack[Settings],
 ) -> Outcome:
-    """Make a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
+    """Make a data set in the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
-    source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
-    most).   workers : processes; 1: this one.
-    resume : continue where ``out`` holds sequences of this run.   settings : emulator, sensor, timeline, quality,
+    source : :class:`Scene` or the result of :func:`load`.   num : number of sequences (of each group at most).
+    workers : processes; 1: this one.
+    resume : continue where ``out`` contains sequences of this run.   settings : emulator, sensor, timeline, quality,
     labels, images, imu, tracks as of :func:`record`, rig as of :func:`record_rig`.
-    Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
-    Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
+    Returns the counts (``made.events``, ``made.labels`` …) and the sequences set aside.
+    Raises BlinkGLError: ConfigError (also for a scene with arrays: save them to files
     first), AssetError, GLError, OutputError."""
     from blinkgl.dataset.executor import Inline, Local
     from blinkgl.dataset.run import run_dataset
@@ -126,7 +126,7 @@ def generate(
 
 @check.public
 def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
-    """Check a data set; ``.clean`` says whether it has no problem, ``.problems`` lists them by sequence.
+    """Check a data set; ``.clean`` tells whether it has no problem, ``.problems`` lists them by sequence.
 
     deep : number of sequences that are made again and compared.   seed : selects them.
     Raises AssetError: no data set there."""
@@ -143,11 +143,11 @@ _SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "sensor": ("sensor", check.plain),
     "quality": ("quality", check.plain),
 }
-"""Argument -> key of the configuration, and what reads it."""
+"""Argument -> key of the configuration, and the function that reads it."""
 
 
 def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[Settings]) -> RunTemplate:
-    """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
+    """Return ``source`` as a run, with the given values replacing its own. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load(path) gives")
     template = source.template() if isinstance(source, Scene) else source
     own: dict[str, Any] = {}
@@ -165,7 +165,7 @@ def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[
 
 
 def requested(source: Source, config: SequenceConfig, index: int, **wanted: Any) -> SequenceRequest:
-    """Sequence ``index`` of ``source``.   wanted : as of :class:`SequenceRequest`."""
+    """Return the request for sequence ``index`` of ``source``.   wanted : as of :class:`SequenceRequest`."""
     from blinkgl.sequence.request import SequenceRequest
 
     if isinstance(source, Scene):
@@ -174,7 +174,7 @@ def requested(source: Source, config: SequenceConfig, index: int, **wanted: Any)
 
 
 def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:
-    """What sequence ``index`` shows. Raises ConfigError and AssetError."""
+    """Return the scene of sequence ``index``. Raises ConfigError and AssetError."""
     if isinstance(source, Scene):
         return source.build(config)
     from blinkgl.scene.build import sequence_scene

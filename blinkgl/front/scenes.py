@@ -1,13 +1,13 @@
-"""Scenes in Python: the pieces of ``scene: {kind: explicit}``, checked by the same models,
+"""Scenes in Python: the parts of ``scene: {kind: explicit}``, checked by the same models,
 drawn from the same data classes.
 
     path = Keyframes({0: look_at((-3, 0, 1), (0, 0, 0)), 1: look_at((-3, 1, 1), (0, 0, 0))})
     scene = Scene(Camera(320, 240, pose=path))
     scene += Primitive("cuboid", material=Material(procedural="bricks"))
 
-World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All pieces are
-values: nothing changes them, ``scene + body`` is another scene. A wrong argument raises ConfigError, which names
-it, when the piece is made.
+World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All parts are
+immutable values: ``scene + body`` is another scene. A wrong argument raises a ConfigError with its name when the part
+is created.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Camera(Piece):
     cx, cy : principal point, px; (0, 0) is the centre of the top-left pixel; default: the image's
     centre.   near : m, nothing nearer is drawn.
     lens : "pinhole", "radtan" with distortion=(k1, k2, p1, p2[, k3]), or "equidistant" with (k1, k2, k3, k4).
-    calibration : YAML file of Kalibr or DSEC in the place of size, intrinsics and lens; calibration_name : which camera
-    of it.
+    calibration : YAML file of Kalibr or DSEC instead of size, intrinsics and lens; calibration_name : the camera's name
+    in it.
     pose : :class:`Pose`, :class:`Keyframes`, :class:`Trajectory` or a position (3,); OpenCV axes (x right, y down, z
     forward).
     Raises ConfigError."""
@@ -75,12 +75,12 @@ class Camera(Piece):
 class Body(Piece):
     """Physics of a body: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
 
-    kind : "dynamic" falls; "fixed" stays, or follows its path, whatever hits it; "none" takes no part.
+    kind : "dynamic" falls; "fixed" stays, or follows its path, whatever hits it; "none" has no collisions.
     mass : kg, or by density : kg/m³ (default 700).
-    friction : Coulomb's coefficient.   rolling : the same of rolling, of the radius.
-    restitution : share of the speed that an impact leaves.
-    velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes.
-    Raises ConfigError; a missing MuJoCo and bodies inside each other are found when the scene is built."""
+    friction : Coulomb's coefficient.   rolling : the coefficient of rolling, as a part of the radius.
+    restitution : fraction of the speed that remains after an impact.
+    velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes. Raises
+    ConfigError; a missing MuJoCo and intersecting bodies raise when the scene is built."""
 
     def __init__(self, kind: Literal["dynamic", "fixed", "none"] = "dynamic", **keys: Any):
         self.tree = self._checked(BodyConfig, check.given(kind=kind, **keys))
@@ -89,7 +89,7 @@ class Body(Piece):
 class Deform(Piece):
     """Change of a body's shape over time, by a formula: ``Mesh("tree.glb", deform=Deform("bend", angle=10))``.
 
-    kind : "wave", "flag", "twist", "bend", "breathe", or that of a deformer of your own.
+    kind : "wave", "flag", "twist", "bend", "breathe", or that of your own deformer.
     keys : of that kind (docs/configuration.md, "deform"), such as ``amplitude`` and ``wavelength`` in parts of the
     body's size, ``period`` s, ``phase`` and ``angle`` degrees, ``along`` and ``towards`` axes of the body at rest.
     Raises ConfigError."""
@@ -101,13 +101,13 @@ class Deform(Piece):
 
 
 class Animation(Piece):
-    """A clip that a glTF file's skins, morph targets and nodes play: ``Mesh("ann.glb",
+    """A clip for a glTF file's skins, morph targets and nodes: ``Mesh("ann.glb",
     animation=Animation("Walk", speed=1.2))``.
 
-    clip : name or number of the animation.   file : another glTF file that it is taken from, whose joints have the
-    same names; None: the mesh's own.   speed : of the clip's own, negative backwards.   phase : s of the clip at
-    time 0.   loop : begins again at its end; False: held before its first and after its last key.
-    Raises ConfigError; a clip that the file lacks is found when the scene is built."""
+    clip : name or number of the animation.   file : another glTF file that contains it, whose joints have the same
+    names; None: the mesh's own.   speed : factor on the clip's own, negative backwards.   phase : s of the clip at time
+    0.   loop : restarts at its end; False: constant before its first and after its last key.
+    Raises ConfigError; a clip that the file does not contain raises when the scene is built."""
 
     def __init__(
         self,
@@ -123,12 +123,12 @@ class Animation(Piece):
 
 
 class Way(Piece):
-    """A curve that a body follows at one speed, its x axis ahead: the ``pose`` of a figure that walks.
+    """A curve that a body follows at constant speed, its x axis forwards: the ``pose`` of a walking figure.
 
-    points : (N, 3) m, two or more, which the curve passes smoothly; beyond its ends it goes straight on.
-    speed : m/s; None: as fast as a figure's steps or a fish's strokes take it, 1 for other bodies.
-    closed : from the last point back to the first, and on.   level : the body's z axis stays up; False: its x axis goes
-    up and down with the way.   start : share of the way already covered at time 0.
+    points : (N, 3) m, two or more, through which the curve passes smoothly; beyond its ends it is straight.
+    speed : m/s; None: the speed of a figure's steps or a fish's strokes, 1 for other bodies.
+    closed : continue from the last point to the first.   level : the body's z axis stays up; False: its x axis follows
+    the curve's slope.   start : fraction of the curve already covered at time 0.
     Raises ConfigError."""
 
     def __init__(
@@ -146,7 +146,7 @@ class Way(Piece):
 
 
 class _Object(Piece):
-    """What primitives and meshes share: an object of the scene, its mesh and its material."""
+    """Common base of primitives and meshes: an object of the scene, its mesh and its material."""
 
     mesh: dict[str, Any]
     triangles: data.Mesh | None = None
@@ -178,12 +178,13 @@ class _Object(Piece):
 
 
 class Primitive(_Object):
-    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid, die,
-    or one that moves by itself: figure, flag, fish.
+    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid, die, or
+    one that moves by itself: figure, flag, fish.
 
-    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``, and what a figure does,
+    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``, and a figure's movement,
     such as ``clip="dance"`` (docs/configuration.md, "primitives").
-    material : :class:`Material`, default white, or the coat of figures, flags and fish.   scale : one factor, or (3,).
+    material : :class:`Material`, default white, or the texture of figures, flags and fish.   scale : one factor, or
+    (3,).
     pose : :class:`Pose`, :class:`Keyframes`, :class:`Trajectory`, :class:`Way` or a position (3,).
     name : default the shape's.   category : "object", "ground", "wall" or "sky", for collisions.
     body : its physics, :class:`Body`; None: an obstacle.
@@ -229,8 +230,8 @@ class Mesh(_Object):
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
     category, body, deform : as of :class:`Primitive`.
-    animation : of a glTF file: a clip's name or number, looped, or an :class:`Animation`; None: nothing is played.
-    Raises ConfigError; a damaged file raises when the scene is built."""
+    animation : of a glTF file: a clip's name or number, looped, or an :class:`Animation`; None: no animation. Raises
+    ConfigError; a damaged file raises when the scene is built."""
 
     def __init__(
         self,
@@ -254,7 +255,7 @@ class Mesh(_Object):
         if file is not None:
             self.mesh = self._checked(MeshConfig, check.given(file=str(check.path(file, "Mesh.file")), up=up))
         elif vertices is not None and faces is not None:
-            # The model wants a shape or a file; explicit_scene is given these triangles under the mesh's name.
+            # The model requires a shape or a file; explicit_scene gets these triangles under the mesh's name.
             self.mesh, self.triangles = {"primitive": "grid"}, _triangles(vertices, faces, uvs)
             material = material if material is not None else Material()
         if animation is not None and (file is None or Path(file).suffix.lower() not in (".glb", ".gltf")):
@@ -297,8 +298,8 @@ class Scene(Piece):
     """Bodies before a camera, for a duration. ``scene + body`` is a scene with one more.
 
     camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
-    light : :class:`Light`.   background : linear radiance where nothing is hit.   fog : density per metre and linear
-    radiance of fog between the camera and everything; None: clear air.
+    light : :class:`Light`.   background : linear radiance of pixels without a surface.   fog : density per metre and
+    linear radiance of fog between the camera and every surface; None: clear air.
     duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label
     interval after ``start``, so that a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
     collisions : stop bodies where they collide.   gravity : (3,) m/s², without effect if no object is a dynamic
@@ -351,11 +352,12 @@ class Scene(Piece):
             **foggy,
             **({"physics": self._gravity} if falls else {}),
         }
-        if self.objects:  # a scene without bodies is refused where it is used: `scene + body` begins with one
+        if self.objects:  # a scene without bodies is refused at its use, because `scene + body` begins with one
             self._checked(ExplicitSceneConfig, self.tree)
 
     def _listed(self, falls: bool) -> dict[str, Any]:
-        """Meshes, materials and objects by name; what is made of arrays goes into memory. falls : something does."""
+        """Return meshes, materials and objects by name; those made of arrays are kept in memory. falls : a body is
+        dynamic."""
         named, meshes, materials = [], {}, {}
         taken: set[str] = set()
         for k, body in enumerate(self.objects):
@@ -394,7 +396,7 @@ class Scene(Piece):
         return f"<Scene of {len(self.objects)} objects>"
 
     def template(self) -> RunTemplate:
-        """The scene as the run that a YAML file would be, relative paths from the working
+        """Return the scene as the run of an equivalent YAML file, relative paths from the working
         folder. Raises ConfigError: no objects."""
         if not self.objects:
             raise ConfigError(
@@ -404,11 +406,11 @@ class Scene(Piece):
 
     @property
     def on_disk(self) -> bool:
-        """Whether a YAML file could say it: nothing is made of arrays."""
+        """Whether a YAML file could describe it: no part is made of arrays."""
         return not (self._memory.meshes or self._memory.textures or self._memory.maps)
 
     def build(self, config: SequenceConfig) -> data.Scene:
-        """What the renderer draws. Raises ConfigError and AssetError: files."""
+        """Return the scene for the renderer. Raises ConfigError and AssetError: files."""
         from blinkgl.scene.build import equipped, in_fog, seen_by
 
         span_ns = config.time.t0_ns, config.time.t1_ns

@@ -1,4 +1,4 @@
-"""Sections of a configuration from the arguments of a person's call: a name, a table, or the model itself."""
+"""Sections of a configuration from the arguments of a call: a name, a table, or the model itself."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TrackSettings = str | Mapping[str, Any] | Config
 
 
 def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
-    """``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
+    """Return ``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
     from blinkgl.recordings.simulation import emulator_config
 
     if not isinstance(emulator, (str, Mapping, Config)):
@@ -49,11 +49,11 @@ NAMED = {
     "imu": ("preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}"),
     "tracks": ("choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"),
 }
-"""Sections of a configuration: the key that a text is, what it is, what is accepted."""
+"""Sections of a configuration: the key set by a text, its description, the accepted values."""
 
 
 def section_tree(key: str, given: Any) -> dict[str, Any]:
-    """A section of :data:`NAMED`, of a name, a table, or a configuration. Raises ConfigError."""
+    """Return a section of :data:`NAMED`, from a name, a table, or a configuration. Raises ConfigError."""
     named, what, accepted = NAMED[key]
     if not isinstance(given, (str, Mapping, Config)):
         raise ConfigError(f"not {what}", where=key, value=given, accepted=accepted)
@@ -67,12 +67,12 @@ def section_tree(key: str, given: Any) -> dict[str, Any]:
 
 _FORMER = {"flow": "'forward', as in labels.flow of a YAML", "flow_backward": "'backward', as in labels.flow of a YAML"}
 OF_EVENTS = ("events",)
-"""Labels that are of events and not of a time."""
+"""Labels that belong to events and not to a time."""
 
 
 def label_names(labels: Sequence[str | float]) -> set[str | float]:
-    """Names, and intervals of flow, s. Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
-    # Intervals are asked for by numbers.
+    """Return the names, and the intervals of flow, s. Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
+    # Intervals are requested by numbers.
     known = [*dict.fromkeys(one.said for one in LABELS.values() if one.said != "flow_intervals"), *OF_EVENTS]
     wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
@@ -84,12 +84,12 @@ def label_names(labels: Sequence[str | float]) -> set[str | float]:
 
 
 def is_interval(label: Any) -> bool:
-    """Whether a label is the interval of a flow, s; which ones there may be says ``labels.flow``."""
+    """Whether a label is the interval of a flow, s; ``labels.flow`` checks which ones are valid."""
     return isinstance(label, (int, float)) and not isinstance(label, bool)
 
 
 def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
-    """``labels:`` that asks for these and no others. Raises ConfigError as :func:`label_names`."""
+    """Return the ``labels:`` that requests exactly these. Raises ConfigError as :func:`label_names`."""
     wanted = label_names(labels)
     everything: dict[str, Any] = {}
     asked: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Event cameras: emulators to feed frames to, and the shipped sensors' values."""
+"""Event cameras: emulators for frames, and the values of the included sensors."""
 
 from __future__ import annotations
 
@@ -55,10 +55,11 @@ DvsVoltmeter.__doc__ = (
 
 @check.public
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
-    """Return the values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
+    """Return the values of an included camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
     (case and punctuation do not matter), or of a sensor file by its path.
 
-    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …, None where
-    the file does not say; ``values("v2e")`` gives an emulator's keys.
-    unit : where values are distributions over units: the unit of this number; None: the middle. Raises ConfigError."""
+    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …, None if the
+    file does not contain it; ``values("v2e")`` gives an emulator's keys.
+    unit : for values that are distributions over units: the number of the unit; None: the middle value. Raises
+    ConfigError."""
     return _load_sensor(name, None if unit is None else check.whole(unit, "unit", 0, 2**31))

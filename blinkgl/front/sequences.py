@@ -1,4 +1,4 @@
-"""A sequence as it happens, and one held in memory."""
+"""Iteration over a sequence during its simulation, and a sequence in memory."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def simulate_sequence(
     pictures_hz: float | None = None,
     **settings: Unpack[Settings],
 ) -> Simulation:
-    """Iterate over one sequence in the order of time; nothing is written and nothing is kept:
+    """Iterate over one sequence in the order of time; nothing is written or stored:
 
         for item in simulate_sequence(scene):
             match item:
@@ -51,15 +51,15 @@ def simulate_sequence(
     All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is
     released when the loop ends, also by an error.
 
-    source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
+    source : :class:`Scene` or the result of :func:`load`, recorded frames (``frames:``)
     included.   index : number of the sequence.
-    settings : emulator, sensor, timeline, quality, labels, images, imu, tracks as of :func:`record`; what ``labels``
-    does not name is not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
-    events : False leaves them out.
+    settings : emulator, sensor, timeline, quality, labels, images, imu, tracks as of :func:`record`; labels not in
+    ``labels`` are not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
+    events : False: no events.
     pictures_hz : number of :class:`Picture` per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
-    ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
-    GLError and, as it goes, EventDataError."""
+    ``labels``. Iterate over it once, or use it in ``with`` if it may not be iterated. Raises ConfigError, AssetError,
+    GLError and, during iteration, EventDataError."""
     config = _configured(source, index, settings)
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
@@ -77,11 +77,11 @@ class Recording:
 
     events : all of them, t in µs on the scene's clock.   t_us : (K,) int64, times of the labels.
     labels : K times :class:`LabelFrame`; labels that were not requested are None.
-    images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
-    config : every value as drawn.   frames : how many the emulator saw.
-    lost : events that its limit and the read-out dropped.
+    images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones unchanged), or None.
+    config : every value as drawn.   frames : number of frames that the emulator received.
+    lost : events dropped by its limit and the read-out.
     camera : :class:`CameraImage` of the frame camera, with ``images:``.
-    imu : measurements of the inertial unit, :class:`~blinkgl.sequence.inertial.Inertial`; None: there is none.
+    imu : measurements of the inertial unit, :class:`~blinkgl.sequence.inertial.Inertial`; None: no unit.
     tracks : tracked points, :class:`~blinkgl.render.tracks.Tracks`; None: not requested."""
 
     events: Events
@@ -104,11 +104,11 @@ class Recording:
 
     @property
     def valid(self) -> np.ndarray:
-        """(K, H, W) bool."""
+        """(K, H, W) bool: where :attr:`flow` is valid."""
         return np.stack([flow.valid for flow in self._forward()])
 
     def window(self, k: int) -> Events:
-        """Return the events from label ``k``'s time until the next one's, which flow ``k`` spans."""
+        """Return the events from label ``k``'s time until the next one's, the time of flow ``k``."""
         k = check.whole(k, "k", 0, len(self.t_us) - 1)
         return self.events.window(int(self.t_us[k]), int(self.image_t_us[k + 1]))
 
@@ -121,16 +121,16 @@ class Recording:
 
 @check.public
 def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
-    """Return events, images and ground truth of one sequence as arrays, what :func:`generate` writes.
+    """Return events, images and ground truth of one sequence as arrays, as :func:`generate` writes them.
 
-    source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.
+    source : :class:`Scene` or the result of :func:`load`.   index : number of the sequence.
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
     sensor : camera that gives size, emulator values and read-out, such as "davis346".
     timeline : :class:`Timeline`.
     quality : "fast", "balanced" (the default), "accurate" or "reference".
     labels : names of labels, such as images, forward and backward (flow), occlusion, depth
-    (docs/configuration.md has all), and numbers: intervals of ``flow_intervals``, s; "events": what made each
-    event, ``events.truth``; default: the source's.
+    (docs/configuration.md has all), and numbers: intervals of ``flow_intervals``, s; "events": the cause of each event,
+    ``events.truth``; default: the source's.
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
@@ -144,7 +144,7 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
 
 
 class Gathered:
-    """What has happened in one sequence so far, to become a :class:`Recording`."""
+    """The items of one sequence so far, from which a :class:`Recording` is made."""
 
     def __init__(self) -> None:
         self._events: list[Events] = []
@@ -154,7 +154,7 @@ class Gathered:
         self._images: list[CameraImage] = []
 
     def take(self, item: Item) -> None:
-        """Pictures for those who watch are not kept."""
+        """Store an item; pictures for display are not stored."""
         if isinstance(item, EventChunk):
             self._events.append(item.events)
         elif isinstance(item, GroundTruth):
@@ -167,7 +167,7 @@ class Gathered:
             self._images.append(item)
 
     def recording(self, sequence: Simulation) -> Recording:
-        """Of the sequence that all items were of."""
+        """Return the recording of the sequence of all items."""
         t_us = np.array(self._t_us, np.int64)
         return Recording(
             Events.concatenate(self._events),
@@ -185,25 +185,25 @@ class Gathered:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A rig's sequence as it happens, and one held in memory.
+# Iteration over a rig's sequence during its simulation, and one in memory.
 
 
 @check.public
 def simulate_rig(
     source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigSequence:
-    """Iterate over what a rig's sensors record, in the order of time; nothing is written and nothing is kept:
+    """Iterate over the data of a rig's sensors in the order of time; nothing is written or stored:
 
         for member, item in simulate_rig(scene, "stereo"):
             member.name, item                 # "left", EventChunk(…): items as of simulate_sequence
 
-    source : :class:`Scene`, whose camera's pose is the rig's, or what :func:`load` gave.
+    source : :class:`Scene`, whose camera's pose is the rig's, or the result of :func:`load`.
     rig : :class:`Rig`, or a preset's name; None: the source's.   index : number of the sequence.
     settings : emulator, sensor, timeline, quality, labels of all its cameras that do not set them, as of
     :func:`record`.
     The iterator has ``config``, ``scene``, ``t0_ns``, ``t1_ns`` and ``members``, one of each camera, as
-    :func:`simulate_sequence` gives them; ``inertial_units()`` is what the other sensors measured. Iterate over it once,
-    or use it in ``with``. Raises ConfigError, AssetError, GLError and, as it goes, EventDataError."""
+    :func:`simulate_sequence` gives them; ``inertial_units()`` gives the inertial measurements. Iterate over it once, or
+    use it in ``with``. Raises ConfigError, AssetError, GLError and, during iteration, EventDataError."""
     template = configured(source, rig, **settings)
     config = template.sequence(check.whole(index, "index", 0, MAX_INDEX))
     if config.sensors is None:
@@ -217,11 +217,11 @@ def simulate_rig(
 class RigRecording:
     """A rig's sequence in memory. ``recording["left"]`` is the :class:`Recording` of that camera.
 
-    cameras : by name; of a frame camera without events there are none in its recording.
-    imu : of every sensor that has an inertial unit, by name; ``T_cam_imu`` leads to that sensor's axes.
+    cameras : recordings by name; that of a frame camera without events contains none.
+    imu : of every sensor with an inertial unit, by name; ``T_cam_imu`` leads to that sensor's axes.
     T_rig_sensor : (4, 4) float64 by name, from a sensor's axes to the rig's.
     t_us : (M,) int64, the start and every label's time, the last one's end included.   T_world_rig : (M, 4, 4) float64,
-    where the rig was.
+    the rig's poses.
     config : every value as drawn."""
 
     cameras: Mapping[str, Recording]
@@ -241,7 +241,7 @@ class RigRecording:
 def record_rig(
     source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
 ) -> RigRecording:
-    """Return what all sensors of a rig record of one sequence, as arrays, what :func:`generate` writes.
+    """Return the data of all sensors of a rig for one sequence, as arrays, as :func:`generate` writes them.
 
     Arguments as of :func:`simulate_rig`. Raises ConfigError, AssetError, GLError, EventDataError."""
     with simulate_rig(source, rig, index=index, **settings) as sequence:

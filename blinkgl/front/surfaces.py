@@ -21,15 +21,16 @@ MAPS = ("metallic_roughness_map", "normal_map", "emission_map", "mask")
 
 @signed_by(LightConfig, sun_elevation="elevation", sun_azimuth="azimuth")
 class Light(Piece):
-    """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
-    lights beside them.
+    """Light of a scene: a sun, a sky and other lamps. A white surface with normal n has radiance
+    sun * max(0, n . s) + sky * (0.5 + 0.5 n_z), and the lamps' light in addition.
 
     elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).
     sun_color, sky_color : (3,) linear factors, white by default.
     lights : tables as under ``light.lights`` of the YAML: ``{"kind": "point", "position": (0, 0, 2), "strength": 3}``,
     ``{"kind": "spot", "position": …, "look_at": …, "angle": 40}``, ``{"kind": "sun", "elevation": 20}``.
-    environment : a panorama in the place of sun and sky, as ``light.environment``: ``{"map": "park.hdr"}``.
-    shadows : "off", "hard" or "soft".   sun_size : degrees, softens.   shadow_size : texels a side of a shadow map.
+    environment : a panorama instead of sun and sky, as ``light.environment``: ``{"map": "park.hdr"}``.
+    shadows : "off", "hard" or "soft".   sun_size : degrees, for soft shadows.   shadow_size : texels along a side of a
+    shadow map.
     unlit : radiance = albedo everywhere.
     Raises ConfigError."""
 
@@ -64,17 +65,17 @@ class Material(Piece):
     float, linear light from 0 to 1; row 0 is the top.
     color : (3,) linear factor.   procedural, seed : kind and number of a computed texture, such as "bricks".
     photograph : one of scikit-image's, such as "astronaut".   uv_scale : (2,) repeats.
-    max_size : px, longer sides of a file are reduced.
+    max_size : px, files with longer sides are reduced.
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
     metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
-    emission : (3,) linear radiance of its own; times ``emission_map``, sRGB.
+    emission : (3,) linear emitted radiance; times ``emission_map``, sRGB.
     normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.
     mask : opacity: holes where it is below ``cutoff`` (0 to 1).
     Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
     Raises ConfigError."""
 
     def __init__(self, image: str | os.PathLike | np.ndarray | None = None, **keys: Any):
-        if "texture" in keys:  # the YAML's name, which would be lost below the one of here
+        if "texture" in keys:  # the YAML's name, which the argument's name would overwrite
             raise ConfigError("has another name", where="Material.texture", accepted="image=…, as in Material(image)")
         maps = {key: keys[key] for key in MAPS if keys.get(key) is not None}
         self.maps = {key: _map(map_, key) for key, map_ in maps.items() if not _is_file(map_)}
@@ -95,7 +96,7 @@ def _is_file(given: Any) -> bool:
 
 
 def _map(given: Any, key: str) -> np.ndarray:
-    """(h, w, 3) uint8, of a mask (h, w)."""
+    """Return an array (h, w, 3) uint8, of a mask (h, w)."""
     shape = (None, None) if key == "mask" else (None, None, 3)
     accepted = f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8"
     where = f"Material.{key}"

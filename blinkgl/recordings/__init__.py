@@ -1,7 +1,7 @@
 """Recordings of cameras, without a renderer.
 
 In:    any video, or event files.
-Out:   its events (``simulate``), how two recordings differ (``compare``), or the emulator that is like a camera
-       (``calibrate``).
-Start: simulation.py; comparison.py; calibration.py, of the clips of clip.py and the numbers of statistics.py.
+Out:   its events (``simulate``), the differences of two recordings (``compare``), or the emulator that resembles a
+       camera (``calibrate``).
+Start: simulation.py; comparison.py; calibration.py, with the clips of clip.py and the numbers of statistics.py.
 """

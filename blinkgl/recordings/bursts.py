@@ -1,9 +1,9 @@
-"""Bursts that a camera of events and frames makes itself: where its frames are reset or read out, pixels all over the
-sensor fire at once, nearly all with one polarity, once a frame. No emulator does.
+"""Bursts of a camera of events and frames: where its frames are reset or read out, pixels all over the sensor fire at
+once, nearly all with one polarity, once per frame. Emulators have no such bursts.
 
-Seen in DAVIS240 recordings: 12 % of the events of slider_depth and 19 % of evbench_davis240 lie in a ms or two a frame.
+In DAVIS240 recordings 12 % of the events of slider_depth and 19 % of evbench_davis240 lie in one or two ms per frame.
 They are not noise: without them polarity sums follow the frames less well (0.90 instead of 0.91, 0.84 instead of 0.86),
-so what fires is what stood near its level anyhow. Their number says something of light, their times do not.
+so pixels near their level fire. Their number depends on light, their times do not.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from blinkgl.types.events import Events
 
 BIN_US = 250
 AROUND_MS = 5.0
-"""To either side: what the rate is otherwise."""
+"""Time on each side that gives the usual rate."""
 TIMES, LEAST = 3.0, 15
-"""A bin of a burst has so many times the events of those around it, and so many more."""
+"""A bin of a burst has this many times the events of those around it, and at least this many more."""
 ONE_POLARITY = 0.85
 NEAR = 0.02
-"""Of a time of some frames: so well do bursts follow one another at the frames' interval."""
+"""Tolerance of the bursts' period, as a fraction of the time of some frames."""
 MOST_FRAMES, LEAST_OTHERS = 4, 2
 
 
 def frame_bursts(events: Events, interval_us: float) -> np.ndarray:
-    """(N, 2) int64, [begin, end) in µs, in time order, none overlapping: bursts of one polarity that come at the
-    frames' interval. events : of the whole sensor, in time order."""
+    """Return bursts of one polarity at the frames' interval, (N, 2) int64, [begin, end) in µs, in time order, not
+    overlapping.
+    events : of the whole sensor, in time order."""
     if not len(events):
         return np.empty((0, 2), np.int64)
     begin = int(events.t[0])
@@ -51,7 +52,7 @@ def frame_bursts(events: Events, interval_us: float) -> np.ndarray:
 
 
 def inside_any(t_us: np.ndarray, spans: np.ndarray) -> np.ndarray:
-    """(N,) bool: which of the times lie in one of ``spans``."""
+    """Return which of the times lie in one of ``spans``, (N,) bool."""
     if not len(spans):
         return np.zeros(len(t_us), bool)
     last = np.searchsorted(spans[:, 0], t_us, side="right") - 1

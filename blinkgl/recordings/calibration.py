@@ -1,10 +1,10 @@
-"""The parameters with which an emulator's events are like a camera's: found from one half of a recording in time,
-judged by the other.
+"""Calibration: finds the parameters for which an emulator's events resemble a camera's, from one half of a recording in
+time, and tests them on the other.
 
 The method is that of simulated moments (McFadden, Econometrica 57, 1989): numbers of the recording
-(:mod:`~blinkgl.recordings.statistics`) against the same of a simulation, each difference divided by what it may be by
-chance, least squares with a robust loss from several starts. What the data say nothing about is not fitted but left at
-its default, and named.
+(:mod:`~blinkgl.recordings.statistics`) against those of a simulation, each difference divided by its standard deviation
+by chance, least squares with a robust loss from several starts. Parameters that the data do not determine are not
+fitted but left at their defaults, and named.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ _STILL = "A still scene of middle brightness was assumed: what depends on light,
 
 @dataclass(frozen=True)
 class Judged:
-    """A simulation against the recording in one half. Rates are of all pixels that count."""
+    """A simulation against the recording in one half. Rates are over all pixels that count."""
 
     events: int
     recorded: int
     on_off: float
     recorded_on_off: float
     interval_distance: float
-    """Kolmogorov and Smirnov's, of the intervals between the events of a pixel"""
+    """Kolmogorov-Smirnov distance of the intervals between the events of a pixel"""
     polarity_correlation: float
     """of polarity sums per interval, blurred by a pixel; NaN for a still scene"""
     count_correlation: float
     """of the events of single pixels"""
     still_hz: float
-    """of the pixels that saw no change, events per second and pixel; NaN where there are too few of them"""
+    """rate of the pixels that saw no change, events per second and pixel; NaN where there are too few of them"""
     recorded_still_hz: float
     told: float = float("nan")
     """AUC of the judge (:mod:`~blinkgl.recordings.judge`); NaN where there are too few patches"""
@@ -67,11 +67,11 @@ class Judged:
 class Calibration:
     """Result of :func:`calibrate`.
 
-    config : the emulator as fitted; before : as it was.   values, uncertainty : of the fitted keys (a standard
-    deviation, in the key's unit).   untold : why the others were not fitted, by key.   halves : intervals of the half
-    that was fitted, and of that which was not.   judged_before, judged : one of each half.   simulated_before,
-    simulated : events of the whole clip.   gamma : of the frames' codes; None: there were none.   warnings : what the
-    recording lacks, though a fit was possible."""
+    config : the fitted emulator; before : before the fit.   values, uncertainty : of the fitted keys (a standard
+    deviation, in the key's unit).   untold : reason for each key that was not fitted.   halves : intervals of the
+    fitted half, and of the other.
+    judged_before, judged : one of each half.   simulated_before, simulated : events of the whole clip.   gamma : of the
+    frames' codes; None: there were none.   warnings : weaknesses of the recording, though a fit was possible."""
 
     recording: str
     clip: Clip
@@ -92,7 +92,7 @@ class Calibration:
     warnings: list[str] = field(default_factory=list)
 
     def sensor(self) -> dict[str, Any]:
-        """The table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
+        """Return the table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
         name, (height, width) = self.config.emulator, self.clip.sensor
         seconds = [(self.clip.edges_us[b] - self.clip.edges_us[a]) / 1e6 for a, b in self.halves]
         file = os.path.basename(self.recording)
@@ -131,17 +131,17 @@ def calibrate(
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> Calibration:
-    """Fits an emulator to a recording.
+    """Fit an emulator to a recording.
 
-    frames : what the camera saw, of its size and at the middle of the exposures
-    (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   reading : how they are understood.
-    still : a scene that stands still in constant light, without frames: noise alone.
-    emulator : a name, or where the fit begins; ``fixed``: keys that stay as they are there.
-    starts : of the search.   progress : called with (what is being done, fraction).
+    frames : of the scene, of the camera's size and at the middle of the exposures
+    (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   reading : how they are interpreted.
+    still : a static scene in constant light, without frames: only noise.
+    emulator : a name, or the initial configuration; ``fixed``: keys that keep their values.
+    starts : of the search.   progress : called with (current activity, fraction).
 
     Raises EventDataError, one line: no frames, frames of another size, saturated, not of this recording's time or
-    clock; too few events. ConfigError: an emulator that says nothing of what may be fitted, an unknown key,
-    interpolation. AssetError: unreadable."""
+    clock; too few events. ConfigError: an emulator without parameters to fit, an unknown key, interpolation.
+    AssetError: unreadable."""
     base = emulator_config(emulator)
     _keys(base, fixed)
     if still and frames is not None:
@@ -171,8 +171,8 @@ def calibrate_events(
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> Calibration:
-    """:func:`calibrate` of what was read already. size : (height, width) of the sensor.   frames : (array, t_ns, name);
-    None: a still scene."""
+    """Fit :func:`calibrate` to data already read. size : (height, width) of the sensor.   frames : (array, t_ns, name);
+    None: a static scene."""
     base = emulator_config(emulator)
     keys = _keys(base, fixed)
     if reading.interpolate not in INTERPOLATIONS:
@@ -221,7 +221,7 @@ def calibrate_events(
 
 
 def _judged(clip: Clip, stream: Events, halves: tuple[tuple[int, int], tuple[int, int]]) -> tuple[Judged, Judged]:
-    """A simulation against the clip's own events, in each half."""
+    """Return the comparison of a simulation with the clip's own events, in each half."""
 
     def of(part: tuple[int, int]) -> Judged:
         own = sums(clip.events, clip, *part)
@@ -246,7 +246,7 @@ def _of_scene(
     seed: int,
     say: Callable[[str, float], None],
 ) -> tuple[Clip, Search | None]:
-    """The clip that the frames show, and the search that found its clock; None where the clock is known."""
+    """Return the clip of the frames, and the search that found its clock; None where the clock is known."""
     clip = clip_of_frames(events, frames, size, reading, seed=seed)
     if reading.delay_ms is not None:
         return clip, None
@@ -264,8 +264,8 @@ def _without_lag(
     reading: FrameReading,
     seed: int,
 ) -> Clip:
-    """The clip on a clock from which the emulator's own lag is taken: levels are passed after the light has begun to
-    change, so an emulator's events are behind the frames, too, and by so much the clocks do not differ."""
+    """Return the clip on a clock without the emulator's own delay: levels are passed after the light begins to change,
+    so an emulator's events are also later than the frames, and the clocks do not differ by that."""
     simulated = clip.simulate(search.config(), seed)
     lag_us, _ = clock_offset(simulated, clip.change, clip.clock_us, clip.size)
     found_us = round(clip.facts["found_delay_us"])
@@ -275,7 +275,7 @@ def _without_lag(
 
 
 def judge_half(recorded: Sums, simulated: Sums, told: float = float("nan")) -> Judged:
-    """``simulated`` with its products taken against ``recorded``."""
+    """Return the comparison of ``simulated`` with ``recorded``; its products must be with ``recorded``."""
     own, other = recorded.without(None), simulated.without(None)
     total = lambda parts: parts[0].sum(axis=0) + parts[4]  # OFF, ON of those that moved and of those that did not
     a, b = total(own), total(other)
@@ -331,7 +331,7 @@ def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
 
 
 def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]:
-    """Notes and warnings: what was found and taken of the frames."""
+    """Return notes and warnings about the frames."""
     facts, gap_ms = clip.facts, float(np.median(np.diff(clip.clock_us))) / 1000
     found = f"{facts['found_delay_us'] / 1000:+.1f} ms (correlation {facts['delay_correlation']:.2f})"
     notes = [

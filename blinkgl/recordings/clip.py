@@ -1,7 +1,7 @@
-"""A piece of a recording with what it saw: the pixels and times that a calibration looks at, the same for the camera's
-events and for those that an emulator makes of the frames.
+"""A part of a recording with its scene: the pixels and times of a calibration, the same for the camera's events and for
+those that an emulator makes of the frames.
 
-A clip may hold some tiles of the sensor only, stacked on one another: emulators know no neighbours.
+A clip may consist of some tiles of the sensor, stacked: pixels of emulators do not interact.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from blinkgl.types.events import Events
 
 TILE_PX = 32
 SETTLING = 3
-"""Intervals between frames that the first frame is shown before it counts: slow pixels come to rest in them."""
+"""Intervals for which the first frame is shown before it counts, so that slow pixels reach a steady state."""
 MOST_PIXEL_STEPS = 3_000_000
-"""Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
+"""Largest number of pixels times frames of a clip, float32, for a fit in about a minute."""
 STILL = 0.04
-"""Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel that saw nothing."""
+"""Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel without a change."""
 STUCK_TIMES, STUCK_LEAST = 4, 30
-"""A stuck pixel has so many times the median of the 5x5 pixels round it, and so many events more."""
+"""A stuck pixel has this many times the median of the 5x5 pixels around it, and this many events more."""
 MOST_SATURATED = 0.3
 LEAST_BRIGHT, LEAST_QUIET, ALIKE = 0.08, 0.05, 0.05
 """Luminance of pixels, and part of them, that can tell the gain of a frame, and how much their changes of ln I may
 differ (median)."""
 SAME_GAIN = 0.02
-"""Of ln: less is not worth a note."""
+"""Change of ln below which there is no note."""
 LEAP, LARGEST_THRESHOLD = 0.1, 2.0
 """Median change of ln I from one frame to the next from which on events have to say so, too, and the contrast that
 they stand for at most."""
 MOST_SHIFT_US = 100_000
 LEAST_CORRELATION = 0.25
-"""Of polarity sums with the frames' change: below, events and frames are not of one scene or not on one clock."""
+"""Of polarity sums with the frames' change: below, events and frames are of different scenes or clocks."""
 DARK_BACKGROUND = 0.2
-"""Luminance of the scene of a recording without frames: the middle of the scale, about."""
+"""Luminance of the scene of a recording without frames: about the middle of the scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Clip:
     def simulate(
         self, config: EmulatorConfig, seed: int = 0, *, stop: int | None = None, readout: ReadoutConfig | None = None
     ) -> Events:
-        """What an emulator makes of the first ``stop`` intervals (default: all), on the pixels that count."""
+        """Return an emulator's events in the first ``stop`` intervals (default: all), on the pixels that count."""
         stop = self.intervals if stop is None else stop
         end_ns = int(self.clock_us[stop]) * 1000
         shown = (EventFrame(t, luminance) for t, luminance in self.frames if t <= end_ns)
@@ -98,17 +98,17 @@ class Clip:
         return events.part(self.used[events.y, events.x])
 
     def with_events(self, events: Events) -> Clip:
-        """The same scene with other events."""
+        """Return the same scene with other events."""
         return replace(self, events=events)
 
 
 @dataclass(frozen=True)
 class FrameReading:
-    """How the frames beside a recording are to be understood.
+    """How the frames beside a recording are interpreted.
 
-    gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : what is shown between two frames, "motion"
-    or "linear"; max_px : of motion, px per step.   delay_ms : of the frames' clock against the events'; None: found
-    from both.   exposures : whether their times are known to be the middles of exposures.   name : for messages."""
+    gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between two frames, "motion" or "linear";
+    max_px : of motion, px per step.   delay_ms : of the frames' clock against the events'; None: estimated from both.
+    exposures : whether their times are known to be the middles of exposures.   name : for messages."""
 
     gamma: str | float = "linear"
     interpolate: str = "motion"
@@ -119,7 +119,7 @@ class FrameReading:
 
 
 PLAIN = FrameReading()
-"""Linear codes at times that are found."""
+"""Linear codes at times that are estimated."""
 
 
 def clip_of_frames(
@@ -131,7 +131,7 @@ def clip_of_frames(
     most: int = MOST_PIXEL_STEPS,
     seed: int = 0,
 ) -> Clip:
-    """Of a recording that saw something.
+    """Return the clip of a recording with frames.
 
     frames : (array, t_ns, name), at the middle of their exposures.   size : (height, width) of the events' sensor.
     Raises EventDataError: frames of another size, no common time, saturated frames, clocks that do not match."""
@@ -183,7 +183,7 @@ def clip_of_frames(
 
 
 def _changes(grey: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """ln(I + 10) of the frames, blurred by a pixel, and (K, H, W) float32 from one to the next."""
+    """Return ln(I + 10) of the frames, blurred by a pixel, and (K, H, W) float32 from one to the next."""
     logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
     return logs, np.diff(np.stack(logs), axis=0).astype(np.float32)
 
@@ -191,8 +191,8 @@ def _changes(grey: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
 def _greys(
     frames: Iterable[tuple[np.ndarray, int, str]], size: tuple[int, int], reading: FrameReading
 ) -> tuple[list[np.ndarray], Callable[[list[np.ndarray]], list[np.ndarray]], np.ndarray, np.ndarray]:
-    """The frames' luminance, what takes their noise from them, their times in µs, and (H, W) bool, which pixels were
-    saturated in any of them."""
+    """Return the frames' luminance, the removal of their noise, their times in µs, and (H, W) bool, pixels saturated in
+    any frame."""
     decode = Decoder(reading.gamma)
     grey, times, full, first = [], [], np.zeros(size, bool), []
     for frame, t_ns, name in frames:
@@ -223,7 +223,7 @@ def _greys(
 
 
 def _delay(found_us: int, correlation: float, reading: FrameReading) -> int:
-    """What is added to the frames' times, µs: what was asked for, or what was found, where it is to be trusted."""
+    """Return the offset of the frames' times, µs: the given one, or the estimated one where it is reliable."""
     if reading.delay_ms is not None:
         return round(reading.delay_ms * 1000)
     if not correlation >= LEAST_CORRELATION:
@@ -238,7 +238,7 @@ def _delay(found_us: int, correlation: float, reading: FrameReading) -> int:
 
 
 def _spanned(events: Events, clock: np.ndarray, where: str) -> np.ndarray:
-    """Numbers of the intervals between frames that the events span."""
+    """Return the indices of the intervals between frames that the events span."""
     # The first interval may begin a little before the first event, the last end a little after the last.
     slack = (clock[1:] - clock[:-1]) // 4
     inside = np.flatnonzero((clock[:-1] >= events.t[0] - slack) & (clock[1:] <= events.t[-1] + 1 + slack))
@@ -255,7 +255,7 @@ def _spanned(events: Events, clock: np.ndarray, where: str) -> np.ndarray:
 def _path(
     grey: list[np.ndarray], clock: np.ndarray, reading: FrameReading, facts: dict[str, float]
 ) -> list[tuple[np.ndarray, int]]:
-    """What the emulator is shown, (luminance, t_ns), the warm-up first; what was found on the way goes to ``facts``."""
+    """Return the emulator's input, (luminance, t_ns), the warm-up first; findings go to ``facts``."""
     path: list[tuple[np.ndarray, int]] = list(zip(grey, (clock * 1000).tolist()))
     if reading.interpolate == "motion":
         displacement = Displacement()
@@ -263,8 +263,8 @@ def _path(
             (g.astype(np.float32, copy=False), t) for g, t in motion(path, reading.max_px, displacement=displacement)
         ]
         facts |= {"displacement_px": displacement.p99, "inserted": displacement.inserted}
-    # Before the first frame the pixels have seen something else, and stand anywhere between their levels: another
-    # part of the same picture, from which the light goes over to the first frame.
+    # Before the first frame the pixels saw something else and have any state between their levels: another part of the
+    # same picture, which changes into the first frame.
     height, width = grey[0].shape[:2]
     other = np.roll(grey[0], (height // 3, width // 3), (0, 1))
     begin, interval = int(clock[0]) * 1000, int(clock[1] - clock[0]) * 1000
@@ -272,7 +272,8 @@ def _path(
 
 
 def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:
-    """Of a recording of a scene that stands still in constant light: noise alone. Time is cut into ``parts``."""
+    """Return the clip of a recording of a static scene in constant light: only noise. Time is divided into
+    ``parts``."""
     begin, end = int(events.t[0]), int(events.t[-1]) + 1
     edges = begin + (end - begin) * np.arange(parts + 1) // parts
     frame = np.full(size, luminance, np.float32)
@@ -292,11 +293,11 @@ def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = D
 
 
 def _one_gain(grey: list[np.ndarray], clock_us: np.ndarray, used: np.ndarray, events: Events) -> np.ndarray:
-    """(K + 1,) what to divide the frames by, so that the exposure or gain of their camera, which it changes by itself,
-    is no light: the brightness of pixels that fired in no interval stays as it is.
+    """Return divisors of the frames, (K + 1,), so that automatic changes of their camera's exposure or gain do not
+    count as light: the brightness of pixels that fired in no interval stays constant.
 
-    Where hardly any pixel was quiet all the time, those that were from one frame to the next say it, of changes that
-    the events contradict."""
+    Where hardly any pixel was quiet all the time, those quiet from one frame to the next are used, for changes that the
+    events contradict."""
     bright = used & (np.minimum.reduce(grey) > LEAST_BRIGHT)
     fired = [polarity_counts(events.window(int(a), int(b)), used.shape) for a, b in itertools.pairwise(clock_us)]
     quiet = bright & ~np.any([on + off > 0 for on, off in fired], axis=0)
@@ -315,15 +316,15 @@ def _one_gain(grey: list[np.ndarray], clock_us: np.ndarray, used: np.ndarray, ev
 
 
 def _without_leaps_at_the_ends(gains: np.ndarray) -> slice:
-    """The frames between the first and the last interval without a leap: what a camera's first exposures, before it
-    has found its own, leave of dark and of bright parts is not one factor."""
+    """Return the frames between the first and the last interval without a leap: a camera's first exposures, before it
+    has adapted, do not change dark and bright parts by one factor."""
     steady = np.flatnonzero(np.abs(np.diff(np.log(gains))) <= LEAP)
     return slice(int(steady[0]), int(steady[-1]) + 2) if len(steady) >= 2 else slice(None)
 
 
 class Tiles:
-    """As much of a sensor as fits into ``most`` pixels times frames: all of it, or tiles drawn at random, stacked on
-    one another. size : (height, width) of the sensor."""
+    """The part of a sensor that fits into ``most`` pixels times frames: all of it, or random tiles, stacked. size :
+    (height, width) of the sensor."""
 
     def __init__(self, size: tuple[int, int], frames: int, most: int = MOST_PIXEL_STEPS, seed: int = 0):
         self.size, self.share = size, 1.0
@@ -340,13 +341,13 @@ class Tiles:
         self.share = len(chosen) * TILE_PX**2 / (size[0] * size[1])
 
     def cut(self, image: np.ndarray) -> np.ndarray:
-        """(..., height, width) to what is looked at of it."""
+        """Return the used part of (..., height, width)."""
         if not self._corners:
             return image
         return np.concatenate([image[..., y : y + TILE_PX, x : x + TILE_PX] for y, x in self._corners], axis=-2)
 
     def events(self, events: Events, used: np.ndarray) -> Events:
-        """Those on pixels that are looked at and ``used`` (height, width), where these are in the cut."""
+        """Return the events on used pixels of ``used`` (height, width), with positions in the cut."""
         if not self._corners:
             return events.part(used[events.y, events.x])
         y, x = events.y.astype(np.int64), events.x.astype(np.int64)
@@ -362,9 +363,9 @@ class Tiles:
 
 
 def clock_offset(events: Events, changes: np.ndarray, clock_us: np.ndarray, size: tuple[int, int]) -> tuple[int, float]:
-    """What has to be added to the frames' times, µs, so that polarity sums follow ``changes`` (K, H, W), of the
-    frames' blurred logarithms, best, and the mean correlation over the intervals there; looked for within
-    ``MOST_SHIFT_US`` and half a frame interval."""
+    """Return the offset of the frames' times, µs, for which polarity sums best follow ``changes`` (K, H, W), of the
+    frames' blurred logarithms, and the mean correlation over the intervals there; searched within ``MOST_SHIFT_US`` and
+    half a frame interval."""
     pairs = list(range(len(clock_us) - 1))
     if not pairs:
         return 0, float("nan")
@@ -401,28 +402,29 @@ def _match(events: Events, changes: np.ndarray, clock_us: np.ndarray, pairs: lis
 
 
 def stuck_pixels(events: Events, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool: pixels that fire many times as often as those round them. What they do is no answer to light
-    (``readout.pixels`` has them), and two of them can outweigh all others in a correlation of counts."""
+    """Return pixels that fire many times as often as those around them, (H, W) bool. Their events do not depend on
+    light (``readout.pixels`` models them), and two of them can dominate a correlation of counts."""
     where = events.y.astype(np.int64) * size[1] + events.x
     count = np.bincount(where, minlength=size[0] * size[1]).reshape(size)
     return count > STUCK_TIMES * median_filter(count, 5, mode="nearest") + STUCK_LEAST
 
 
 def polarity_sums(events: Events, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float64, ON minus OFF."""
+    """Return ON minus OFF events, (H, W) float64."""
     on, off = polarity_counts(events, size)
     return on - off
 
 
 def polarity_counts(events: Events, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) float64 each, ON and OFF events of the pixels."""
+    """Return ON and OFF events of the pixels, (H, W) float64 each."""
     where = events.y.astype(np.int64) * size[1] + events.x
     count = lambda kind: np.bincount(where[events.p == kind], minlength=size[0] * size[1]).reshape(size).astype(float)
     return count(1), count(0)
 
 
 def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, tuple[int, int]]:
-    """All events of a file, and the (height, width) of its sensor. EventDataError: fewer than ``least``."""
+    """Return all events of a file, and the (height, width) of its sensor. Raises EventDataError: fewer than
+    ``least``."""
     with open_events(path) as file:
         file = file.sized()
         events = file.read()
@@ -440,7 +442,7 @@ def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, 
 def timed_frames(
     path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
 ) -> tuple[Iterator[tuple[np.ndarray, int, str]], bool]:
-    """Frames as :func:`~blinkgl.io.frames.open_frames` gives them, and whether their times are known to be the middles
+    """Return frames as :func:`~blinkgl.io.frames.open_frames` does, and whether their times are known to be the middles
     of exposures."""
     source = open_frames(path, fps=fps, timestamps=timestamps)
     exposures = source.path.suffix.lower() in RECORDING and fps is None and timestamps is None

@@ -1,6 +1,6 @@
-"""Event recordings side by side, against the frames of their scene, or one by itself: how real does a simulation look?
+"""Comparison of event recordings with each other or with frames of their scene, or description of one.
 
-Everything streams interval by interval; memory is a handful of sensor-sized maps.
+Data stream interval by interval; memory is a few sensor-sized maps.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 IEI_EDGES_US = np.logspace(0, 7, 71)
 """Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
 LOG_OFFSET = 10.0
-"""Added to the 8-bit code before the logarithm: keeps the dark noise of real frames from dominating."""
+"""Added to the 8-bit code before the logarithm, so that the dark noise of real frames does not dominate."""
 TOLD = 0.6
-"""AUC of the judge from which on it is worth saying by what it tells."""
+"""AUC of the judge above which its features are reported."""
 BLUR_PX = 1.0
-"""Sigma of the Gaussian on both maps before a correlation: single-event quantisation and
-sub-pixel shifts are not what it asks about."""
+"""Sigma of the Gaussian on both maps before a correlation, which removes single-event quantisation and sub-pixel
+shifts."""
 
 
 @dataclass(eq=False)
@@ -73,8 +73,8 @@ class RecordingSide:
 
 @dataclass(eq=False)
 class Comparison:
-    """Result of :func:`compare`. ``b`` is None when there was one recording. What is told pixel by
-    pixel is None where the two differ in size."""
+    """Result of :func:`compare`. ``b`` is None when there was one recording. Pixel-wise results are None where the two
+    differ in size."""
 
     edges_us: np.ndarray
     a: RecordingSide
@@ -84,13 +84,13 @@ class Comparison:
     polarity_correlation: np.ndarray | None = None
     """(K,) Pearson correlation over the pixels of the blurred polarity sums of a and b in each interval"""
     told_apart: Judgement | None = None
-    """how well a judge tells b from a; None: nobody asked for it, or there is no b"""
+    """how well a judge distinguishes b from a; None: not requested, or there is no b"""
     halves: tuple[Judgement, ...] = ()
-    """how well it tells the halves of each recording from one another, a's first"""
+    """how well it distinguishes the halves of each recording, a's first"""
 
     @property
     def same_size(self) -> bool:
-        """Whether the pixels of two recordings can be compared one by one."""
+        """Return whether the pixels of two recordings can be compared one by one."""
         return self.b is not None and self.a.counts.shape == self.b.counts.shape
 
     @property
@@ -99,19 +99,19 @@ class Comparison:
 
     @property
     def rate_ratio(self) -> np.ndarray:
-        """(K,) events of b per event of a; NaN where a has none."""
+        """Return events of b per event of a, (K,); NaN where a has none."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.a.rate_hz > 0, self.b.rate_hz / self.a.rate_hz, np.nan)
 
     @property
     def iei_distance(self) -> float:
-        """Largest difference of the two cumulative distributions of the inter-event interval
-        (Kolmogorov–Smirnov distance)."""
+        """Return the largest difference of the two cumulative distributions of the inter-event interval
+        (Kolmogorov-Smirnov distance)."""
         cdf = [np.cumsum(s.iei) / max(s.iei.sum(), 1) for s in (self.a, self.b)]
         return float(np.abs(cdf[0] - cdf[1]).max())
 
     def rows(self) -> list[tuple[str, str, str]]:
-        """(quantity, a, b) as text, for a table; quantities of the pair stand in the last column."""
+        """Return (quantity, a, b) as text, for a table; quantities of the pair are in the last column."""
         sides = [self.a] + ([self.b] if self.b else [])
         each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))
         rows = [
@@ -150,7 +150,7 @@ class Comparison:
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists (maps left out), for JSON."""
+        """Return plain numbers and lists (without maps), for JSON."""
 
         def side(s: RecordingSide) -> dict:
             return {k: _plain(v) for k, v in asdict(s).items() if k != "counts"} | {
@@ -194,16 +194,16 @@ def compare(
     zero_time: bool = False,
     judge: bool = False,
 ) -> Comparison:
-    """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the
-    time they share; alone, ``a`` is described.
+    """Compare event file ``a`` with event file ``b``, with ``frames``, or with both, over their common time; alone,
+    ``a`` is described.
 
-    Recordings of different sensor sizes are described side by side; what needs the same pixels in both is then None.
+    Recordings of different sensor sizes are described side by side; pixel-wise results are then None.
 
     Intervals are those between frames where frames are given, else ``interval_ms``. ``b`` may itself be frames (a
-    folder, video, .npy of frames): anything that is no event file. gamma : of the frames; "linear" takes the codes as
-    intensities, as fits a DAVIS's frames.
-    frame_delay_ms : added to the frames' times; a stamp of the exposure's start lags its centre. zero_time : count both
-    recordings from their first event. judge : also train a classifier to tell them apart
+    folder, video, .npy of frames): anything that is not an event file. gamma : of the frames; "linear" uses the codes
+    as intensities, as for a DAVIS's frames.
+    frame_delay_ms : added to the frames' times; a stamp of the exposure's start is before its centre. zero_time : count
+    both recordings from their first event. judge : also train a classifier to distinguish them
     (:mod:`~blinkgl.recordings.judge`), which holds their events in memory.
 
     Raises EventDataError: frames of another size than a recording, no common time, too few events for a judge.
@@ -240,7 +240,7 @@ def compare(
 def _judged(
     files: list[EventFile], shifts: list[int], span_us: tuple[int, int]
 ) -> tuple[tuple[Judgement, ...], Judgement | None]:
-    """The halves of each, and of two the one against the other: patch by patch where they are of one size."""
+    """Compare the halves of each, and the two with each other: patch by patch where they are of one size."""
     from blinkgl.recordings import judge
 
     events = [
@@ -308,8 +308,8 @@ def _accumulate(
 
 @kernel
 def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
-    """Adds events to the count and polarity maps and to the histogram of inter-event
-    intervals (ten bins per decade of µs)."""
+    """Add events to the count and polarity maps and to the histogram of inter-event intervals (ten bins per decade of
+    µs)."""
     for i in range(len(t)):
         r, c = y[i], x[i]
         counts[r, c] += 1
@@ -322,7 +322,7 @@ def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
 
 
 def _windows(file: EventFile, edges: np.ndarray, shift: int) -> Iterator[Events]:
-    """Events of each [edges[k], edges[k+1]), times minus ``shift``; every interval yields, empty ones too."""
+    """Yield the events of each [edges[k], edges[k+1]), times minus ``shift``, also for empty intervals."""
     parts: list[Events] = []
     k = 0
     for chunk in file.chunks():
@@ -345,7 +345,7 @@ def _joined(parts: list[Events], shift: int) -> Events:
 
 
 def _span(file: EventFile) -> tuple[int, int]:
-    """First event's time and one past the last's."""
+    """Return the first event's time and one past the last's."""
     first = last = None
     for chunk in file.chunks():
         first = int(chunk.t[0]) if first is None else first
@@ -404,7 +404,7 @@ def _blurred(values: np.ndarray) -> np.ndarray:
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's over the pixels; NaN where one is constant."""
+    """Return Pearson's correlation over the pixels; NaN where one is constant."""
     a, b = a.ravel() - a.mean(), b.ravel() - b.mean()
     norm = np.sqrt((a @ a) * (b @ b))
     return float(a @ b / norm) if norm > 0 else float("nan")
@@ -413,7 +413,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 def _is_event_file(path) -> bool:
     path = Path(path)
     if path.suffix.lower() in (".npy", ".npz") and path.is_file():
-        with contextlib.suppress(AssetError), numpy_errors(path):  # damaged: the reader will say so
+        with contextlib.suppress(AssetError), numpy_errors(path):  # damaged: the reader reports it
             if path.suffix.lower() == ".npz":
                 with NpzReader(path) as arrays:
                     return "x" in arrays

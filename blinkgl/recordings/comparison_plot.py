@@ -1,4 +1,4 @@
-"""The picture of a comparison: rates over time, counts per pixel, intervals, correlations."""
+"""The plot of a comparison: rates over time, counts per pixel, intervals, correlations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Panel = Callable[[Any], None]
 
 
 def plot(result: Comparison, path: str | os.PathLike) -> None:
-    """One PNG of three to six panels. OutputError when it cannot be written."""
+    """Draw one PNG of three to six panels. Raises OutputError when it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -101,7 +101,7 @@ def _correlations(result: Comparison, sides: list[Side]) -> Panel:
 
 
 def _pixel_by_pixel(result: Comparison, limit: int) -> Panel:
-    """Events per pixel of one recording over those of the other, which have the same pixels."""
+    """Return a panel of events per pixel of one recording over those of the other, with the same pixels."""
     assert result.b is not None
     pair = [np.minimum(side.counts, limit).ravel() for side in (result.a, result.b)]
 

@@ -1,4 +1,4 @@
-"""What the codes of given frames are: luminance, by a curve, and the noise that is in them."""
+"""Decoding of given frames: luminance from codes by a curve, and the noise of the frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class Decoder:
-    """Frames as stored to linear luminance (H, W) float32.
+    """Converts stored frames to linear luminance, (H, W) float32.
 
     gamma : as of :func:`~blinkgl.recordings.simulation.frames_to_events`."""
 
@@ -27,7 +27,7 @@ class Decoder:
         self._tables: dict[np.dtype, np.ndarray] = {}
 
     def table(self, dtype: DTypeLike) -> np.ndarray:
-        """Luminance of each code of an unsigned integer type, float32."""
+        """Return the luminance of each code of an unsigned integer type, float32."""
         dtype = np.dtype(dtype)
         if dtype not in self._tables:
             most = 2 ** (8 * dtype.itemsize) - 1
@@ -35,7 +35,8 @@ class Decoder:
         return self._tables[dtype]
 
     def __call__(self, frame: np.ndarray, name: str) -> np.ndarray:
-        """Raises EventDataError with ``name``, pixel and value for NaN, infinite or negative intensities."""
+        """Decode a frame. Raises EventDataError with ``name``, pixel and value for NaN, infinite or negative
+        intensities."""
         if frame.dtype in (np.uint8, np.uint16):
             table = self.table(frame.dtype)
             if frame.ndim == 2:
@@ -79,7 +80,7 @@ def _luma_by_table(frame, table, weights, out):
 
 
 def checked_gamma(gamma: str | float | None) -> str | float | None:
-    """A curve as a person gives it: its name, or an exponent as a number. Raises ConfigError."""
+    """Return a curve given by a user: its name, or an exponent as a number. Raises ConfigError."""
     if gamma in (None, "srgb", "linear"):
         return gamma
     try:
@@ -94,8 +95,8 @@ def checked_gamma(gamma: str | float | None) -> str | float | None:
 
 
 def noise_of(frames: Sequence[np.ndarray], decode: Decoder, fitting: Fitting | None = None) -> FrameNoise | None:
-    """The noise of the first frames as stored, after ``decode`` and ``fitting``; None for floats, which are exact, and
-    for frames that are not alike (which are refused when their turn comes)."""
+    """Return the noise of the first stored frames, after ``decode`` and ``fitting``; None for floats, which are exact,
+    and for frames of different sizes (which are refused later)."""
     first = frames[0]
     if first.dtype not in (np.uint8, np.uint16):
         return None

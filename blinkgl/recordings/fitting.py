@@ -1,4 +1,4 @@
-"""Frames of one size as a sensor of another would see them: the largest part of the sensor's shape, scaled."""
+"""Frames converted to a sensor of another size: the largest part of the sensor's shape, scaled."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Fitting:
-    """given, wanted : (height, width), px."""
+    """A conversion of frame sizes. given, wanted : (height, width), px."""
 
     given: tuple[int, int]
     wanted: tuple[int, int]
 
     @property
     def part(self) -> tuple[int, int]:
-        """(height, width) of what is used of a frame: its middle, of the wanted shape."""
+        """Return (height, width) of the used part of a frame: its middle, of the wanted shape."""
         (height, width), (wanted_height, wanted_width) = self.given, self.wanted
         scale = min(height / wanted_height, width / wanted_width)
         return max(1, round(wanted_height * scale)), max(1, round(wanted_width * scale))
 
     def __call__(self, luminance: np.ndarray) -> np.ndarray:
-        """(H, W) float32 linear, as given, to the wanted size: means over areas where that is smaller."""
+        """Return (H, W) float32 linear light at the wanted size: means over areas where that is smaller."""
         height, width = self.part
         y, x = (self.given[0] - height) // 2, (self.given[1] - width) // 2
         cut = luminance[y : y + height, x : x + width]

@@ -1,8 +1,8 @@
-"""The noise of given frames: found from the frames, and kept from becoming events.
+"""The noise of given frames: estimated from the frames, and prevented from becoming events.
 
-A camera that stands still gives frames that differ by noise, and an emulator takes every difference for light. What a
-pixel of the event camera would have seen is steadier: its own noise is the emulator's matter
-(:mod:`blinkgl.events.noise`), that of the frames is not.
+A static camera's frames differ by noise, and an emulator interprets every difference as light. An event camera's own
+pixels have less noise, which the emulator models (:mod:`blinkgl.events.noise`); the frames' noise must not be added to
+it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy as np
 from blinkgl.timeline.interpolate import DenseFlow
 
 LOOKED_AT = 5
-"""Frames at the beginning from which the noise is found."""
+"""Number of first frames from which the noise is estimated."""
 BAND = 4.0
-"""Standard deviations of the noise within which a change is taken for noise: of a hundred thousand pixels that stand
-still, a dozen leave it in a frame. Of two recordings by still cameras, 3 leaves 0.6 and 4.5 times the events that the
-event camera has at still pixels, 4 leaves 0.4 and 2.2; 5 begins to cost events of what moves."""
+"""Standard deviations of the noise within which a change counts as noise: of a hundred thousand static pixels, a dozen
+exceed it per frame. For two recordings by static cameras, 3 leaves 0.6 and 4.5 times the event camera's events at
+static pixels, 4 leaves 0.4 and 2.2; 5 begins to lose events of motion."""
 _BLOCK_PX = 8
 _QUANTILE, _OF_CHI_SQUARED = 0.2, 0.85
 """Part of the blocks of one brightness that are taken to hold noise alone, and the 20 % quantile of the mean square of
@@ -36,9 +36,9 @@ has to be noise; the side over which the flow is smoothed. Of noise 0.7 or more 
 photographs that move by 0.5 px 0.2 to 0.5 (median), by 2 or 7 px 0.02."""
 _BINS, _LEAST_BLOCKS = 12, 12
 _CLEAN = 0.35
-"""Codes: what rounding alone makes is 0.29."""
+"""Codes: rounding alone gives 0.29."""
 _BRIGHT = 0.85
-"""Of full scale: above, codes are near their end, and noise is cut."""
+"""Fraction of full scale: above, codes are near their end, and noise is clipped."""
 _FEW_CODES, _CLIPPED, _FLICKER = 32, 0.1, 0.02
 """From which on frames are warned of: different codes, part of the pixels at an end, and how much the whole picture's
 brightness jumps to and fro from one frame to the next (median)."""
@@ -54,7 +54,7 @@ class FrameNoise:
     typical: tuple[float, float]
 
     def sigma(self, luminance: np.ndarray) -> np.ndarray:
-        """Standard deviation at a luminance, of full scale."""
+        """Return the standard deviation at a luminance, of full scale."""
         return np.sqrt(self.constant + self.slope * luminance)
 
     def __str__(self) -> str:
@@ -63,10 +63,11 @@ class FrameNoise:
 
 
 def frame_noise(frames: Sequence[np.ndarray], code: float) -> FrameNoise | None:
-    """The noise of the first frames of a clip, or None for frames without: nothing but rounding, or too small to say.
+    """Return the noise of the first frames of a clip, or None for frames with only rounding noise, or too small to
+    estimate.
 
-    frames : (H, W) float32 luminance of full scale 1, of one size.   code : distance of two codes at middle
-    brightness, in luminance."""
+    frames : (H, W) float32 luminance of full scale 1, of one size.   code : distance of two codes at middle brightness,
+    in luminance."""
     found = [_blocks(a, b) for a, b in itertools.pairwise(frames)]
     light, square = (np.concatenate(values) for values in zip(*found)) if found else (np.empty(0), np.empty(0))
     if len(light) < 2 * _LEAST_BLOCKS:
@@ -83,8 +84,8 @@ def frame_noise(frames: Sequence[np.ndarray], code: float) -> FrameNoise | None:
 
 
 def _blocks(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) mean luminance and variance of a pixel's noise, of the blocks in which no code is at an end and in which
-    what changed is white: noise is, and a texture that moves is not."""
+    """Return mean luminance and variance of a pixel's noise, (N,), of the blocks in which no code is at an end and the
+    change is white: noise is, and a moving texture is not."""
     height, width = (side // _BLOCK_PX * _BLOCK_PX for side in a.shape)
     if not height or not width:
         return np.empty(0), np.empty(0)
@@ -92,8 +93,8 @@ def _blocks(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         image[:height, :width], (width // _BLOCK_PX, height // _BLOCK_PX), interpolation=cv2.INTER_AREA
     ).ravel()
     change = b - a
-    # What changes smoothly over the picture is light. Taking the mean of 3x3 away leaves 8/9 of the noise's variance,
-    # and the mask 36 times as much (Immerkaer, CVIU 1996); a difference of two frames has twice as much as one.
+    # A smooth change over the picture is light. Subtracting the mean of 3x3 leaves 8/9 of the noise's variance
+    # (Immerkaer, CVIU 1996, whose mask leaves 36 times it); a difference of two frames has twice the variance of one.
     square = mean((change - cv2.blur(change, (3, 3))) ** 2) / (2 * 8 / 9)
     finest = mean(cv2.filter2D(change, -1, _MASK) ** 2) / (2 * 36)
     light = mean((a + b) / 2)
@@ -122,8 +123,8 @@ def _moved(a: np.ndarray, b: np.ndarray, mean: Callable[[np.ndarray], np.ndarray
 
 
 def _lower_line(level: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """(constant, slope), neither negative, of a line below most of the points: at some levels everything moves, and
-    their variance is not noise's."""
+    """Return (constant, slope), neither negative, of a line below most of the points: at some levels everything moves,
+    and their variance is not noise."""
     from scipy.optimize import nnls
 
     scale = max(float(variance.max()), 1e-30)
@@ -139,9 +140,9 @@ def _lower_line(level: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
 
 
 class Steadied:
-    """A pixel follows the frames' light only as far as noise does not explain the distance: by a band round what it
-    stands at, of ``BAND`` standard deviations to either side, which the light pushes along. What stays inside makes no
-    change at all, and so no event; a ramp is followed at a distance."""
+    """A pixel follows the frames' light only as far as noise does not explain the difference: a band of ``BAND``
+    standard deviations on each side of its value, which the light pushes. Changes inside cause no event; a ramp is
+    followed at a distance."""
 
     def __init__(self, noise: FrameNoise):
         self._noise = noise
@@ -149,11 +150,11 @@ class Steadied:
         self._frames = 0
 
     def __call__(self, luminance: np.ndarray) -> np.ndarray:
-        """(H, W) float32 of the next frame to what the pixels take it for; the argument stays as it is."""
+        """Return the pixels' values for the next frame, (H, W) float32; the argument is not changed."""
         if self._at is None:
             self._at = luminance
         else:
-            # Where a pixel stands is the frames' mean at first, whose own noise is in the distance, too.
+            # At first a pixel's value is the frames' mean, whose own noise is included in the difference.
             width = BAND * np.sqrt(1 + 1 / self._frames) * self._noise.sigma(np.maximum(self._at, 0))
             self._at = np.clip(self._at, luminance - width, luminance + width).astype(np.float32)
         self._frames += 1
@@ -161,7 +162,7 @@ class Steadied:
 
 
 def caveats(first: Sequence[np.ndarray], brightness: Sequence[float]) -> Iterator[str]:
-    """What a user has to know of frames as stored before believing their events, a line each.
+    """Yield warnings about stored frames that affect their events, a line each.
 
     first : the first frames.   brightness : mean code of each frame."""
     codes = [frame for frame in first if frame.dtype.kind == "u"]

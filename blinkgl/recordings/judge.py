@@ -1,9 +1,10 @@
-"""Can two recordings be told apart? A two-sample test by a classifier (Lopez-Paz and Oquab, ICLR 2017) on local patches
-of events (:mod:`~blinkgl.recordings.patches`): what it learns in some stretches of time is tried on the others. An area
-under the curve of 0.5 is guessing, 1 certainty.
+"""A two-sample test of recordings by a classifier (Lopez-Paz and Oquab, ICLR 2017) on local patches of events
+(:mod:`~blinkgl.recordings.patches`): it is trained on some time windows and tested on the others. An area under the
+curve of 0.5 is guessing, 1 certainty.
 
-Asked twice. Of a patch by itself: which recording is it from? That is how unlike the two look, whatever they saw. Of
-the same patch in both: which is which? There the scene cancels, and a tenth of the events missing is seen at once.
+Two questions. For a single patch: which recording is it from? That measures how different the two look, for any scene.
+For the same patch in both: which is which? There the scene cancels, so a tenth of the events missing is detected at
+once.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from blinkgl.types.events import Events
 
 FOLDS = 4
 LEAST_IN_PATCH = 8
-"""Events, on either side: of what is all but empty nothing can be said."""
+"""Events, on either side; patches with fewer are not used."""
 LEAST_PATCHES = 100
-"""Of either side; fewer say nothing."""
+"""Patches of either side; fewer are not enough."""
 MOST_PATCHES = 20_000
 _BINS, _ROUNDS, _RATE = 24, 80, 0.15
 _TELLING = 3
@@ -29,9 +30,9 @@ _TELLING = 3
 
 @dataclass(frozen=True)
 class Judgement:
-    """auc : mean over the folds; below 0.5 is chance, too.   spread : their standard deviation.   patches : of both
-    sides together.   window_us : of a patch.   paired : AUC of telling which of two patches of one place and time is
-    whose; None where there are no pairs.   telling : what told most, (name, share of what was gained)."""
+    """Result of a test. auc : mean over the folds; below 0.5 is chance, too.   spread : their standard deviation.
+    patches : of both sides together.   window_us : of a patch.   paired : AUC of identifying two patches of one place
+    and time; None where there are no pairs.   telling : the most important features, (name, share of the gain)."""
 
     auc: float
     spread: float
@@ -42,8 +43,8 @@ class Judgement:
 
 
 def judge(a: Events, b: Events, size: tuple[int, int], span_us: tuple[int, int]) -> Judgement:
-    """Tells b from a, of sensors of one size, in the same span of time [span_us[0], span_us[1]). Patches that are all
-    but empty on both sides are left out. EventDataError: too few patches with events."""
+    """Distinguish b from a, of sensors of one size, in the same time span [span_us[0], span_us[1]). Patches that are
+    nearly empty on both sides are left out. Raises EventDataError: too few patches with events."""
     features = [patches(events, size, span_us) for events in (a, b)]
     full = np.maximum(features[0][0], features[1][0]) >= LEAST_IN_PATCH
     own, other = (values[full] for _, values in features)
@@ -51,7 +52,7 @@ def judge(a: Events, b: Events, size: tuple[int, int], span_us: tuple[int, int])
     window = np.nonzero(full)[0]
     window_us = (span_us[1] - span_us[0]) / WINDOWS
     alone = _judged(np.concatenate([own, other]), label, np.tile(window, 2), window_us)
-    # Which of the two comes first is drawn, and the question is which.
+    # The order of the two is random, and must be identified.
     swapped = np.random.default_rng(0).integers(0, 2, len(own)).astype(float)
     try:
         paired = _judged((own - other) * (2 * swapped - 1)[:, None], swapped, window, window_us).auc
@@ -63,8 +64,8 @@ def judge(a: Events, b: Events, size: tuple[int, int], span_us: tuple[int, int])
 def judge_unlike(
     a: Events, b: Events, size_a: tuple[int, int], size_b: tuple[int, int], span_us: tuple[int, int]
 ) -> Judgement:
-    """Of sensors of different sizes: by the patches that are not all but empty, wherever they lie. What the two saw
-    counts, too."""
+    """Compare sensors of different sizes by their non-empty patches at any position. Differences of the scenes count,
+    too."""
     found = [patches(events, size, span_us) for events, size in ((a, size_a), (b, size_b))]
     full = [count >= LEAST_IN_PATCH for count, _ in found]
     x = np.concatenate([values[some] for (_, values), some in zip(found, full)])
@@ -74,8 +75,8 @@ def judge_unlike(
 
 
 def judge_halves(a: Events, size: tuple[int, int], span_us: tuple[int, int]) -> Judgement:
-    """A recording's own halves, dealt out in space and time like a chessboard's squares: what a judge says of two
-    streams of one camera and one scene, 0.5 but for chance."""
+    """Compare a recording's own halves, divided in space and time like a chessboard: the result for two streams of one
+    camera and one scene, 0.5 except for chance."""
     count, values = patches(a, size, span_us)
     full = count >= LEAST_IN_PATCH
     t, y, x = np.nonzero(full)
@@ -117,8 +118,8 @@ def _telling(gains: np.ndarray) -> Iterator[tuple[str, float]]:
 
 
 def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scores of ``other`` (M, F) by gradient boosting of stumps (Friedman 2001) under the logistic loss, learnt of
-    ``x`` (N, F) and ``label`` (N,) of 0 and 1; features are cut at quantiles. And (F,) what each feature gained."""
+    """Return scores of ``other`` (M, F) by gradient boosting of stumps (Friedman 2001) with the logistic loss, trained
+    on ``x`` (N, F) and ``label`` (N,) of 0 and 1; features are cut at quantiles. Also (F,) the gain of each feature."""
     count = x.shape[1]
     cuts = [np.unique(np.quantile(x[:, f], np.arange(1, _BINS) / _BINS)) for f in range(count)]
     code = lambda data: np.stack([np.searchsorted(cuts[f], data[:, f], side="right") for f in range(count)], 1)
@@ -142,8 +143,8 @@ def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.nda
 
 
 def area(score: np.ndarray, label: np.ndarray) -> float:
-    """Under the curve of true against false positives: how often one of the second kind has the higher score (Mann and
-    Whitney), ties half."""
+    """Return the area under the curve of true against false positives: how often one of the second kind has the higher
+    score (Mann and Whitney), ties half."""
     from scipy.stats import rankdata
 
     positive = label > 0.5

@@ -1,8 +1,8 @@
-"""What is told of a patch of events, a few pixels by a stretch of time: the numbers by which the judge
-(:mod:`~blinkgl.recordings.judge`) tells recordings apart.
+"""Features of patches of events (a few pixels by a time window), by which the judge (:mod:`~blinkgl.recordings.judge`)
+distinguishes recordings.
 
-Some are of single pixels (rates, intervals), some of neighbours (which way things move, what goes on over the patch's
-border), some of the whole sensor (bursts), some of the patches beside it in space and time.
+Some describe single pixels (rates, intervals), some neighbours (direction of motion, continuity over the patch's
+border), some the whole sensor (bursts), some the adjacent patches in space and time.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from blinkgl.types.events import Events
 
 SIDE_PX = 16
 WINDOWS = 16
-"""Of time; a patch is SIDE_PX x SIDE_PX pixels by one of them."""
+"""Number of time windows; a patch is SIDE_PX x SIDE_PX pixels by one of them."""
 NEAR_US = 2000
-"""An event has company where a pixel beside it fired not longer ago."""
+"""An event has company where an adjacent pixel fired at most this long before."""
 _BURST = 64
-"""Parts of a window in which the sensor's events are counted, and ``_BURST // 2`` of them are what is usual."""
+"""Parts of a window in which the sensor's events are counted; the usual count is over ``_BURST // 2`` of them."""
 _PIXEL, _BESIDE = 14, 8
 
 NAMES = (
@@ -48,13 +48,13 @@ NAMES = (
     "more than before",
     "more than after",
 )
-"""Of the features, in their order."""
+"""Names of the features, in order."""
 
 
 def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """(T, Y, X) int number of events of each patch, and (T, Y, X, F) float32 what is told of it, ``NAMES``.
+    """Return the number of events of each patch, (T, Y, X) int, and its features, (T, Y, X, F) float32, ``NAMES``.
 
-    size : (height, width) px.   span_us : what is cut into ``WINDOWS``."""
+    size : (height, width) px.   span_us : divided into ``WINDOWS``."""
     height, width = size
     shape = WINDOWS, -(-height // SIDE_PX), -(-width // SIDE_PX)
     window = (span_us[1] - span_us[0]) / WINDOWS
@@ -105,7 +105,7 @@ def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> 
 
 
 def _beside(values: np.ndarray) -> np.ndarray:
-    """Mean over the patches left, right, above and below, where there are such."""
+    """Return the mean over the patches left, right, above and below, where they exist."""
     padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
     four = np.stack([padded[:, :-2, 1:-1], padded[:, 2:, 1:-1], padded[:, 1:-1, :-2], padded[:, 1:-1, 2:]])
     there = np.isfinite(four)
@@ -114,7 +114,8 @@ def _beside(values: np.ndarray) -> np.ndarray:
 
 
 def _bursts(t: np.ndarray, window: float) -> np.ndarray:
-    """Logarithm of the sensor's events in short parts of the time against what is usual round them."""
+    """Return the logarithm of the sensor's events in short parts of the time relative to the usual count around
+    them."""
     parts = WINDOWS * _BURST
     count = np.bincount(np.minimum((t / window * _BURST).astype(np.int64), parts - 1), minlength=parts).astype(float)
     usual = np.convolve(count, np.full(_BURST // 2 + 1, 1 / (_BURST // 2 + 1)), "same")
@@ -123,7 +124,7 @@ def _bursts(t: np.ndarray, window: float) -> np.ndarray:
 
 @kernel
 def _of_pixels(x, y, t, p, window, size, sums):
-    """Sums over each pixel's own events in a patch."""
+    """Compute sums over each pixel's own events in a patch."""
     last = np.full(size, -1, np.int64)
     before = np.zeros(size, np.uint8)
     gap_before = np.full(size, -1, np.int64)  # of one polarity; -1: the event before was of the other, or the first
@@ -160,7 +161,7 @@ def _of_pixels(x, y, t, p, window, size, sums):
 
 @kernel
 def _of_neighbours(x, y, t, p, window, size, sums):
-    """Sums over the events of the eight pixels round each event, before it."""
+    """Compute sums over the preceding events of the eight pixels around each event."""
     height, width = size
     last = np.full(size, -1, np.int64)
     before = np.zeros(size, np.uint8)
@@ -189,7 +190,7 @@ def _of_neighbours(x, y, t, p, window, size, sums):
 
 @kernel
 def _of_times(x, y, t, window, bursts, sums):
-    """Events that have the same time as the one before, wherever that is, and how busy the sensor was."""
+    """Count events with the same time as the previous one, anywhere, and the sensor's activity."""
     for i in range(len(t)):
         k = min(int(t[i] / window), sums.shape[0] - 1)
         s = sums[k, y[i] // SIDE_PX, x[i] // SIDE_PX]

@@ -1,10 +1,10 @@
-"""The noise of single pixels (``readout.pixels``) that a camera's still scene shows: how many pixels are noisy or hot,
-how much, how often an event of noise is answered by one of the opposite polarity, and what hot pixels prefer.
+"""Fit of single-pixel noise (``readout.pixels``) to a camera's recording of a static scene: how many pixels are noisy
+or hot, how much, how often a noise event is followed by one of the opposite polarity, and the polarity of hot pixels.
 
-Fitted by maximum likelihood to how many events each pixel made in the first half of the recording (the Poisson process
-of :class:`~blinkgl.events.pixels.PixelNoise`, its rates a mixture of two log-normal laws, counts of answered events
-compound), to the time between the two events of pixels that made two, and to how many of a hot pixel's are ON. Judged
-by the half that was not fitted.
+Maximum likelihood of the number of events of each pixel in the first half of the recording (the Poisson process of
+:class:`~blinkgl.events.pixels.PixelNoise`, its rates a mixture of two log-normal laws, counts of answered events
+compound), of the time between the two events of pixels with two, and of the number of a hot pixel's ON events. The
+other half tests the fit.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from blinkgl.recordings.clip import read_recording
 from blinkgl.types.events import Events
 
 LEAST_EVENTS = 500
-"""Of a half: fewer say nothing of a spread over pixels."""
+"""Events per half; fewer do not determine a spread over pixels."""
 WORTH = 6.0
-"""By which the logarithm of the likelihood has to grow for hot pixels, or answers, to be told."""
+"""Gain of log-likelihood that hot pixels, or answers, must give."""
 _EXACT, _PER_DECADE = 64, 12
-"""Counts up to the first are told apart; larger ones in bins, so many a decade."""
+"""Counts up to the first are separate; larger ones are in bins, this many per decade."""
 _GRID = np.linspace(np.log(1e-7), np.log(1e6), 480)
 """Logarithms of expected counts over which laws of rates are summed."""
 _SHARES = 20
@@ -60,7 +60,7 @@ class PixelFit:
 
     @property
     def fired(self) -> tuple[int, int]:
-        """Pixels, recorded and simulated."""
+        """Return the number of pixels that fired, recorded and simulated."""
         return len(self.counts[0]), len(self.counts[1])
 
     @property
@@ -76,7 +76,7 @@ class PixelFit:
         return self.simulated / max(self.recorded, 1)
 
     def sensor(self) -> dict[str, Any]:
-        """The table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
+        """Return the table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
         file = os.path.basename(self.recording)
         told = {k: float(f"{v:.4g}") for k, v in self.config.model_dump(exclude_defaults=True).items()}
         return {
@@ -97,7 +97,7 @@ class PixelFit:
 def fit_pixels(
     recording: str | os.PathLike, *, seed: int = 0, progress: Callable[[str, float], None] | None = None
 ) -> PixelFit:
-    """:func:`fit_pixels_of` of a file.   Raises EventDataError (too few events), AssetError (unreadable)."""
+    """Fit :func:`fit_pixels_of` to a file.   Raises EventDataError (too few events), AssetError (unreadable)."""
     if progress:
         progress("reading", 0.0)
     events, size = read_recording(recording, least=2 * LEAST_EVENTS)
@@ -113,8 +113,8 @@ def fit_pixels_of(
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> PixelFit:
-    """``readout.pixels`` for what a still scene in constant light shows. size : (height, width) of the sensor.
-    used : (height, width) bool, the pixels that are looked at; None: all."""
+    """Fit ``readout.pixels`` to a static scene in constant light. size : (height, width) of the sensor.
+    used : (height, width) bool, the pixels to use; None: all."""
     say = progress or (lambda *_: None)
     height, width = size
     looked = np.ones(height * width, bool) if used is None else np.asarray(used, bool).reshape(-1)
@@ -163,7 +163,7 @@ def fit_pixels_of(
         spread = uncertainty.pop("share")
         delay, wide, first_on = _delays(halves[0], pixel, counts, seconds[0])
         seen = _seen(delay, wide, seconds[0])
-        # Answers that come after the end are lost, those of what came before the beginning stand alone.
+        # Answers after the end are lost; those of noise before the beginning are single events.
         q = min(share / max(seen + share * (seen - 1.0), 1e-3), 1.0)
         values |= {"answered": q, "answer_ms": 1e3 * delay, "answer_spread_decades": wide}
         uncertainty["answered"] = spread * q / share
@@ -207,7 +207,7 @@ def _too_few(name: str, count: int) -> EventDataError:
 
 
 def _within(key: str, value: float) -> float:
-    """A value inside the key's own limits."""
+    """Return a value within the key's limits."""
     ends = {"ge": -np.inf, "le": np.inf}
     for rule in PixelsConfig.model_fields[key].metadata:
         ends |= {side: getattr(rule, side) for side in ends if getattr(rule, side, None) is not None}
@@ -215,7 +215,7 @@ def _within(key: str, value: float) -> float:
 
 
 def _gaps(events: Events, width: int) -> np.ndarray:
-    """Times between a pixel's events, µs."""
+    """Return times between a pixel's events, µs."""
     pixel = events.y.astype(np.int64) * width + events.x
     order = np.lexsort((events.t, pixel))
     return np.diff(events.t[order])[np.diff(pixel[order]) == 0]
@@ -275,8 +275,8 @@ def _preferences(
 
 
 def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: float) -> float:
-    """Seconds that a pixel sleeps after an event: a low percentile of the intervals of those that fire most, if no
-    shorter ones are due there; 0 where nobody fires often enough to tell."""
+    """Return the dead time of a pixel after an event, s: a low percentile of the intervals of the most active pixels,
+    if no shorter ones are expected; 0 where no pixel is active enough."""
     busy = counts >= max(100, 0.3 * counts.max())
     inside = busy[pixel]
     order = np.lexsort((events.t[inside], pixel[inside]))
@@ -289,7 +289,7 @@ def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: f
 
 
 def _seen(delay: float, decades: float, seconds: float) -> float:
-    """Share of answers that fall into a recording of that length in which what they answer does."""
+    """Return the fraction of answers that fall into a recording of that length together with their events."""
     if decades <= 0:
         return max(1 - delay / seconds, 0.0)
     x = np.linspace(-6, 6, 600)
@@ -309,8 +309,8 @@ class _Found:
 
 
 class _Counts:
-    """The likelihood of how many events each pixel made. counts : (pixels,).   seconds : in which.
-    dead : s that a pixel sleeps after an event."""
+    """The likelihood of each pixel's number of events. counts : (pixels,).   seconds : duration.   dead : dead time
+    after an event, s."""
 
     def __init__(self, counts: np.ndarray, seconds: float, dead: float = 0.0):
         self._seconds, self._dead = seconds, dead
@@ -350,7 +350,7 @@ class _Counts:
         return self._kept[number]
 
     def _law(self, median: float, decades: float) -> np.ndarray:
-        """Weights of the grid, of a log-normal law of rates (1/s)."""
+        """Return weights of the grid, of a log-normal law of rates (1/s)."""
         weight = np.exp(-0.5 * ((_GRID - np.log(median * self._seconds)) / (_TEN * decades)) ** 2)
         return weight / max(weight.sum(), 1e-300)
 
@@ -363,7 +363,7 @@ class _Counts:
         return (1 - v["hot_fraction"]) * plain, v["hot_fraction"] * own
 
     def hot_chance(self, found: _Found, counts: np.ndarray) -> np.ndarray:
-        """(pixels,) probability that a pixel that made so many events is a hot one."""
+        """Return the probability, (pixels,), that a pixel with this number of events is hot."""
         plain, own = self._chances(found.values)
         share = own / np.maximum(plain + own, 1e-300)
         return share[np.searchsorted(self._edges, counts)]
@@ -399,7 +399,7 @@ class _Counts:
             starts.append(np.array([rate, spread, *((-6.0, tail, -2.0) if hot else ())]))
         for start in starts:
             start = np.append(start, 0.0) if answers else start
-            for _ in range(2):  # the simplex begins anew where it ended
+            for _ in range(2):  # the simplex restarts where it ended
                 options = {"maxiter": 400 * len(start), "xatol": 1e-3, "fatol": 1e-2}
                 start = minimize(loss, start, method="Nelder-Mead", options=options).x
             ends.append((loss(start), start))
@@ -420,7 +420,7 @@ class _Counts:
 
 
 def _curvature(loss: Callable[[np.ndarray], float], at: np.ndarray, step: float = 0.02) -> np.ndarray:
-    """(n, n) second differences."""
+    """Return (n, n) second differences."""
     n = len(at)
     found, unit = np.zeros((n, n)), step * np.eye(n)
     for i in range(n):

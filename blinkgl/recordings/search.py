@@ -1,8 +1,8 @@
 """The search for an emulator's parameters: least squares on the logarithms of the parameters, from several starts.
 
-Numbers of the recording (:mod:`~blinkgl.recordings.statistics`) are compared with the same of a simulation, each
-difference divided by what it may be by chance, with a robust loss (the method of simulated moments, McFadden,
-Econometrica 57, 1989). What the data say nothing about is left at its default, and named.
+Numbers of the recording (:mod:`~blinkgl.recordings.statistics`) are compared with those of a simulation, each
+difference divided by its standard deviation by chance, with a robust loss (the method of simulated moments, McFadden,
+Econometrica 57, 1989). Parameters that the data do not determine are left at their defaults, and named.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import Sums, Targets, sums, target
 
 TRIED = 64
-"""Settings drawn over the whole room of the parameters, of which the best are started from."""
+"""Number of random settings over the whole range of the parameters; the best are the starts."""
 STEP = 0.05
-"""Of a parameter's logarithm, for derivatives: far above the jumps of single events."""
+"""Step of a parameter's logarithm, for derivatives: far above the jumps by single events."""
 UNTOLD = 0.5
-"""Standard deviation of a parameter's logarithm from which on the data are taken not to tell it."""
+"""Standard deviation of a parameter's logarithm above which the data do not determine it."""
 VAGUE = 0.25
-"""From which on other places are tried, too."""
+"""Standard deviation above which other values are tried, too."""
 LEAST_CHANCE = 0.05
-"""Of a number's error, where chance is known at all."""
+"""Smallest part of chance in a number's error, where chance is known."""
 TOLERANCE = 0.5
-"""How much worse the fit may become by putting a parameter that is not told back to its default."""
+"""Largest loss of fit by resetting an undetermined parameter to its default."""
 PRIOR = 2.0
-"""How much a standard deviation from what cameras have counts for: as the smaller of the blocks of numbers."""
+"""Weight of a deviation by one standard deviation from typical cameras: as the smaller of the blocks of numbers."""
 _MOST_STEPS = 20
 _FEW_STEPS, _PLACES = 3, 6
 _WORTH = 0.2
-"""How much worse than the best a place may be, with derivatives from elsewhere, to be worth a descent."""
+"""How much worse than the best a point may be, with derivatives from elsewhere, to be worth a descent."""
 _EACH = 3
-"""Places for a start, from which a few steps are tried."""
+"""Points per start, from which a few steps are tried."""
 _LITTLE = 0.01
-"""Part of the cost that a step has to gain, or the descent ends."""
+"""Fraction of the cost that a step must gain; otherwise the descent ends."""
 
 
 class Search:
-    """Looks for the parameters; their logarithms are what it works with."""
+    """Searches for the parameters, in their logarithms."""
 
     def __init__(
         self,
@@ -54,7 +54,8 @@ class Search:
         seed: int,
         progress: Callable[[float], None] = lambda _: None,
     ):
-        """parts : clips of one camera, and how many intervals of each are looked at: one set of parameters for all."""
+        """Prepare a search. parts : clips of one camera, and the number of intervals used of each: one set of
+        parameters for all."""
         self._parts, self._base, self._seed, self._progress = parts, base, seed, progress
         # What a model has no parameter for it would buy with those that are for something else.
         one = lambda clip, stop: target(sums(clip.events, clip, 0, stop), together=base.one_threshold)
@@ -73,8 +74,8 @@ class Search:
         self._planned = 1
 
     def responding(self, keys: list[str]) -> list[str]:
-        """Those that make any difference to the scene; the others are named and left alone. What is tried is the middle
-        of all rooms with one key at either end."""
+        """Return the parameters that affect the scene; the others are named and not changed. The test uses the middle
+        of all ranges, with one key at either end."""
         middle = self._ends(keys).mean(axis=1)
         here, found = self._off(keys, middle), []
         for i, ends in enumerate(self._ends(keys)):
@@ -88,8 +89,8 @@ class Search:
         return found
 
     def roughly(self, keys: list[str], starts: int) -> np.ndarray:
-        """The logarithms of the parameters where the best of several descents ends: a few steps from more places, then
-        all from those that led lowest."""
+        """Return the logarithms of the parameters at the end of the best of several descents: a few steps from more
+        points, then all steps from those that led lowest."""
         ends = self._ends(keys)
         tried = qmc.scale(qmc.Sobol(len(keys), seed=self._seed).random(TRIED), *ends.T)
         tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
@@ -104,23 +105,23 @@ class Search:
 
     @property
     def keys(self) -> list[str]:
-        """Of the parameters that are looked for."""
+        """Return the parameters of the search."""
         return self._keys
 
     @property
     def place(self) -> np.ndarray:
-        """The logarithms of the parameters where it stands."""
+        """Return the logarithms of the present parameters."""
         return self._at
 
     def run(self, keys: list[str], start: np.ndarray) -> None:
-        """start : logarithms of the parameters, where :meth:`roughly` ended."""
+        """Run the search. start : logarithms of the parameters, where :meth:`roughly` ended."""
         if not keys:
             self.cost = _loss(self._difference([], np.empty(0)))
             return
         self.target.beside(self._sums(keys, start), floor="expected")
         best = self._descend(keys, start)
-        # As if the model were the camera, with nothing but chance between them; then with what it turns out to be off
-        # by.
+        # First as if the model were exact, with only chance errors; then with the errors that the model turns out to
+        # have.
         for floor in ("lowest", "seen"):
             self.target.beside(self._sums(keys, best[1]), floor=floor)
             best = self._descend(keys, best[1])
@@ -169,8 +170,8 @@ class Search:
         return {key: float(np.exp(v)) for key, v in zip(self._keys, self._at)}
 
     def uncertainty(self) -> dict[str, float]:
-        """Of the recording's and the simulation's chance alone, more where the model does not fit: from what the fit
-        would move by if a group of pixels were missing."""
+        """Return the uncertainty by chance of the recording and the simulation, larger where the model does not fit:
+        from the change of the fit when a group of pixels is left out."""
         if not self._keys:
             return {}
         t = self.target
@@ -181,8 +182,8 @@ class Search:
         moved = (t.jackknife - t.jackknife.mean(axis=0)) * (t.weight / t.error) @ pull.T
         groups = len(t.jackknife)
         spread = np.sqrt((groups - 1) / groups * (moved**2).sum(axis=0))
-        # Where the model is off by more than chance, by that much; a number that hardly any group of pixels moves says
-        # nothing of chance.
+        # Where the model's error exceeds chance, that error; a number that hardly any group of pixels changes gives no
+        # estimate of chance.
         known = t.chance > LEAST_CHANCE * t.error
         off = self._residual[:count][known] / t.weight[known] * t.error[known] / t.chance[known]
         misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
@@ -193,20 +194,20 @@ class Search:
         return np.sqrt(np.diag(np.linalg.inv(told.T @ told + self._prior())))
 
     def _robust(self) -> np.ndarray:
-        """Square roots of the weights that the loss gives to the residuals."""
+        """Return square roots of the loss's weights of the residuals."""
         return (1 + self._residual**2) ** -0.25
 
     def _prior(self) -> np.ndarray:
-        """Of the logarithms, as information: what cameras have; where nothing is known of them but the ends, a normal
-        law as wide."""
+        """Return the information on the logarithms from typical cameras; where only the ends of a range are known, a
+        normal law of the same width."""
         ends = self._ends(self._keys)
         wide = 12 / np.diff(ends, axis=1)[:, 0] ** 2
         _, scale = self._usual(self._keys)
         return np.diag(np.where(scale > 0, scale**2, wide))
 
     def _usual(self, keys: list[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Logarithms of what cameras have, and what a distance from it counts for; 0 where nothing is known. Whoever
-        begins with a sensor says with it what is usual."""
+        """Return logarithms of typical values, and the weight of a deviation from them; 0 where nothing is known. An
+        initial sensor defines what is typical."""
         usual, scale = np.zeros(len(keys)), np.zeros(len(keys))
         for i, key in enumerate(keys):
             known, given = self._base.fitted[key], self._default(key)
@@ -238,7 +239,7 @@ class Search:
         ]
 
     def _difference(self, keys: list[str], at: np.ndarray) -> np.ndarray:
-        """What the simulation is off by, and behind it how far the parameters are from what is usual."""
+        """Return the simulation's errors, followed by the parameters' deviations from typical values."""
         usual, scale = self._usual(keys)
         return np.concatenate([self._off(keys, at), scale * (at - usual)])
 
@@ -249,7 +250,7 @@ class Search:
         return np.array([_loss(self._difference(keys, at)) for at in places])
 
     def _derivatives(self, keys: list[str], at: np.ndarray, here: np.ndarray) -> np.ndarray:
-        """By steps of ``STEP``; by wider ones where that does hardly anything."""
+        """Return derivatives by steps of ``STEP``, or wider ones where that has hardly any effect."""
         columns = []
         for i, (low, high) in enumerate(self._ends(keys)):
             for width in (STEP, 8 * STEP):
@@ -263,10 +264,9 @@ class Search:
         return np.array(columns).T.reshape(len(here), len(keys))
 
     def _scanned(self, keys: list[str], best: tuple[float, np.ndarray]) -> tuple[float, np.ndarray]:
-        """What a descent cannot see: far from where a parameter matters (a dead time shorter than any interval, an
-        offset darker than any pixel) nothing says which way to go. So those that the data hardly tell here are each
-        held at places over their whole room while the others follow, and the descent begins
-        again where that is better."""
+        """Search where a descent has no gradient: far from where a parameter matters (a dead time shorter than any
+        interval, an offset darker than any pixel). Each weakly determined parameter is held at values over its whole
+        range while the others follow; the descent restarts from a better point."""
         self._keys, self._at, self._residual = keys, best[1], self._difference(keys, best[1])
         self._jacobian = self._derivatives(keys, best[1], self._residual)
         vague = [i for i, spread in enumerate(self._spread()) if spread > VAGUE]
@@ -277,12 +277,12 @@ class Search:
             slopes = np.delete(np.delete(self._jacobian, i, axis=1), numbers + i, axis=0)
             for place in np.linspace(low, high, _PLACES + 2)[1:-1]:
                 self._set = {**held, keys[i]: float(np.exp(place))}
-                # By the derivatives of where the scan began: near enough to see which places are worth a descent.
+                # With the derivatives of the scan's start: accurate enough to see which points are worth a descent.
                 cost, at = self._descend(others, np.delete(start[1], i), slopes, _FEW_STEPS)
                 tried.append((cost, np.insert(at, i, place)))
             self._set = held
             tried.sort(key=lambda one: one[0])
-            # A place may be better although the nearest that was tried is not: let go of it.
+            # A point may be better although the nearest tried one is not, so its parameter is released.
             worth = [at for cost, at in tried[:2] if cost < best[0] + max(_WORTH * best[0], 2.0)]
             best = min([best, *(self._descend(keys, at) for at in worth)], key=lambda one: one[0])
         return best
@@ -290,9 +290,9 @@ class Search:
     def _descend(
         self, keys: list[str], start: np.ndarray, slopes: np.ndarray | None = None, steps: int = _MOST_STEPS
     ) -> tuple[float, np.ndarray]:
-        """(loss, logarithms of the parameters) where least squares lead from ``start``.
+        """Return (loss, logarithms of the parameters) at the end of least squares from ``start``.
 
-        slopes : derivatives to stay with; None: those of each place."""
+        slopes : fixed derivatives; None: those of each point."""
         if not keys:
             return _loss(self._difference(keys, start)), start
         low, high = self._ends(keys).T
@@ -313,7 +313,7 @@ def _loss(residual: np.ndarray) -> float:
 
 
 def _apart(ordered: np.ndarray, count: int) -> list[np.ndarray]:
-    """The best ones, no two of them within a factor of two in all parameters."""
+    """Return the best ones, no two of them within a factor of two in all parameters."""
     chosen: list[np.ndarray] = []
     for place in ordered:
         if all(np.abs(place - other).max() > np.log(2) for other in chosen):

@@ -1,11 +1,11 @@
-"""Any video to events: frames in, events out.
+"""Conversion of any video to events.
 
     for events in frames_to_events(frames, fps=1000, emulator="v2e"):
         ...
 
-``frames`` is any iterable, a generator included; nothing but the current frames is kept. :func:`file_to_events` is the
-same from file to file (``blinkgl simulate``). :func:`blinkgl.simulate` and
-:func:`blinkgl.simulate_file` are these behind the front door.
+``frames`` is any iterable, a generator included; only the current frames are stored. :func:`file_to_events` is the same
+from file to file (``blinkgl simulate``). :func:`blinkgl.simulate` and :func:`blinkgl.simulate_file` are their public
+interfaces.
 """
 
 from __future__ import annotations
@@ -38,19 +38,20 @@ if TYPE_CHECKING:
     from blinkgl.sequence_files.preview import PreviewWriter
 
 _SPARSE = 8
-"""Rows and columns for one of which a frame's brightness is taken."""
+"""A frame's brightness uses every n-th row and column."""
 INTERPOLATIONS = ("linear", "motion")
 
 
 class OwnFrames(NamedTuple):
-    """What a sensor's own frames are: grey, of the sensor's (height, width), their codes by this curve to light."""
+    """Properties of a sensor's own frames: grey, of the sensor's (height, width), with this curve from codes to
+    light."""
 
     size: tuple[int, int]
     gamma: str | float
 
 
 def own_frames(sensor: SensorConfig | None) -> OwnFrames | None:
-    """What is known of a sensor's own frames."""
+    """Return the known properties of a sensor's own frames."""
     if sensor is None or sensor.frame_gamma is None:
         return None
     return OwnFrames((sensor.height, sensor.width), sensor.frame_gamma)
@@ -58,7 +59,7 @@ def own_frames(sensor: SensorConfig | None) -> OwnFrames | None:
 
 @dataclass(frozen=True)
 class FrameUse:
-    """How given frames become light; see :func:`frames_to_events`."""
+    """How given frames are converted to light; see :func:`frames_to_events`."""
 
     gamma: str | float | None = None
     interpolate: str = "linear"
@@ -69,7 +70,7 @@ class FrameUse:
 
 @dataclass
 class SimulationReport:
-    """What a simulation did; complete when the generator is exhausted."""
+    """Record of a simulation; complete when the generator is exhausted."""
 
     frames: int = 0
     """given"""
@@ -84,28 +85,28 @@ class SimulationReport:
     lost: int = 0
     """events that found the queue of the sensor's read-out full"""
     late: int = 0
-    """events that were still on the read-out's bus when the last frame came"""
+    """events that were still on the read-out's bus at the last frame"""
     causes: dict[str, int] = field(default_factory=dict)
-    """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
+    """events by cause, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
     moved_px: list[float] = field(default_factory=list)
     """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
     assumed_gamma: str | float | None = None
-    """what integer codes were taken for, because nobody said it: the curve of the sensor's own frames, or "srgb" """
+    """assumed curve of integer codes without a given one: that of the sensor's own frames, or srgb"""
     fitting: Fitting | None = None
-    """how frames became the sensor's size; None: they had it, or nobody asked"""
+    """conversion of frames to the sensor's size; None: not needed"""
     noise: FrameNoise | None = None
-    """the frames' own, from which no events were made; None: exact frames, or it was kept"""
+    """noise of the frames, from which no events were made; None: exact frames, or it was kept"""
     caveats: list[str] = field(default_factory=list)
-    """what is wrong with the frames, a line each: few codes, clipped, flicker"""
+    """problems of the frames, a line each: few codes, clipped, flicker"""
 
     @property
     def duration_s(self) -> float:
         return (self.last_ns - self.first_ns) * 1e-9
 
     def add(self, t_ns: int, events: Events, camera: EventCamera) -> None:
-        """Count what the emulator made of a frame at t_ns."""
+        """Count the emulator's events of a frame at t_ns."""
         self.first_ns = t_ns if self.steps == 0 else self.first_ns
         self.steps += 1
         self.last_ns = t_ns
@@ -118,7 +119,7 @@ class SimulationReport:
 
     @property
     def guessed_over_px(self) -> float:
-        """How far things move between given frames, px, where interpolation is linear: 0 where nobody looked."""
+        """Return the motion between given frames, px, where interpolation is linear; 0 where it was not measured."""
         # The median: dense flow fails at a cut, and where nothing has contrast.
         return float(np.median(self.moved_px)) if self.moved_px else 0.0
 
@@ -137,29 +138,29 @@ def frames_to_events(
     readout: ReadoutConfig | None = None,
     report: SimulationReport | None = None,
 ) -> Iterator[Events]:
-    """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
+    """Yield the events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
 
     Parameters
     ----------
     frames : iterable of (H, W) or (H, W, 3) RGB arrays with ``fps``, of (array, t_ns) pairs or (array, t_ns, name)
-        triples (a :class:`~blinkgl.io.frames.FrameSource` is that). uint8, uint16 (full scale
-        1.0) or float (1.0 is white, more is fine).
+        triples (such as a :class:`~blinkgl.io.frames.FrameSource`). uint8, uint16 (full scale 1.0) or float (1.0 is
+        white, more is allowed).
     emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
     gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: linear for floats; for integers that of
-        ``own`` where frames are like these, else srgb.
-    interpolate : "linear": the given frames, between which the emulators are linear themselves; "motion":
-        dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
-    keep_noise : make events of the noise of integer frames, too; else it is found from the first frames and what it
-        explains makes none (:mod:`blinkgl.recordings.frame_noise`). Floats, and frames without noise, are taken as
-        they are.
-    own : what frames of the sensor's own are like; None: nobody knows.
-    seed : of the emulator. readout : what is behind the pixels (``load_sensor(name).readout``); None:
-    nothing. report : filled as it goes.
+        ``own`` where frames match it, else srgb.
+    interpolate : "linear": the given frames, between which the emulators interpolate linearly; "motion": dense-flow
+        warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
+    keep_noise : make events of the noise of integer frames, too; else the noise is estimated from the first frames and
+        changes that it explains cause no events (:mod:`blinkgl.recordings.frame_noise`). Floats, and frames without
+        noise, are used unchanged.
+    own : properties of the sensor's own frames; None: unknown.
+    seed : of the emulator. readout : read-out of the sensor (``load_sensor(name).readout``); None: none. report :
+        filled during the simulation.
 
     Raises
     ------
-    EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed
-    size, fewer than two frames; names the frame.
+    EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed size, fewer than two frames;
+        names the frame.
     ConfigError : unknown emulator, gamma or interpolation.
     """
     report = report if report is not None else SimulationReport()
@@ -169,8 +170,8 @@ def frames_to_events(
 
 
 class Step(NamedTuple):
-    """One step of an emulator. events : before t_ns, not given before.   frame : (H, W) float32
-    linear luminance or uint8 codes, at t_ns."""
+    """One step of an emulator. events : new events before t_ns.   frame : (H, W) float32 linear luminance or uint8
+    codes, at t_ns."""
 
     t_ns: int
     events: Events
@@ -178,7 +179,7 @@ class Step(NamedTuple):
     decode: Decoder
 
     def luminance(self) -> np.ndarray:
-        """(H, W) float32, linear."""
+        """Return linear luminance, (H, W) float32."""
         return self.decode(self.frame, "") if self.frame.dtype == np.uint8 else self.frame
 
 
@@ -193,7 +194,7 @@ def simulated_steps(
     readout: ReadoutConfig | None = None,
     fitting: Fitting | None = None,
 ) -> Iterator[Step]:
-    """As :func:`frames_to_events`, every step of it. fitting : frames to the sensor's size; None: they have it."""
+    """Yield every step of :func:`frames_to_events`. fitting : of frames to the sensor's size; None: they have it."""
     config = emulator_config(emulator)
     if use.interpolate not in INTERPOLATIONS:
         raise ConfigError(
@@ -220,7 +221,7 @@ def stepped(
     report: SimulationReport | None = None,
     fitting: Fitting | None = None,
 ) -> Iterator[Step]:
-    """Frames (array, t_ns, name), those in between included, through an event camera. Raises
+    """Yield steps of frames (array, t_ns, name), interpolated ones included, through an event camera. Raises
     EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
     given = _Given(frames, use, report, fitting)
@@ -245,9 +246,9 @@ def stepped(
 
 
 class _Given:
-    """The given frames' light, (luminance, t_ns) as they come: decoded, of the sensor's size, without their noise.
+    """Light of the given frames, (luminance, t_ns) in order: decoded, of the sensor's size, without their noise.
 
-    by_codes : whether frames stay the codes that they are, for an emulator that has a table of them."""
+    by_codes : whether frames stay codes, for an emulator with a table of them."""
 
     def __init__(
         self,
@@ -312,12 +313,13 @@ def file_to_events(
     readout: ReadoutConfig | None = None,
     progress: Callable[[SimulationReport, float | None], None] | None = None,
 ) -> SimulationReport:
-    """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format
-    (.h5 .raw .txt .csv .npz .npy); emulator, seed, readout and what ``use`` holds as :func:`frames_to_events`. The
-    files appear whole or not at all.
+    """Convert the frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending
+    selects the format (.h5 .raw .txt .csv .npz .npy); emulator, seed, readout and the content of ``use`` as in
+    :func:`frames_to_events`. The files appear completely or not at all.
 
-    size : (height, width) of the sensor; frames of another size are cropped and scaled; None: as the frames are.
-    preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
+    size : (height, width) of the sensor; frames of another size are cropped and scaled; None: that of the frames.
+    preview : video of frames and events. progress : called with (report so far, fraction done or None) per given
+    frame.
     """
     from blinkgl.io.formats import event_writer
 
@@ -361,13 +363,14 @@ def file_to_events(
                 done = report.frames
                 progress(report, min(done / frames.count, 1.0) if frames.count else None)
         out.t_end_us = report.last_ns // 1000
-    if frames.path.suffix.lower() in VIDEO:  # made to be looked at: sRGB is no guess there
+    if frames.path.suffix.lower() in VIDEO:  # made for viewing: sRGB is certain there
         report.assumed_gamma = None
     return report
 
 
 def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | dict) -> None:
-    """Raises OutputError: no event file's ending, or of a format that cannot hold what the emulator says."""
+    """Raise OutputError for an ending that is not an event file's, or a format that cannot store the emulator's
+    causes."""
     from blinkgl.io.formats import WITH_CAUSES, output_format
 
     kind = output_format(target)
@@ -383,7 +386,7 @@ def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | di
 def _preview(
     path: str | os.PathLike, height: int, width: int, start_us: int, gap_ns: int, overwrite: bool
 ) -> Iterator[PreviewWriter]:
-    """A video of frames and events, at the frames' rate up to 100 Hz, that appears whole or not at all."""
+    """Return a video of frames and events, at the frames' rate up to 100 Hz, which appears completely or not at all."""
     from blinkgl.io.atomic import atomic_file
     from blinkgl.sequence_files.preview import PreviewWriter
 
@@ -398,7 +401,7 @@ def _preview(
 
 
 def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
-    """A validated emulator config from a name, a plain mapping with ``emulator``, or a config."""
+    """Return a validated emulator config from a name, a plain mapping with ``emulator``, or a config."""
     if isinstance(emulator, EmulatorConfig):
         return emulator
     data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
@@ -410,7 +413,7 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
 
 
 def timed(frames: Iterable, fps: float | None = None) -> Iterator[tuple[np.ndarray, int, str]]:
-    """(frame, t_ns, name) from the three kinds of iterables :func:`frames_to_events` takes."""
+    """Yield (frame, t_ns, name) from the three kinds of iterables of :func:`frames_to_events`."""
     for i, item in enumerate(frames):
         if isinstance(item, tuple):
             frame, t_ns = np.asarray(item[0]), int(item[1])

@@ -1,8 +1,8 @@
-"""What a calibration compares of two streams of events of one scene: sums that add up over the pixels, and from them a
-vector of numbers, each with what it may be off by.
+"""Statistics by which a calibration compares two event streams of one scene: sums over the pixels, and from them a
+vector of numbers, each with its expected error.
 
-Sums are kept by groups of pixels, so that leaving each group out in turn (the jackknife, Quenouille 1956; Tukey 1958)
-says how far every number, and whatever is computed of them, would be another in another recording of the same kind.
+Sums are kept per group of pixels, so that leaving each group out in turn (the jackknife, Quenouille 1956; Tukey 1958)
+tells how much every number, and anything computed from them, would vary in another recording of the same kind.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from blinkgl.recordings.patches import NAMES, SIDE_PX, patches
 from blinkgl.types.events import Events
 
 GROUPS = 16
-"""Of tiles of pixels, for the jackknife."""
+"""Number of groups of tiles, for the jackknife."""
 ISI_PER_DECADE = 40
 ISI_BINS = 7 * ISI_PER_DECADE
-"""Of the interval between two events of a pixel, from 1 µs on."""
+"""Bins of the interval between two events of a pixel, from 1 µs."""
 COUNTS = np.array([0, 1, 2, 3, 4, 6, 9, 14, 21, 31, 101, 1001])
 """Lower ends of the bins of a pixel's number of events."""
 LIGHTS = 8
 PROBES = np.array([0.005, 0.01, 0.02, 0.05, *np.arange(0.1, 0.95, 0.1), 0.95, 0.98])
 """Quantiles of the recording's intervals at which the two distributions are compared."""
 LEAST_STILL = 400
-"""px; fewer say nothing of noise."""
+"""px; fewer do not determine noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Sums:
     seconds: np.ndarray
 
     def without(self, group: int | None) -> list[np.ndarray]:
-        """The totals over the groups, but for one."""
+        """Return the totals over the groups, without one."""
         keep = np.arange(GROUPS) != (-1 if group is None else group)
         parts = (self.rates, self.lights, self.isi, self.counts, self.still, self.still_counts, self.products,
                  self.pixels, self.alike, self.looks)  # fmt: skip
@@ -73,9 +73,9 @@ class Sums:
 
 
 def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None = None) -> Sums:
-    """Of a stream of events of the clip's scene in its intervals [first, stop).
+    """Return the sums of a stream of events of the clip's scene in its intervals [first, stop).
 
-    against : the recording's; None: it is that itself."""
+    against : the recording's; None: it is the recording itself."""
     height, width = clip.size
     count = stop - first
     group = groups(clip.size)
@@ -100,7 +100,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     still_counts = _histogram(both.sum(axis=1)[still], group[still])
     quiet = np.stack([_by(np.where(still, group, GROUPS), both[:, p]) for p in (0, 1)], 1)
     raw = (total[..., 1] - total[..., 0]).reshape(count, height, width).astype(np.float32)
-    # Quantisation and shifts of less than a pixel are not what is asked about, as in `compare`.
+    # Quantisation and sub-pixel shifts are not compared, as in `compare`.
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
     other = polarity if against is None else against.polarity
     products = np.stack(
@@ -130,7 +130,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
 def _looks(
     events: Events, size: tuple[int, int], span_us: tuple[int, int], full: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``Sums.looks`` and (T, Y, X) bool, the patches that count (full: where that is known)."""
+    """Return ``Sums.looks`` and (T, Y, X) bool, the patches that count (full: where that is known)."""
     count, told = patches(events, size, span_us)
     full = count >= LEAST_IN_PATCH if full is None else full
     side = TILE_PX // 2
@@ -142,7 +142,7 @@ def _looks(
 
 
 def groups(size: tuple[int, int]) -> np.ndarray:
-    """(H*W,) int64, the group of every pixel: tiles dealt out as cards are, neither rows nor columns."""
+    """Return the group of every pixel, (H*W,) int64: tiles assigned at random, neither rows nor columns."""
     y, x = np.divmod(np.arange(size[0] * size[1]), size[1])
     side = TILE_PX // 2
     return ((y // side) * 7 + (x // side) * 3) % GROUPS
@@ -183,13 +183,13 @@ def _collect(where, t, p, edges, bursts, group, total, isi):
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A recording's numbers, with which those of a simulation are compared.
+    """A recording's numbers, for comparison with a simulation's.
 
-    values : (N,).   chance : (N,), what each may be off by, of the recording and of a simulation.
-    floor : (N,), by which a model is off besides.   weight : (N,), of the block a number belongs to.
+    values : (N,).   chance : (N,), standard deviation of each, of the recording and of a simulation.
+    floor : (N,), further error of a model.   weight : (N,), of a number's block.
     jackknife : (G, N), differences without each group.   block : (N,) of names.
-    spread : (F,), of what is told of the recording's patches.
-    together : rates of ON and OFF events of pixels that moved in one number."""
+    spread : (F,), of the features of the recording's patches.
+    together : rates of ON and OFF events of moving pixels in one number."""
 
     sums: Sums
     probes: np.ndarray
@@ -207,18 +207,18 @@ class Target:
         return np.hypot(self.chance, self.floor)
 
     def residual(self, simulated: Sums) -> np.ndarray:
-        """(N,), in errors, times the weights."""
+        """Return the residuals, (N,), in errors, times the weights."""
         return self.weight * (self._numbers(simulated) - self.values) / self.error
 
     def _numbers(self, of: Sums, without: int | None = None) -> np.ndarray:
         return numbers(of, self.probes, self.spread, without, self.together)[0]
 
     def beside(self, simulated: Sums, *, floor: str) -> Target:
-        """With the errors that a simulation near the recording shows. Chance: the jackknife of the differences, in
-        which the scene, the same in both, falls out.
+        """Return the target with errors from a simulation near the recording. Chance: the jackknife of the differences,
+        in which the common scene cancels.
 
-        floor : "expected": ``FLOOR``.   "lowest": a tenth of it, as for a model that is the camera.   "seen": what the
-        simulation is off by beyond chance, block by block, between the two."""
+        floor : "expected": ``FLOOR``.   "lowest": a tenth of it, as for an exact model.   "seen": the simulation's
+        error beyond chance, block by block, between the two."""
         value = lambda without: self._numbers(simulated, without) - self._numbers(self.sums, without)
         jackknife = np.stack([value(group) for group in range(GROUPS)])
         chance = np.sqrt((GROUPS - 1) / GROUPS * ((jackknife - jackknife.mean(axis=0)) ** 2).sum(axis=0))
@@ -233,13 +233,13 @@ class Target:
 
 
 class Targets:
-    """Of several recordings by one camera: their numbers behind one another."""
+    """Several recordings by one camera: their numbers one after another."""
 
     def __init__(self, each: list[Target]):
         self._each = each
 
     def beside(self, simulated: list[Sums], *, floor: str) -> None:
-        """As :meth:`Target.beside`, from now on."""
+        """Use errors as in :meth:`Target.beside` from now on."""
         self._each = [one.beside(of, floor=floor) for one, of in zip(self._each, simulated)]
 
     def residual(self, simulated: list[Sums]) -> np.ndarray:
@@ -261,16 +261,17 @@ class Targets:
 
 WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 5.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
            "polarity": 2.0, "alike": 4.0, "look": 2.0, "total": 3.0}  # fmt: skip
-"""How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
+"""Weights of the blocks: rates and intervals matter most in the use of a simulation."""
 FLOOR = {"rate": 0.02, "light": 0.05, "interval": 0.01, "turn": 0.02, "count": 0.01, "still": 0.05, "still count": 0.01,
          "polarity": 0.02, "alike": 0.02, "look": 0.1, "total": 0.02}  # fmt: skip
-"""No model is expected to be nearer to a camera than this: logarithms of rates, shares of events or of pixels."""
+"""Smallest error expected of a model: logarithms of rates, fractions of events or of pixels."""
 LOWEST = 0.1
-"""Of a floor, where the model turns out to be nearer."""
+"""Factor on a floor, where the model turns out to be better."""
 
 
 def target(recorded: Sums, together: bool = False) -> Target:
-    """Of the recording's sums; with floors for errors until a simulation is beside it. together: see Target."""
+    """Return the target of the recording's sums, with floors as errors until a simulation is compared. together: see
+    Target."""
     probes = _probes(recorded.isi.sum(axis=(0, 1)))
     spread = _spread(recorded.looks.sum(axis=0))
     values, block = numbers(recorded, probes, spread, together=together)
@@ -282,21 +283,23 @@ def target(recorded: Sums, together: bool = False) -> Target:
 
 
 def _spread(looks: np.ndarray) -> np.ndarray:
-    """Standard deviations of what is told of patches, from ``Sums.looks``."""
+    """Return standard deviations of the patches' features, from ``Sums.looks``."""
     count, features = max(looks[0], 1), len(NAMES)
     mean, square = looks[1 : 1 + features] / count, looks[1 + features :] / count
     return np.sqrt(np.maximum(square - mean**2, 1e-6))
 
 
 def correlation(alike: np.ndarray) -> float:
-    """Pearson's, of the events of single pixels, from ``Sums.alike``; 0 where one of them is constant."""
+    """Return Pearson's correlation of the events of single pixels, from ``Sums.alike``; 0 where one of them is
+    constant."""
     n, a, b, product, square_a, square_b = alike
     norm = np.sqrt(max(n * square_a - a * a, 0.0) * max(n * square_b - b * b, 0.0))
     return float((n * product - a * b) / norm) if norm > 0 else 0.0
 
 
 def _probes(isi: np.ndarray) -> np.ndarray:
-    """Bins at which the recording's distribution of intervals passes the PROBES, and the one before its first."""
+    """Return the bins at which the recording's distribution of intervals passes the PROBES, and the one before its
+    first."""
     if not isi.sum():
         return np.empty(0, np.int64)
     cdf = np.cumsum(isi) / isi.sum()
@@ -307,7 +310,7 @@ def _probes(isi: np.ndarray) -> np.ndarray:
 def numbers(
     s: Sums, probes: np.ndarray, spread: np.ndarray, without: int | None = None, together: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) numbers of a stream, and the name of the block of each. spread, together: see Target."""
+    """Return (N,) numbers of a stream, and the block name of each. spread, together: see Target."""
     rates, lights, isi, counts, still, still_counts, products, pixels, alike, looks = s.without(without)
     values, block = [], []
 
@@ -335,13 +338,13 @@ def numbers(
         add("turn", isi[1].sum() / max(total, 1))
     if pixels[1] >= LEAST_STILL:
         add("still", np.log((still + 2) / (s.seconds.sum() * pixels[1])))
-        # Of the pixels that fired at all: most never do, and would hide what the others are like.
+        # Of the pixels that fired: most never do, and would hide the others' distribution.
         add("still count", (np.cumsum(still_counts[1:]) / max(still_counts[1:].sum(), 1))[:-1])
         add("still count", np.log((still_counts[1:].sum() + 2) / pixels[1]) / 5)
     return np.concatenate(values) if values else np.empty(0), np.array(block)
 
 
 def interval_distance(a: Sums, b: Sums) -> float:
-    """Kolmogorov and Smirnov's distance of the intervals between events of a pixel."""
+    """Return the Kolmogorov-Smirnov distance of the intervals between events of a pixel."""
     cdf = [np.cumsum(s.isi.sum(axis=(0, 1))) / max(s.isi.sum(), 1) for s in (a, b)]
     return float(np.abs(cdf[0] - cdf[1]).max())

@@ -1,4 +1,4 @@
-"""``blinkgl shader check`` and ``show``: compile everything, say what is wrong where."""
+"""``blinkgl shader check`` and ``show``: compile every program, and report each error with its place."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from blinkgl.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.shader_debugger.session import LOOKUPS, Inspection, files_of, open_folder
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Every program in every variant that passes ask for, for some configuration and scene.
+# Every program in every variant that a pass uses for some configuration and scene.
 
 SURFACES = (("TINTED", "EMISSIVE"), ("EMISSIVE", "EMISSION_MAP"), ("GLOSSY",), ("BUMPED",), MORE)
-"""What materials are beside a base colour: each of MORE alone, where it can be, and all of them."""
+"""Material features besides a base colour: each of MORE alone, where it is possible, and all of them."""
 KINDS = [Kind(*switches) for switches in product((False, True), repeat=3)]
 
 
 def kinds() -> list[Kind]:
-    """Of materials all, and of shapes that change with time one each."""
+    """Return all kinds of material, and one kind for each shape that changes with time."""
     shapes = {
         (("DEFORM", 1), (define_of(deformer.glsl), 1), ("SHAPE_ROWS", 64), *sorted(sizes.items())): None
         for deformer in DEFORMERS.values()
         for sizes in deformer.examples
     }
-    # Of materials each extra by itself, and all of them on a shape that changes.
+    # Each material feature alone, and all of them on a shape that changes.
     surfaces = [Kind(True, False, False, masked=True, more=("TINTED",), hued=True)]
     for hued in (False, True):
         surfaces += [Kind(True, True, False, hued=hued, more=more) for more in SURFACES]
@@ -46,17 +46,18 @@ def kinds() -> list[Kind]:
 
 
 def lookups(program: str) -> list[dict[str, Any]]:
-    """Defines of the variants in which the debugger has a production program show what it looks up."""
+    """Return the defines of the variants in which a production program shows its texture lookups."""
     return _variant_defines(program, (type(pass_) for pass_ in LOOKUPS.values()))
 
 
 def variants(program: str) -> list[dict[str, Any]] | None:
-    """Defines of every variant of a program file, without :func:`lookups`; None for a file that no pass knows."""
+    """Return the defines of every variant of a program file, without :func:`lookups`; None for a file that no pass
+    uses."""
     return _variant_defines(program, (*PASSES, Inspection)) or None
 
 
 def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
-    """Of the plain light none, and of all that light can be an example each; of shapes one."""
+    """Return no defines for the plain light, and an example of each feature of light; one of them for shapes."""
     if kind is None or not (kind.lit and pass_.lit):
         return [{}]
     if kind.more:
@@ -76,7 +77,7 @@ def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[st
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
                 plain = pass_.defines(kind) | (kind.defines(pass_.lit) if kind is not None else {})
-                # Fog does not look at the material: the plainest and the fullest stand for all.
+                # Fog does not depend on the material: the simplest and the most complex stand for all.
                 foggy = pass_.lit and kind in (KINDS[0], KINDS[-1])
                 for more in (*_lights(pass_, kind), *([{"FOG": 1}] if foggy else [])):
                     defines = plain | more
@@ -86,7 +87,7 @@ def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[st
 
 @dataclass
 class Finding:
-    """One thing said about some variants of a program. examples : defines of the first of them."""
+    """A message about some variants of a program. examples : defines of the first of them."""
 
     diagnostic: Diagnostic
     program: str
@@ -96,7 +97,8 @@ class Finding:
 
 @dataclass
 class Result:
-    """renderer : what compiled.   programs : name -> number of variants.   found : by program and message."""
+    """The result of a check. renderer : the compiler.   programs : name -> number of variants.   found : by program and
+    message."""
 
     renderer: str = ""
     seconds: float = 0.0
@@ -105,7 +107,7 @@ class Result:
 
     @property
     def errors(self) -> list[Finding]:
-        """Each once, in the order in which they were met."""
+        """Return each error once, in order of occurrence."""
         return list(self.found.values())
 
     def as_dict(self) -> dict:
@@ -121,9 +123,9 @@ class Result:
 
 
 def check(files: list[str], shaders: str | None = None, backend: str = "auto", device: int = 0) -> Result:
-    """Compiles every variant of every program, or of those that ``files`` belong to.
+    """Compile every variant of every program, or of the programs that use ``files``.
 
-    Raises ConfigError for a file that is no shader, GLError without OpenGL or without a folder to read."""
+    Raises ConfigError for a file that is no shader, GLError without OpenGL or without a readable folder."""
     folder, names = _programs(files, shaders)
     result = Result()
     started = time.perf_counter()
@@ -136,10 +138,10 @@ def check(files: list[str], shaders: str | None = None, backend: str = "auto", d
 
 
 def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result) -> None:
-    """Adds every variant of one program to ``result``."""
-    # Programs that no pass draws are somebody's own: they are compiled as they stand.
+    """Add every variant of one program to ``result``."""
+    # Programs that no pass uses are the user's own: they are compiled unchanged.
     wanted = variants(name)
-    wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
+    wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: the user's own program, unchanged
     result.programs[name] = len(wanted)
     for defines in wanted:
         sources: dict[str, ShaderSource] = {}
@@ -148,7 +150,7 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
                 sources[stage] = expand(name, stage, defines, folder)
             program = link(ctx, sources)
         except ShaderError as error:
-            # A name that is wrong in an include is reported by every stage that includes it.
+            # An undefined name in an include is reported by every stage that includes it.
             for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
                 if diagnostic.kind == "error":
                     found = result.found.setdefault((name, diagnostic), Finding(diagnostic, name, example=defines))
@@ -158,11 +160,11 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
 
 
 def _programs(files: list[str], shaders: str | None):
-    """The folder, and the program files to compile."""
+    """Return the folder, and the program files to compile."""
     folder = open_folder(shaders)
-    if files and shaders is None:  # a file of another folder brings its folder along
+    if files and shaders is None:  # files of another folder select that folder
         first = Path(files[0]).resolve()
-        # An include lies below include/, at any depth; a program lies in the folder itself.
+        # An include is below include/, at any depth; a program is in the folder itself.
         home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
         if first.is_file() and home != folder.resolve():
             folder = open_folder(str(home))
@@ -187,7 +189,7 @@ def _programs(files: list[str], shaders: str | None):
                 value=text,
                 accepted="one of " + ", ".join(str(p.relative_to(folder)) for p in known),
             )
-        # Of an include all programs are compiled that it is part of.
+        # For an include, compile all programs that contain it.
         wanted = (
             [path.name]
             if path.parent == folder
@@ -201,11 +203,11 @@ def _includes(folder, program: str, include: str) -> bool:
     try:
         return include in expand(program, "fragment", {}, folder).files
     except ShaderError:
-        return True  # broken on the way there: compile it and say so
+        return True  # error in its own includes: compile it, to report that
 
 
 def as_text(result: Result) -> str:
-    """The check in lines for a person."""
+    """Return the check as text."""
     total = sum(result.programs.values())
     lines = []
     for found in result.errors:
@@ -237,7 +239,7 @@ def _defines(defines: dict) -> str:
 
 
 def show_source(program: str, defines: list[str], stage: str, numbers: bool, shaders: str | None) -> str:
-    """What ``blinkgl shader show`` prints. Raises ConfigError, ShaderError."""
+    """Return the output of ``blinkgl shader show``. Raises ConfigError, ShaderError."""
     table = {name: value or "1" for name, _, value in (text.partition("=") for text in defines)}
     if stage not in (*STAGES, GEOMETRY, "both"):
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""What ``passes``, ``probe`` and ``diff`` do, without the command line."""
+"""The work of ``passes``, ``probe`` and ``diff``, without the command line."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 def write_passes(
     subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None
 ) -> list[Path]:
-    """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the
+    """Write every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, to the
     folder ``out``. Returns the paths.
 
-    Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
+    Anti-aliased as configured: these are the arrays that generation uses. Raises BlinkGLError."""
     from blinkgl.shader_debugger import picture
 
     there = buffers_of(subject.scene)
@@ -44,7 +44,7 @@ def write_passes(
         f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
     )
     with open_renderer(subject, shaders, as_configured=True) as renderer:
-        # A folder is not made for a run that cannot draw.
+        # No folder is created for a run that cannot draw.
         folder = _folder(out)
         gpu = GpuMoment(renderer, when)
         for name in names:
@@ -59,12 +59,12 @@ def write_passes(
 
 
 def _meaningful(moment, info) -> np.ndarray | None:
-    """Where a buffer's values mean something: where something is hit, or where the flow is valid."""
+    """Return where a buffer's values are meaningful: where a surface is visible, or where the flow is valid."""
     if info.name in MAPS:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", *TWINNED)  # the background has them, too
+    everywhere = info.name in ("luminance", *TWINNED)  # the background has values, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -89,7 +89,7 @@ def _folder(out: str) -> Path:
 
 
 def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = None, as_json: bool = False) -> str:
-    """What ``blinkgl shader probe`` prints."""
+    """Return the output of ``blinkgl shader probe``."""
     x, y = check_pixel(subject.scene, pixel)
     with open_renderer(subject, shaders) as renderer:
         found = probe(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps), x, y)
@@ -104,10 +104,9 @@ def run_diff(
     shaders: str | None = None,
     out: str | None = None,
 ) -> tuple[dict, list[BufferReport]]:
-    """Compares the named buffers (default: all that can be); with ``out`` also writes
-    diff.png and NAME_error.npy there.
-    Returns what :func:`verdict.verdict` says, and the reports."""
-    # Names are checked before anything is drawn.
+    """Compare the named buffers (default: all possible ones); with ``out`` also write diff.png and
+    NAME_error.npy there. Returns the result of :func:`verdict.verdict`, and the reports."""
+    # Names are checked before drawing.
     if names:
         there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
@@ -132,12 +131,12 @@ def run_diff(
 
 
 def diff_json(found: dict, reports: list[BufferReport]) -> str:
-    """What ``diff --json`` prints."""
+    """Return the output of ``diff --json``."""
     return json.dumps(_finite(found | {"buffers": [r.summary() for r in reports]}))
 
 
 def _finite(value):
-    """JSON has no inf and nan: as text."""
+    """Return inf and nan as text, because JSON has neither."""
     if isinstance(value, dict):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -148,8 +147,8 @@ def _finite(value):
 
 
 def diff_text(found: dict, reports: list[BufferReport]) -> str:
-    """The verdict, the table, then histogram, suspicions and the worst pixel of each object of each buffer that failed,
-    or of a single one."""
+    """Return the verdict, the table, then histogram, suspicions and the worst pixel of each object, for each failed
+    buffer or for a single one."""
     lines = [*verdict_text(found), ""] if not found["passed"] else []
     lines.append(
         f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} "
@@ -178,7 +177,7 @@ def diff_text(found: dict, reports: list[BufferReport]) -> str:
         ]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
-        # A logarithm, or one wrong pixel would have no bar beside ten thousand right ones.
+        # Logarithmic; otherwise one wrong pixel would have no bar beside ten thousand right ones.
         bars = {
             name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count
         }

@@ -1,21 +1,21 @@
-"""The GPU against the float64 reference over a whole image.
+"""Comparison of the GPU with the float64 reference over a whole image.
 
-What is graded, and with which tolerance
-----------------------------------------
+Graded pixels and tolerances
+----------------------------
 Pixels in the silhouette band (``reference.silhouette_band``: within one pixel of an id change or a jump in depth) are
-reported apart: there a pixel centre may fall on either side of an edge. Off the band a buffer is graded where both
-sides see the same triangle; where they see neighbouring ones (a pixel centre on a shared
-edge) only ids and masks are graded. Pictures that are made of others (:mod:`twins`) are graded at every pixel.
+reported separately: there a pixel centre may fall on either side of an edge. Outside the band a buffer is graded where
+both sides see the same triangle; where they see neighbouring ones (a pixel centre on a shared
+edge) only ids and masks are graded. Pictures made from other pictures (:mod:`twins`) are graded at every pixel.
 
-Order: the buffers are graded in the order in which a pass makes them: where the surface is (local position, depth, id),
-what the pass looks up there (coordinates, level, albedo), the light, and their product. Each look-up is the pass's own,
-shown by a variant of its own source (``include/lookup.glsl``), and what follows from an earlier step is graded with
-that step as the GPU made it: the albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and
-level, the result against the GPU's own albedo times its own light. So the first buffer that fails is where the fault
-is; the verdict says so, object by object.
+Order: the buffers are graded in the order in which a pass computes them: the surface's place (local position, depth,
+id), the texture lookups there (coordinates, level, albedo), the light, and their product. Each lookup is the pass's
+own, shown by a variant of its own source (``include/lookup.glsl``). A result that depends on an earlier step is graded
+with the GPU's value of that step: the albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and
+level, the result against the GPU's own albedo times its own light. So the first buffer that fails contains the fault;
+the verdict names it, object by object.
 
-The reference has no mip maps, hence the twin, and a loose tolerance: drivers may make mip maps as they like. With
-anisotropic filtering (``render.anisotropy`` > 1) level and albedo are left out.
+The reference has no mip maps, hence the twin, and a loose tolerance: OpenGL does not define how drivers make them. With
+anisotropic filtering (``render.anisotropy`` > 1) level and albedo are not graded.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ from blinkgl.shader_debugger.quantities import QUANTITIES, Quantity
 from blinkgl.shader_debugger.suspicions import suspicions
 from blinkgl.shader_debugger.twins import TWINNED
 
-WORST = 10  # objects told apart in a report
+WORST = 10  # objects listed in a report
 NOTHING = "nothing hit"
 NEVER = 2.0
 """A second difference is at most twice the largest of its values."""
 SIDE = 1e-4
-"""Share of a corner below which a point may be taken for one of the neighbouring triangle."""
+"""Fraction of a corner below which a point may count as one of the neighbouring triangle."""
 LIT = ("direct", "shadow", "around", "light", "mirrored", "emission")
 MAP_JUMP = 0.005
 """A second difference of a shadow map above this part of its depth is an edge."""
@@ -60,7 +60,7 @@ NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colou
 
 
 def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
-    """``["1e-3"]`` for every compared buffer, or ``["depth=1e-4", …]``. Raises ConfigError."""
+    """Return the tolerances of ``["1e-3"]`` (every compared buffer) or ``["depth=1e-4", …]``. Raises ConfigError."""
     out: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.rpartition("=")
@@ -78,10 +78,10 @@ def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
 
 @dataclass(eq=False)
 class BufferReport:
-    """Of one buffer. errors : (H, W) float64, nan where not comparable.   graded, band : (H, W) bool.
+    """The result for one buffer. errors : (H, W) float64, nan where not comparable.   graded, band : (H, W) bool.
     value : the graded statistic.
-    objects : of each object (the worst ten, worst first) its graded pixels, those over the tolerance, their median and
-    largest error, and where the largest is: x, y, error, gpu, reference, triangle."""
+    objects : for each object (the worst ten, worst first) its graded pixels, those over the tolerance, their median and
+    largest error, and the place of the largest: x, y, error, gpu, reference, triangle."""
 
     quantity: Quantity
     tolerance: float
@@ -98,11 +98,11 @@ class BufferReport:
 
     @property
     def limit(self) -> float:
-        """Of one pixel: a fraction of all says nothing about one."""
+        """Limit for one pixel; a limit on a fraction of all pixels does not apply to one."""
         return self.tolerance if self.quantity.statistic == "max" else 0.0
 
     def summary(self) -> dict:
-        """Plain numbers, for JSON and for the table."""
+        """Return plain numbers, for JSON and for the table."""
         inside, band = self.errors[self.graded], self.errors[self.band & ~np.isnan(self.errors)]
 
         def stats(e):
@@ -132,12 +132,12 @@ class BufferReport:
 
 
 def _at(errors: np.ndarray, q: float) -> float:
-    # One of the errors themselves, since between a finite one and inf there is no number.
+    # One of the errors themselves, because inf cannot be interpolated.
     return float(np.quantile(errors, q, method="inverted_cdf")) if errors.size else 0.0
 
 
 def histogram(errors: np.ndarray) -> dict[str, int]:
-    """Counts per decade: "0", "<1e-8", "1e-8", … (from this power of ten up to the next), "inf"."""
+    """Return counts per decade: "0", "<1e-8", "1e-8", … (from this power of ten up to the next), "inf"."""
     finite = errors[(errors > 0) & np.isfinite(errors)]
     decades, counts = np.unique(np.clip(np.floor(np.log10(finite)), -9, 9).astype(int), return_counts=True)
     named = {"<1e-8" if d == -9 else f"1e{d:+d}": int(n) for d, n in zip(decades, counts)}
@@ -146,14 +146,14 @@ def histogram(errors: np.ndarray) -> dict[str, int]:
 
 
 def is_mapped(material: Material) -> bool:
-    """Whether more than its base colour comes from a picture."""
+    """Return whether more than its base colour comes from a picture."""
     gloss = material.gloss is not None and material.gloss.map is not None
     return material.bumps is not None or material.emission_map is not None or gloss
 
 
 class Comparison:
-    """Masks that all buffers share, and :meth:`report` for one of them. objects : names of
-    the scene's objects, told apart."""
+    """Masks common to all buffers, and :meth:`report` for one of them. objects : distinct names of the scene's
+    objects."""
 
     def __init__(self, gpu: GpuMoment, ref: ReferenceMoment):
         self.gpu, self.ref = gpu, ref
@@ -162,9 +162,9 @@ class Comparison:
         self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~flat.hit)
         self._same_label = self.same_triangle
         if seen is not flat:
-            # Pixels that a lens looks at are unevenly far from each other: only its own depths say where they jump.
+            # Pixels that a lens reads have unequal distances: only the lens's own depths show where they jump.
             self.band |= reference.silhouette_band(flat.instance, flat.depth, jump=NEVER)
-            # Which triangle a lens's ray met on the GPU is no buffer; off the sides both met the same one.
+            # No buffer has the triangle that a lens's ray met on the GPU; away from the sides both met the same one.
             self._same_label = (seen.bary.min(axis=-1) > SIDE) | ~seen.hit
         things = [thing for thing, _ in casting.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
@@ -172,13 +172,13 @@ class Comparison:
             name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
             for name, thing in zip(names, ref.scene.objects)
         ] + [NOTHING]
-        # Objects may have several parts, and a name may be given twice.
+        # Objects may have several parts, and a name may occur twice.
         index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
 
     def owner(self, name: str) -> np.ndarray:
-        """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be
-        there, or, for the local position, the one that was drawn."""
+        """Return the (H, W) number of the object to which a pixel's error in buffer ``name`` is assigned: the one that
+        should be visible, or, for the local position, the one that was drawn."""
         part = self.gpu["part"] if name == "local" else self._frame(name).part
         return self._object_of_part[part]
 
@@ -187,10 +187,10 @@ class Comparison:
 
     @cached_property
     def shares(self) -> np.ndarray | None:
-        """(2, lamps, H, W) least and greatest share of each lamp that is seen past its soft shadow; None where there
-        are none."""
+        """(2, lamps, H, W) smallest and largest visible fraction of each lamp with soft shadows; None where there are
+        none."""
         ref, lamps = self.ref, lamps_of(self.ref.scene.light)
-        # All maps of a scene are soft or none is.
+        # Either all maps of a scene are soft or none is.
         if not any(one.soft for one in ref.maps):
             return None
         out = np.ones((2, len(lamps), *ref.frame.hit.shape))
@@ -200,33 +200,33 @@ class Comparison:
 
     @cached_property
     def shadow_edges(self) -> np.ndarray:
-        """(H, W) bool: where shadows of maps differ from those of rays, by their texels or by how soft they are."""
+        """(H, W) bool: where shadows of maps differ from those of rays, because of texels or of softness."""
         if self.shares is None:
             return self.ref.shadow_edges
-        # A highlight may be of a lamp that hardly counts among all: no lamp's penumbra is left in.
+        # A highlight may come from a lamp that is weak among all: the penumbras of all lamps are left out.
         penumbra = ((self.shares[0] > 0) & (self.shares[1] < 1)).any(axis=0)
         return penumbra | (np.abs(self._seen_past(self.shares[0]) - self.ref["shadow"]) > 1e-4)
 
     def _seen_past(self, shares: np.ndarray) -> np.ndarray:
-        """(H, W) share of all lamps' light of (lamps, H, W) shares of each."""
+        """Return the (H, W) fraction of all lamps' light, from (lamps, H, W) fractions of each."""
         each = self.ref["lamps"]
         total = each.sum(axis=-1)
         arrives = (each * np.moveaxis(shares, 0, -1)).sum(axis=-1)
         return np.where(total > 0, arrives / np.maximum(total, 1e-30), 1.0)
 
     def map_band(self, name: str) -> np.ndarray:
-        """(texels, texels) bool: silhouettes of a shadow map."""
+        """Return (texels, texels) bool: silhouettes of a shadow map."""
         depth = self.ref[name]
         with np.errstate(divide="ignore"):
             return reference.silhouette_band(depth > 0, 1.0 / depth, jump=MAP_JUMP)
 
     def names(self) -> list[str]:
-        """Every buffer that can be graded here."""
+        """Return every buffer that can be graded here."""
         left_out = self.left_out()
         return [name for name in self._there if name not in left_out]
 
     def left_out(self) -> list[str]:
-        """Buffers that are not graded here at all: how anisotropic filtering looks up is left to the driver."""
+        """Return the buffers that cannot be graded here, because anisotropic filtering depends on the driver."""
         isotropic = self.gpu.renderer.config.anisotropy <= 1
         return [name for name in self._there if not isotropic and name in NEEDS_ISOTROPIC]
 
@@ -236,7 +236,7 @@ class Comparison:
         return [name for name in QUANTITIES if name in there]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """(GPU, what it is graded against); equal shapes."""
+        """Return (GPU, the values to grade it against); equal shapes."""
         gpu, ref = self.gpu, self.ref
         of, what = lookup_of(name)
         if name in TWINNED:
@@ -247,7 +247,7 @@ class Comparison:
             low, high = (self._seen_past(shares) for shares in self.shares)
             return gpu[name], np.clip(gpu[name], low, high)
         if what == "light" and ref.maps:
-            # Of the pass's own shadows, which are graded before.
+            # With the pass's own shadows, which are graded before.
             darker = ref["direct"] * (gpu[f"{of}_shadow"] - ref["shadow"])
             return gpu[name], ref["light"] + ref["matt"] * darker
         if name in ("luminance", "colour"):
@@ -257,7 +257,7 @@ class Comparison:
         return gpu[name], ref[name]
 
     def _shaded(self, name: str) -> np.ndarray:
-        """What a pass makes of its own albedo, its own light, and what it adds."""
+        """Return the product of a pass's own albedo and its own light, plus what it adds."""
         gpu, ref = self.gpu, self.ref
         light = gpu["colour_light_rgb"] if name == "colour" else gpu["luminance_light"][..., None]
         shaded = gpu[f"{name}_albedo"].astype(np.float64) * light
@@ -268,8 +268,8 @@ class Comparison:
         return np.where(ref.frame.hit[..., None], in_fog, ref[name])
 
     def twin(self, of: str) -> np.ndarray:
-        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates and level; 0 where it
-        drew nothing."""
+        """Return the (H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates and level; 0
+        where it drew nothing."""
         gpu, frame = self.gpu, self.ref.frame
         out = np.zeros((*gpu["part"].shape, 3))
         for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)):
@@ -283,23 +283,23 @@ class Comparison:
         return out if of == "colour" else luma_of(out)
 
     def errors(self, name: str) -> np.ndarray:
-        """(H, W) float64 in the quantity's unit; inf where the GPU wrote nan. On needles it is as much smaller as
-        float32 may misplace their surface further."""
+        """Return the (H, W) float64 errors in the quantity's unit; inf where the GPU wrote nan. On very thin triangles
+        they are reduced by how much farther float32 may misplace the surface."""
         g, r = self.pair(name)
         error = QUANTITIES[name].error(g, r, self.gpu, self.ref)
         error = np.where(np.isnan(error), np.inf, error)
         if lookup_of(name)[1] in ("direct", "around", "light"):
-            # Coloured light is told in the luminance of what it falls on: a mean over three channels, weighed by an
-            # albedo that is graded by itself. With other weights the mean moves by the channels' spread at most.
+            # Coloured light is reported as the luminance of its surface: a mean over three channels, weighted by an
+            # albedo that is graded separately. Other weights change the mean by the channels' spread at most.
             of, albedo = lookup_of(name)[0], self.ref["albedo"]
             weights = np.abs(self.gpu["colour_albedo"] - albedo) @ LUMA
-            if of == "luminance":  # whose own albedo is grey, so that of its colours only the sum is known
+            if of == "luminance":  # its own albedo is grey, so only the sum of its colours is known
                 weights = weights + np.abs(self.gpu["luminance_albedo"] - luma_of(albedo))[..., 0]
             error = np.maximum(error - self.ref["spread"] * weights, 0.0)
         return error / self.ref["needles"] if name == "local" or QUANTITIES[name].same_triangle else error
 
     def graded(self, name: str) -> np.ndarray:
-        """(H, W) bool: pixels at which a buffer is graded."""
+        """Return (H, W) bool: pixels at which a buffer is graded."""
         if name in MAPS:
             return ~self.map_band(name)
         if name in TWINNED:
@@ -309,10 +309,10 @@ class Comparison:
             graded &= self.same_triangle if view_of(name) is None else self._same_label
         of, what = lookup_of(name)
         if what in LIT:
-            # The reference looks maps up at full resolution, a GPU in mip maps.
+            # The reference reads maps at full resolution, a GPU from mip maps.
             mapped = [p for p, (_, part) in enumerate(casting.scene_parts(self.ref.scene)) if is_mapped(part.material)]
             graded &= ~np.isin(self.ref.frame.part, mapped)
-            # Light is told in the luminance of what it falls on: on black it has none.
+            # Light is reported as the luminance of its surface: on a black one it is zero.
             graded &= ~self.ref.frame.hit | (self.ref["albedo"].any(axis=-1) & self.gpu[f"{of}_albedo"].any(axis=-1))
         if what == "mirrored" or (what == "shadow" and self.shares is None):
             graded &= ~self.shadow_edges
@@ -322,7 +322,7 @@ class Comparison:
         quantity, errors, graded = QUANTITIES[name], self.errors(name), self.graded(name)
         band = ~graded if name in MAPS else self.band & ~graded
         inside = errors[graded]
-        # Nothing to grade is nothing wrong; the verdict counts it.
+        # Without graded pixels there is no error; the verdict counts it.
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
         report = BufferReport(
             quantity, quantity.tolerance if tolerance is None else tolerance, errors, graded, band, value
@@ -337,7 +337,7 @@ class Comparison:
         g, r = self.pair(name)
         owner = np.full(report.errors.shape, len(self.objects) - 1) if name in MAPS else self.owner(name)
         out = []
-        # Objects are told apart, since a mistake of one variant is that of some objects alone.
+        # Objects are listed separately, because a mistake in one variant affects only some objects.
         for k in np.unique(owner[report.graded]):
             rows = np.flatnonzero((report.graded & (owner == k)).ravel())
             errors = report.errors.ravel()[rows]
@@ -361,15 +361,15 @@ class Comparison:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where the fault is: the first buffer that is wrong, in the order in which a pass makes them, object by object.
+# The place of the fault: the first wrong buffer, in the order in which a pass computes them, object by object.
 
 
 def verdict(reports: list[BufferReport], unused: Iterable[tuple[str, str]] = (), left_out: Iterable[str] = ()) -> dict:
-    """Plain data (JSON).
+    """Return the verdict as plain data (JSON).
 
     passed : every buffer is within its tolerance, and nothing is unused.
     unused : sorted (program, name) of uniforms and attributes that a run sets and that the programs do not use.
-    not_graded : one line, which pixels and which buffers (``left_out``) nothing is said of.
+    not_graded : one line: the pixels and buffers (``left_out``) that are not graded.
     first : {buffer, title, source, objects, suspicions} of the first that is not.
     objects : per object that is over a tolerance, in the order of ``first``: object, first (buffer), x, y (the worst
     pixel there), over_tolerance and pixels (of that buffer), then (the other buffers that are
@@ -378,7 +378,7 @@ def verdict(reports: list[BufferReport], unused: Iterable[tuple[str, str]] = (),
     failed = sorted((r for r in reports if not r.passed), key=lambda r: order.index(r.quantity.name))
     rows: dict[str, dict] = {}
     for report in failed:
-        # Each object by the first buffer that is wrong on it, the others behind.
+        # Each object with the first buffer that is wrong on it, then its others.
         for one in report.objects:
             if not one["over_tolerance"]:
                 continue
@@ -419,11 +419,11 @@ def verdict(reports: list[BufferReport], unused: Iterable[tuple[str, str]] = (),
 
 
 def _not_graded(reports: list[BufferReport], left_out: list[str]) -> str:
-    """One line: how many pixels most buffers leave out, and those that leave out more."""
+    """Return one line: how many pixels most buffers leave out, and the buffers that leave out more."""
     counts = {report.quantity.name: (int((~report.graded).sum()), report.graded.size) for report in reports}
-    # What most buffers leave out are silhouettes; those that leave out more are named.
+    # Most buffers leave out silhouettes; those that leave out more are named.
     shares = [count / size for count, size in counts.values()]
-    # A hundredth more are pixels on the sides of triangles.
+    # Up to a hundredth more are pixels on the sides of triangles.
     usual = float(np.median(shares)) + 0.01
     most = max((one for one in counts.values() if one[0] <= usual * one[1]), key=lambda one: one[0] / one[1])
     line = f"not graded: up to {most[0]} of {most[1]} px of a buffer"
@@ -433,7 +433,7 @@ def _not_graded(reports: list[BufferReport], left_out: list[str]) -> str:
 
 
 def as_text(found: dict) -> list[str]:
-    """Lines."""
+    """Return the verdict as lines."""
     lines = [f"{program}: the shader no longer uses '{name}'" for program, name in found["unused"]]
     first = found["first"]
     if first is None:

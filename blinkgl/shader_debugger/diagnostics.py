@@ -1,4 +1,4 @@
-"""Compiler messages at the user's own file, line and column."""
+"""Compiler messages with the user's own file, line and column."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _QUOTED = re.compile(r"[`'\"]([A-Za-z_][\w.]*)['\"]")
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """line, column : from 1; 0 when unknown.   excerpt : the lines around, with a caret under the column."""
+    """One message. line, column : from 1; 0 when unknown.   excerpt : the lines around, with a caret under the
+    column."""
 
     file: str
     line: int
@@ -33,15 +34,15 @@ class Diagnostic:
 
 
 def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: Any) -> list[Diagnostic]:
-    """Every message behind a ShaderError. ``sources``: by stage, empty when the program could
-    not even be put together."""
+    """Return every message of a ShaderError. ``sources``: by stage, empty when the includes of the program could not be
+    resolved."""
     found = []
     for stage, number, column, kind, text in messages(error.log):
         if stage not in sources:
             continue
         source = sources[stage]
         line, (file, own) = _line(source.text, number), source.locate(number)
-        if not file:  # a line that nobody wrote: an include guard, a #define
+        if not file:  # a generated line: an include guard, a #define
             found.append(Diagnostic(source.name, 0, 0, kind, text, stage, f"generated line: {line}"))
             continue
         column = _column(line, text, column)
@@ -49,8 +50,8 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
     if any(d.kind == "error" for d in found):
         return found
     said = str(error).removeprefix(f"{error.where}: ")
-    if error.log and sources:  # linking: no lines, but names
-        # The later stage first: it is the one that asks for what the earlier does not give.
+    if error.log and sources:  # linking: names, but no lines
+        # The later stage first: it uses what the earlier one does not provide.
         for stage in reversed(sources):
             for name in _QUOTED.findall(said):
                 if place := _declaration(sources[stage], name):
@@ -68,9 +69,9 @@ def _line(text: str, number: int) -> str:
 
 
 def _column(text: str, message: str, column: int) -> int:
-    """A name that the message quotes, if the line has it: drivers count columns after their
-    preprocessor squeezed the blanks."""
-    # Drivers count columns after their preprocessor, names stay.
+    """Return the column of a name that the message quotes, if the line contains it: drivers count columns after their
+    preprocessor removed blanks."""
+    # Drivers count columns after preprocessing, but names stay the same.
     for name in _QUOTED.findall(message):
         if match := re.search(rf"\b{re.escape(name.split('.')[0])}\b", text):
             return match.start() + 1
@@ -89,20 +90,20 @@ def _declaration(source: ShaderSource, name: str) -> tuple[str, int, int] | None
 
 
 def excerpt(folder: Any, file: str, line: int, column: int = 0, around: int = 2) -> str:
-    """Lines around ``line`` of a file in the shader folder, a caret under ``column``."""
+    """Return the lines around ``line`` of a file in the shader folder, with a caret under ``column``."""
     path = folder
     for part in file.split("/"):
         path = path / part
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError):
-        # What the table of labels or shapes makes lies in no file.
+        # Includes generated from the tables of labels and shapes are in no file.
         lines = made_includes().get(file.removeprefix("include/"), "").split("\n")
     out = []
     for i in range(max(1, line - around), min(len(lines), line + around) + 1):
         out.append(f"{'>' if i == line else ' '} {i:4d} | {lines[i - 1]}")
         if i == line and column:
-            # Tabs stay tabs, so that the caret stands below its column however wide they are shown.
+            # Tabs are kept, so that the caret is below its column at any tab width.
             pad = re.sub(r"[^\t]", " ", lines[i - 1][: column - 1])
             out.append(f"       | {pad}^")
     return "\n".join(out)

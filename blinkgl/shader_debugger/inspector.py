@@ -1,4 +1,5 @@
-"""What the page asks for, computed in one thread: OpenGL contexts belong to the thread that made them."""
+"""The answers to the page's requests, computed in one thread: an OpenGL context belongs to the thread that created
+it."""
 
 from __future__ import annotations
 
@@ -45,10 +46,10 @@ from blinkgl.shader_debugger.session import (
 from blinkgl.shader_debugger.twins import TWINNED, twinned_of
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the page may ask, and how each parameter is read: the one place that looks at a query's text.
+# The requests of the page, and the reader of each parameter: only this part parses a query's text.
 
 LONGEST = 2000  # characters of a query
-LARGEST = 1e30  # ends of a colour scale: far above every buffer, and their difference is still a number
+LARGEST = 1e30  # ends of a colour scale: far above every buffer, and their difference is still finite
 SOURCES = ("gpu", "reference")
 COMPONENTS = ("auto", "length", "x", "y", "z", "w")
 
@@ -87,7 +88,7 @@ def _number(key: str, text: str) -> float | None:
         value = float(text) if text else None
     except ValueError:
         value = math.nan
-    # NaN is not below anything.
+    # NaN compares false with everything.
     if value is not None and not abs(value) <= LARGEST:
         raise ConfigError(
             "not a number", where=key, value=text, accepted=f"a number between -{LARGEST:g} and {LARGEST:g}, or nothing"
@@ -96,14 +97,14 @@ def _number(key: str, text: str) -> float | None:
 
 
 def _count(key: str, text: str) -> int:
-    """-1 when not given."""
+    """Return the number; -1 when not given."""
     if text and not re.fullmatch(r"[0-9]{1,18}", text):
         raise ConfigError("not a version", where=key, value=text, accepted="a whole number")
     return int(text) if text else -1
 
 
 def _text(key: str, text: str) -> str:
-    return text  # session.check_pixel reads the two together
+    return text  # session.check_pixel parses both together
 
 
 _VIEW: dict[str, Reader] = {
@@ -122,11 +123,11 @@ ROUTES: dict[str, dict[str, Reader]] = {
     "/verdict": {"t": _seconds},
     "/wait": {"version": _count},
 }
-"""Parameters of each route; all may be left out, where a default makes sense."""
+"""Parameters of each route; all are optional, where a default makes sense."""
 
 
 def read_query(route: str, text: str) -> dict[str, Any]:
-    """Values of every parameter of a route in :data:`ROUTES`, from the text behind the
+    """Return the values of every parameter of a route in :data:`ROUTES`, from the text after the
     question mark. Raises ConfigError."""
     readers = ROUTES[route]
     if len(text) > LONGEST:
@@ -134,7 +135,7 @@ def read_query(route: str, text: str) -> dict[str, Any]:
             "the question is too long", where=route, value=len(text), accepted=f"at most {LONGEST} characters"
         )
     given: dict[str, str] = {}
-    # A parameter that is given twice is read differently everywhere.
+    # Programs differ in how they read a parameter that is given twice.
     for key, value in parse_qsl(text, keep_blank_values=True):
         if key not in readers or key in given:
             raise ConfigError(
@@ -147,14 +148,14 @@ def read_query(route: str, text: str) -> dict[str, Any]:
     return {key: read(key, given.get(key, "")) for key, read in readers.items()}
 
 
-POLL_S = 0.15  # between two looks at the shader files
+POLL_S = 0.15  # between two checks of the shader files
 KEPT = 6  # moments in memory
 MOST_ERRORS = 5  # shown at once
 
 
 class _Loader(ShaderLoader):
-    """Compiles from a copy of the shader folder: programs compile when something first asks for them, and one asked
-    for after a bad edit would be compiled from the bad file. Remembers what it was asked for last, to find the sources
+    """Compiles from a copy of the shader folder. Programs are compiled at their first use; without the copy, one first
+    used after a bad edit would be compiled from the bad file. It stores the last requested program, to find the sources
     of an error."""
 
     asked: tuple[str, dict] = ("", {})
@@ -170,7 +171,7 @@ class _Loader(ShaderLoader):
 
 
 class Inspector:
-    """Buffers, pictures and probes of one subject. Every method but the constructor belongs to the worker's thread."""
+    """Buffers, pictures and probes of one subject. All methods except the constructor belong to the worker's thread."""
 
     def __init__(self, subject: Subject, when: When, shaders: str | None):
         self.subject, self.first = subject, when
@@ -179,13 +180,13 @@ class Inspector:
         self.generation = 1
         self.errors: list[Diagnostic] = []
         self._shown = when
-        # Scrubbing goes back and forth between a few moments.
+        # A time slider goes back and forth between a few moments.
         self.gpu = lru_cache(KEPT)(lambda when: GpuMoment(self.renderer, when))
         self.reference = lru_cache(KEPT)(lambda when: open_reference(subject, when, self.renderer.maps))
         self.comparison = lru_cache(KEPT)(lambda when: Comparison(self.gpu(when), self.reference(when)))
 
     def open(self) -> None:
-        """Makes the context and draws once. Raises GLError."""
+        """Create the context and draw once. Raises GLError."""
         self._context = open_renderer(self.subject, self._shaders)
         self.renderer = self._context.__enter__()
         try:
@@ -202,7 +203,7 @@ class Inspector:
 
     def _draw_all(self, when: When) -> GpuMoment:
         made = GpuMoment(self.renderer, when)
-        # Programs compile when they are first drawn with: all are, so that an error shows now.
+        # Programs are compiled at the first drawing: draw with all, so that an error is shown now.
         for name in self._buffers():
             made[name]
         return made
@@ -211,7 +212,7 @@ class Inspector:
         return buffers_of(self.subject.scene, twinned_of(self.subject.config, self.subject.scene))
 
     def _array(self, when: When, name: str, source: str) -> np.ndarray:
-        if name in TWINNED:  # whose reference is what the twin makes of the GPU's own
+        if name in TWINNED:  # its reference is computed from the GPU's own picture
             return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
         return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
@@ -222,7 +223,7 @@ class Inspector:
     # ---- answers -----------------------------------------------------------------------------------------------
 
     def state(self, q: dict[str, Any]) -> dict:
-        """What the page shows around the pictures."""
+        """Return what the page shows around the pictures."""
         scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
         return {
             "config": self.subject.path,
@@ -248,7 +249,7 @@ class Inspector:
         return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
 
     def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
-        """PNG and legend of one buffer. q : as :func:`questions.read_query` gives it, here and below."""
+        """Return PNG and legend of one buffer. q : the result of :func:`questions.read_query`, here and below."""
         when, name = self._when(q["t"]), check_pass(q["pass"], self._buffers(), "pass")
         source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
         info = PASSES[name]
@@ -264,7 +265,7 @@ class Inspector:
         return picture.png_bytes(rgb), legend | {"unit": info.unit}
 
     def difference(self, q: dict[str, Any]) -> tuple[bytes, dict]:
-        """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
+        """Return PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
         when = self._when(q["t"])
         for key in "ab":
             check_pass(q[key][0], self._buffers(), key)
@@ -280,7 +281,7 @@ class Inspector:
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
         values = np.abs(pictures.component(change, which))
-        # A scale from the least to the greatest difference; without any, some scale.
+        # The scale runs from the smallest to the largest difference; without any, it is arbitrary.
         some = values[np.isfinite(values) & (values > 0)]
         low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
         low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
@@ -292,7 +293,7 @@ class Inspector:
         return picture.png_bytes(rgb), legend | {"unit": PASSES[q["b"][0]].unit}
 
     def verdict(self, q: dict[str, Any]) -> dict:
-        """All buffers against the reference: what ``diff`` says first, and its text."""
+        """Return the comparison of all buffers with the reference: the verdict of ``diff``, and its text."""
         comparison = self.comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
         found = verdict(reports, self.renderer.unused, comparison.left_out())
@@ -307,7 +308,7 @@ class Inspector:
         )
 
     def probe(self, q: dict[str, Any]) -> dict:
-        """The CLI's probe, with the CLI's text of every number."""
+        """Return the result of the command ``probe``, with its text of every number."""
         when = self._when(q["t"])
         x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")
         comparison = self.comparison(when)
@@ -320,15 +321,15 @@ class Inspector:
     # ---- reloading ---------------------------------------------------------------------------------------------
 
     def reload(self) -> None:
-        """Takes the edited shaders when all of them compile and draw; otherwise keeps the old
-        ones and :attr:`errors`."""
+        """Use the edited shaders if all of them compile and draw; otherwise keep the old
+        ones and set :attr:`errors`."""
         old = self.renderer.gl.shaders
         new = _Loader(self.renderer.gl.ctx, self.folder)
         self.renderer.use_shaders(new)
         try:
             self._draw_all(self._shown)
         except ShaderError as error:
-            # The same message comes from each stage that includes the line.
+            # Each stage that includes the line reports the same message.
             found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
             self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
         except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
@@ -353,11 +354,11 @@ class Inspector:
             return {}
 
     def stamps(self) -> tuple:
-        """Changes whenever a shader file does. Safe in any thread."""
+        """Return a value that changes whenever a shader file does. Safe in any thread."""
         out = []
         for path in files_of(self.folder):
             try:
-                # Editors replace a file by renaming: it may be gone for a moment, or have another inode.
+                # Editors replace a file by renaming: it may be absent for a moment, or have another inode.
                 info = path.stat()
                 out.append((str(path), info.st_mtime_ns, info.st_size, info.st_ino))
             except OSError:
@@ -366,7 +367,7 @@ class Inspector:
 
 
 class Worker:
-    """Runs an Inspector in a thread of its own, and watches its files. ``call`` may come from any thread."""
+    """Runs an Inspector in its own thread, and watches its files. ``call`` may be used in any thread."""
 
     def __init__(self, inspector: Inspector):
         self.inspector = inspector
@@ -383,7 +384,7 @@ class Worker:
         self._watcher.start()
 
     def call(self, function: Any, *arguments: Any) -> Any:
-        """The result of ``function`` in the render thread; raises what it raised."""
+        """Return the result of ``function`` in the render thread; exceptions are raised here."""
         if self._stop.is_set():
             raise BlinkGLError("the server is stopping")
         return self._thread.submit(function, *arguments).result()
@@ -391,7 +392,7 @@ class Worker:
     def _watch(self) -> None:
         seen = last = self.inspector.stamps()
         while not self._stop.wait(POLL_S):
-            # Two looks alike mean that nobody is writing just now.
+            # Two equal checks mean that no editor is writing at the moment.
             last, stamps = self.inspector.stamps(), last
             if stamps == last != seen:  # not while an editor is still writing: a file is empty for a moment
                 seen = stamps
@@ -401,7 +402,7 @@ class Worker:
                     self.changed.notify_all()
 
     def wait(self, version: int, timeout: float) -> int:
-        """The version, as soon as it differs from ``version`` or the time is over."""
+        """Return the version, as soon as it differs from ``version`` or the time is over."""
         with self.changed:
             self.changed.wait_for(lambda: self.version != version or self._stop.is_set(), timeout)
             return self.version

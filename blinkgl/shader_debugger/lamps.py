@@ -1,4 +1,4 @@
-"""What lamps see, and what they leave in the dark: shadow maps in float64, and where a map may be off by its texels."""
+"""Shadow maps in float64, the pixels where a map may be wrong because of its texels, and a twin of soft shadows."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from blinkgl.render.shadows import Parallel, scale_of, view_of
 from blinkgl.scene.types import Scene
 
 FAR_AWAY = 1e5
-"""From where a sun's rays come, times the depth of its map: parallel to 1e-5."""
+"""Distance of the origin of a sun's rays, in depths of its map: they are parallel to 1e-5."""
 SMOOTHED = 1.5
-"""Texels from the edge of a hard shadow in which a map's own differs from the rays': what an edge is smoothed over."""
+"""Texels from the edge of a hard shadow within which map and rays may differ: the width over which it is smoothed."""
 WAYS = 8
 GRAZING = 0.1
-"""Cosine at a surface that light passes so flatly that it is given up to sixteen texels of room."""
+"""Cosine at a surface below which light is so grazing that its depth offset is up to sixteen texels."""
 
 
 def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.ndarray]:
-    """((texels, texels) float64 depth as the map should hold it, 0 where nothing casts; int32 number of what is seen
-    there, among all that cast, -1: nothing)."""
+    """Return ((texels, texels) float64 depth that the map should contain, 0 where nothing casts; int32 number of the
+    visible triangle, among all that cast, -1: nothing)."""
     view, pose = view_of(map_.lamp, map_.box, map_.texels, map_.lamp.path.pose(t_ns))
     camera, size = view.camera, map_.texels
     y, x = np.mgrid[0:size, 0:size].reshape(2, -1)
@@ -32,7 +32,7 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
         depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays / rays[:, 2:], camera.near)
         value = camera.near / depth
     else:
-        # The ray caster has rays from one point: from far enough away they are parallel.
+        # The ray caster's rays start at one point: from far enough away they are parallel.
         away = FAR_AWAY * camera.depth
         pose = pose.copy()
         pose[:3, 3] -= away * pose[:3, 2]
@@ -41,13 +41,13 @@ def map_of(scene: Scene, t_ns: int, map_: ShadowMap) -> tuple[np.ndarray, np.nda
         )
         rays = np.column_stack([there / (away + 0.5 * camera.depth), np.ones(len(there))])
         depth, part = appearance.seen_by_lamp(scene, t_ns, pose, rays, 0.5 * away)
-        # Depth is reversed, 1 at the side of the lamp.
+        # Depth is reversed, 1 at the lamp's side.
         value = 1.0 - (depth - away) / camera.depth
     return np.where(part >= 0, value, 0.0).reshape(size, size), part.reshape(size, size)
 
 
 def place_in(map_: ShadowMap, t_ns: int, point: np.ndarray) -> np.ndarray:
-    """(3,) texels from the left and from the top, and depth, of a (3,) point, world axes, in a map."""
+    """Return (3,): texels from the left and from the top, and depth, of a (3,) point, world axes, in a map."""
     view, pose = view_of(map_.lamp, map_.box, map_.texels, map_.lamp.path.pose(t_ns))
     clip = view.projection @ [*((point - pose[:3, 3]) @ pose[:3, :3]), 1.0]
     x, y, depth = clip[:3] / clip[3]
@@ -55,8 +55,8 @@ def place_in(map_: ShadowMap, t_ns: int, point: np.ndarray) -> np.ndarray:
 
 
 def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[ShadowMap, ...]) -> np.ndarray:
-    """(H, W) bool: pixels whose point is so near to the edge of a hard shadow, or so flat to the light, that a map need
-    not agree with rays."""
+    """Return (H, W) bool: pixels whose point is so near to a hard shadow's edge, or lit so grazingly, that map and rays
+    may differ."""
     out = np.zeros(frame.hit.shape, bool)
     rows, points, own = lit_points(scene, frame)
     normals = _flat(scene, frame, rows)
@@ -71,7 +71,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
         facing = (towards * normals).sum(axis=1)
         edge = np.abs(facing) < GRAZING
-        # A shadow's edge is where a neighbour, as far aside as the map smooths, sees another share.
+        # A shadow's edge is where a neighbouring point, at the map's smoothing distance, sees another fraction.
         share = appearance.seen_share(scene, frame.t_ns, one.lamp, points, own)
         edge |= (share > 0) & (share < 1)
         for k in range(WAYS):
@@ -80,7 +80,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
             aside = aside * (texel * SMOOTHED)[:, None]
             # in the plane of the surface, where it is as far aside as the lamp sees it
             slide = (aside * normals).sum(axis=1) / np.where(np.abs(facing) < GRAZING, 1.0, facing)
-            # Moved along the light until it is on the surface's own plane again.
+            # Moved along the light back to the surface's own plane.
             there = points + aside - slide[:, None] * towards
             edge |= appearance.seen_share(scene, frame.t_ns, one.lamp, there, own) != share
         out.ravel()[rows] |= edge
@@ -88,7 +88,7 @@ def near_an_edge(scene: Scene, frame: reference.ReferenceFrame, maps: tuple[Shad
 
 
 def lit_points(scene: Scene, frame: reference.ReferenceFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n,) numbers of the pixels that show something that is lit, their (n, 3) points, world axes, and (n, 2) part and
+    """Return the (n,) numbers of the pixels with a lit surface, their (n, 3) points, world axes, and (n, 2) part and
     triangle."""
     hits = frame.hits()
     points = np.full((len(hits.hit), 3), np.nan)
@@ -102,7 +102,7 @@ def lit_points(scene: Scene, frame: reference.ReferenceFrame) -> tuple[np.ndarra
 
 
 def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np.ndarray:
-    """(n, 3) unit normals of the triangles themselves, world axes."""
+    """Return the (n, 3) unit normals of the triangles themselves, world axes."""
     part, triangle = frame.part.ravel()[rows], frame.triangle.ravel()[rows]
     out = np.zeros((len(rows), 3))
     for p, (thing, own) in enumerate(casting.scene_parts(scene)):
@@ -116,9 +116,9 @@ def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Slow twin of the soft shadows of shaders/include/shadows.glsl in float64; see there for what is done and why.
+# Slow float64 twin of the soft shadows of shaders/include/shadows.glsl, which explains the method.
 #
-# It looks into the GPU's own shadow map, which is graded by itself.
+# It reads the GPU's own shadow map, which is graded separately.
 
 SPARE, FARTHEST, WIDEST, TAPS, LEAST_SLOPE = 0.25, 16.0, 24.0, 16, 1e-4
 TURN = math.pi * (3 - math.sqrt(5))
@@ -127,14 +127,14 @@ SEEDS = np.array(
     [math.sqrt((i + 0.5) / TAPS) * np.array([math.cos(i * TURN), math.sin(i * TURN)]) for i in range(TAPS)]
 )
 ROUNDED = 2.0**-21
-"""Of a place in the map, 0 to 1, and of a depth there: what float32 makes of a product of a matrix."""
+"""Relative rounding error of a position in the map, 0 to 1, and of a depth there: float32 matrix product."""
 
 
 def share_range(
     scene: Scene, frame: reference.ReferenceFrame, one: ShadowMap, depths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((H, W), (H, W)) least and greatest share of a lamp that may be seen past its map, 1 where nothing is lit. They
-    differ where rounding decides which texel a tap hits, or whether that is in the way.
+    """Return ((H, W), (H, W)): smallest and largest possible visible fraction of a lamp by its map, 1 where nothing is
+    lit. They differ where rounding decides which texel a tap hits, or whether it is a blocker.
 
     depths : (texels, texels) float32, the map as the GPU made it."""
     rows, points, _ = lit_points(scene, frame)
@@ -144,7 +144,7 @@ def share_range(
     normals = frame.normal.reshape(-1, 3)[rows] @ pose[:3, :3]
     at = _Place(one, view.projection, there, normals)
     out = np.ones((2, frame.hit.size))
-    # The exact place, and corners of the box in which rounding may have moved it.
+    # The exact position, and corners of the box within which rounding may have moved it.
     moved = [(0, 0, 0), (1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1)]
     shares = [at.share(depths.astype(np.float64), ROUNDED * np.array(way)) for way in moved]
     out[:, rows] = np.min(shares, axis=0), np.max(shares, axis=0)
@@ -153,7 +153,7 @@ def share_range(
 
 
 class _Place:
-    """Where N points are in a map, and how their surfaces lie there."""
+    """Positions of N points in a map, and the orientation of their surfaces there."""
 
     def __init__(self, one: ShadowMap, projection: np.ndarray, there: np.ndarray, normals: np.ndarray):
         clip = np.column_stack([there, np.ones(len(there))]) @ projection.T
@@ -170,26 +170,26 @@ class _Place:
         # What a unit of the map, 0 to 1, is on the plane at distance 1, or of a sun in world units.
         across = 2 / np.array([projection[0, 0], projection[1, 1]])
         self.slope = normals[:, :2] * across * (unit / through)[:, None]
-        # Towards the lamp a surface is spared its own shadow by this much at most, and by ``least`` at least.
+        # Largest offset towards the lamp that avoids self-shadowing; ``least`` is the smallest.
         self.most = FARTHEST * self.texel * unit
         self.least = np.abs(self.slope).sum(axis=1) / self.size + SPARE * self.texel * unit
 
     def _limit(self, depth: np.ndarray, aside: np.ndarray) -> np.ndarray:
-        """Depth above which something is in the way of the surface at a tap."""
+        """Return the depth above which a texel blocks the light of the surface at a tap."""
         room = np.clip(self.least + (self.slope * aside).sum(axis=1), -self.most, self.most)
         return np.maximum(depth + room, 0.0)
 
     def share(self, depths: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        """(N,) share of the lamp that is seen. moved : (3,) of all places, and of all depths in parts."""
+        """Return the (N,) visible fraction of the lamp. moved : (3,) of all positions, and of all depths in parts."""
         xy, depth = self.xy + moved[:2], self.depth + moved[2] * (1.0 if self.sun else self.depth)
-        # How far aside a blocker may stand: the sun's cone up to the map's near side, or the lamp's disc.
+        # Largest distance of a blocker to the side: the sun's cone up to the map's near side, or the lamp's disc.
         reach = self.width * (1 - depth) / self.per_unit if self.sun else self.width
         search = np.clip(0.5 * reach / self.texel, 1.0, WIDEST) / self.size
         blockers, count = np.zeros(len(xy)), np.zeros(len(xy))
-        # Every second tap is enough to find what is in the way.
+        # Every second tap is enough to find blockers.
         for seed in SEEDS[::2]:
             aside = seed * search[:, None]
-            # ivec2() cuts off towards zero.
+            # ivec2() truncates towards zero.
             found = _fetched(depths, np.trunc((xy + aside) * self.size).astype(np.intp), empty=True)
             hides = found > self._limit(depth, aside)
             blockers, count = blockers + np.where(hides, found, 0.0), count + hides
@@ -208,7 +208,7 @@ class _Place:
 
 
 def _fetched(depths: np.ndarray, texel: np.ndarray, empty: bool) -> np.ndarray:
-    """(N,) texels of a map; beyond its edge nothing, or the edge's own."""
+    """Return (N,) texels of a map; beyond its edge nothing, or the edge's own."""
     size = len(depths)
     inside = ((texel >= 0) & (texel < size)).all(axis=1)
     x, y = np.clip(texel, 0, size - 1).T
@@ -216,7 +216,8 @@ def _fetched(depths: np.ndarray, texel: np.ndarray, empty: bool) -> np.ndarray:
 
 
 def _bilinear(depths: np.ndarray, at: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """(N,) share of the four texels around (N, 2) places that are not nearer than the limit, bilinearly weighted."""
+    """Return the (N,) fraction of the four texels around (N, 2) positions that are not nearer than the limit,
+    bilinearly weighted."""
     low = np.floor(at)
     part, total = at - low, np.zeros(len(at))
     for x in (0, 1):

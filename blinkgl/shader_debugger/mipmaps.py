@@ -1,9 +1,9 @@
 """A CPU twin of mip-mapped texture sampling, for grading the albedo where a pixel covers several texels.
 
-The float64 reference samples textures at full resolution: mip maps are the GPU's way to anti-alias, not a property of
-the scene. OpenGL leaves their making to the driver, so this twin (each level half the last one, resampled bilinearly,
-which is the 2 x 2 mean where the size is even; then trilinear sampling, OpenGL 4.6 section 8.14.3) is compared with a
-loose tolerance: it finds wrong coordinates, a wrong texture or a wrong level, not rounding.
+The float64 reference samples textures at full resolution: mip maps are the GPU's method of anti-aliasing, not a part of
+the scene. OpenGL does not define how drivers make them. So the tolerance is loose for this twin (each level half the
+last one, resampled bilinearly, which is the 2 x 2 mean where the size is even; then trilinear sampling, OpenGL 4.6
+section 8.14.3): it finds wrong coordinates, a wrong texture or a wrong level, not rounding.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _chains: WeakKeyDictionary = WeakKeyDictionary()
 
 
 def mip_chain(texture: Texture) -> list[Texture]:
-    """Linear-light float32 levels 0, 1, … down to 1 x 1."""
+    """Return linear-light float32 levels 0, 1, … down to 1 x 1."""
     if texture not in _chains:
         # Mip maps are means of light, not of its sRGB code.
         levels = [linear_image(texture.image)]
@@ -35,9 +35,9 @@ def mip_chain(texture: Texture) -> list[Texture]:
 
 
 def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: tuple[str, str] = REPEAT) -> np.ndarray:
-    """(N, 3) linear light at (N, 2) texture coordinates and (N,) levels (below 0: level 0)."""
+    """Return the (N, 3) linear light at (N, 2) texture coordinates and (N,) levels (below 0: level 0)."""
     chain = mip_chain(texture)
-    # A magnified texture has the finest level, and beyond 1 x 1 there is none.
+    # A magnified texture has the finest level, and 1 x 1 is the last.
     level = np.clip(np.nan_to_num(level), 0.0, len(chain) - 1)
     low = np.floor(level).astype(int)
     out = np.empty((len(uv), 3))
@@ -53,7 +53,7 @@ def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray, wrap: 
 
 
 def mipmapped_albedo(material: Material, uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """(N, 3) linear albedo; ``uv`` already times uv_scale."""
+    """Return the (N, 3) linear albedo; ``uv`` is already multiplied by uv_scale."""
     base = np.asarray(material.base_color, np.float64)
     if material.texture is None:
         return np.broadcast_to(base, (len(uv), 3)).copy()

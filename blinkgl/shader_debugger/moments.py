@@ -1,5 +1,5 @@
 """Every buffer of one moment by name: :class:`GpuMoment` reads them from OpenGL, :class:`ReferenceMoment` computes them
-in float64. Both hand out the same names, shapes and conventions, each computed when it is first asked for."""
+in float64. Both have the same names, shapes and conventions; each buffer is computed at its first use."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Pass:
 
 
 LOOKUPS = ("uv", "level", "albedo", "direct", "shadow", "around", "light", "mirrored", "emission")
-"""What a pass that is lit shows of its way to the result, in the order in which it happens: albedo · light + mirrored +
-emission, where the light of what is matt is direct · shadow + around."""
+"""Buffers of a lit pass on the way to its result, in the order of computation: albedo · light + mirrored + emission,
+where the light of the matt part is direct · shadow + around."""
 MAPS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
 """Buffers that are a lamp's picture, not the camera's."""
 
@@ -110,7 +110,7 @@ class OfLabels(Mapping[str, _T]):
             for label in LABELS.values()
             for view in label.views
         ]
-        # Motion comes last: it hangs on all that is before it.
+        # Motion comes last: it depends on everything before it.
         surface, motion = ([one for early, one in views if early is which] for which in (True, False))
         return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion)}
 
@@ -138,10 +138,10 @@ PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
 
 
 def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
-    """Those of :data:`PASSES` that a scene has: of one without shadows no shadow maps, and so on.
+    """Return the :data:`PASSES` that a scene has: without shadows no shadow maps, and so on.
 
-    twinned : of :data:`twins.TWINNED` those that are among them."""
-    # A lamp without anything that casts has no map.
+    twinned : those of :data:`twins.TWINNED` that are included."""
+    # A lamp has no map if no body casts a shadow.
     maps = len(shadowing(scene.light)) if appearance.casts(scene) else 0
     materials = [part.material for _, part in casting.scene_parts(scene) if not part.material.unlit]
     there = {
@@ -160,18 +160,18 @@ def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
 
 
 def view_of(name: str) -> tuple[Label, View] | None:
-    """The label that has this buffer, and its view; None: it is no label's."""
+    """Return the label that has this buffer, and its view; None: no label has it."""
     return next(((label, view) for label in LABELS.values() for view in label.views if view.name == name), None)
 
 
 def lookup_of(name: str) -> tuple[str, str]:
-    """("luminance", "uv") of "luminance_uv"; ("", "") of what is no look-up."""
+    """Return ("luminance", "uv") of "luminance_uv"; ("", "") for a buffer that is no lookup."""
     pass_name, _, what = name.rpartition("_")
     return (pass_name, what) if pass_name in LOOKUP_PASSES and what in LOOKUPS else ("", "")
 
 
 def check_pass(name: str, known: Any = PASSES, where: str = "--pass") -> str:
-    """``name`` if it is one of ``known``. Raises ConfigError."""
+    """Return ``name`` if it is one of ``known``. Raises ConfigError."""
     if name not in known:
         raise ConfigError("unknown pass", where=where, value=name, accepted="one of " + ", ".join(known))
     return name
@@ -246,7 +246,7 @@ class GpuMoment(_Lazy):
 
     def _labels(self):
         when = self.when
-        # All at once, so that they are drawn in one go.
+        # Request all at once, so that they are drawn together.
         ask = LabelRequest(*(name for name, label in LABELS.items() if label.views))
         frame = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
         return {view.name: view.of(frame.values[name]) for name in ask for view in LABELS[name].views}
@@ -279,7 +279,7 @@ class ReferenceMoment(_Lazy):
 
     @cached_property
     def labels(self) -> reference.ReferenceFrame:
-        """What the camera's pixels see, with flow."""
+        """Labels of the camera's pixels, with flow."""
         when = self.when
         return reference.render(self.seen, when.t_ns, forward_ns=when.forward_ns, backward_ns=when.backward_ns)
 
@@ -290,7 +290,7 @@ class ReferenceMoment(_Lazy):
 
     @cached_property
     def frame(self) -> reference.ReferenceFrame:
-        """What is drawn: without a lens :attr:`labels`."""
+        """The drawn frame: without a lens :attr:`labels`."""
         if self._places is None:
             return self.labels
         return reference.render(self.scene, self.when.t_ns, xy=self._places.astype(np.float64))
@@ -346,7 +346,7 @@ class ReferenceMoment(_Lazy):
                 self._look_up(out, frame, thing, part, on)
                 self._light_up(out, frame, part, on)
         radiance = out["lit"] + out["mirrored"] + out["emission"]
-        # Fog lies between the surface and the camera: after all light.
+        # Fog is between the surface and the camera: apply it after all light.
         in_fog = appearance.seen_through_fog(self.scene, frame.hits(), radiance.reshape(-1, 3)).reshape(radiance.shape)
         out["colour"] = np.where(frame.hit[..., None], in_fog, frame.colour)
         out["luminance"] = out["colour"] @ LUMA
@@ -360,14 +360,14 @@ class ReferenceMoment(_Lazy):
         part: Part,
         on: np.ndarray,
     ) -> None:
-        """Writes where on a part the pixels ``on`` are, and the albedo that is looked up there."""
+        """Write the position on a part of the pixels ``on``, and the albedo read there."""
         scene, mesh, material = self.scene, part.mesh, part.material
         corners = mesh.faces[frame.triangle[on]]
         pose = casting.relative_pose_at(scene, thing, frame.t_ns)
         # In the camera's axes, as the shape is at this time.
         points = casting.vertices_at(mesh, frame.t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
         out["needles"][on] = needles(points, scene.camera)
-        if material.texture is not None:  # else the GPU has no coordinates either
+        if material.texture is not None:  # otherwise the GPU has no coordinates either
             out["uv"][on] = frame.uv[on] * material.uv_scale
             size = material.texture.image.shape[1::-1]
             out["texture_size"][on] = size
@@ -381,7 +381,7 @@ class ReferenceMoment(_Lazy):
     def _light_up(
         self, out: dict[str, np.ndarray], frame: reference.ReferenceFrame, part: Part, on: np.ndarray
     ) -> None:
-        """Writes the light of the pixels ``on`` of a part, whose albedo is known, and its terms."""
+        """Write the light of the pixels ``on`` of a part, whose albedo is known, and its terms."""
         albedo = out["albedo"][on]
         out["lit"][on], out["light"][on], out["shadow"][on] = albedo, 1.0, 1.0
         if part.material.unlit:
@@ -389,7 +389,7 @@ class ReferenceMoment(_Lazy):
         rows = np.flatnonzero(on.ravel())
         sent = appearance.radiated(self.scene, frame.hits(), rows, albedo, frame.normal[on], frame.uv[on])
         out["lit"][on] *= sent.matt
-        # Light is told in the luminance of what it falls on: coloured light takes of each colour as much as it has.
+        # Light is reported as the luminance of its surface: each colour counts as much as the surface reflects it.
         weights = albedo * LUMA
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
 
@@ -401,7 +401,7 @@ class ReferenceMoment(_Lazy):
         )
         light = seen(sent.matt)
         out["light"][on], out["around"][on], out["direct"][on] = light, around, direct
-        # Each lamp by itself, so that shares of soft shadows can be put in their place.
+        # Each lamp separately, so that the fractions of soft shadows can be inserted.
         out["lamps"][on] = np.einsum("knc,nc->nk", sent.light.open, weights)
         terms = sent.light.open.sum(axis=0), sent.light.around, sent.matt
         spread = np.max([np.ptp(one, axis=1) for one in terms], axis=0)
@@ -420,11 +420,11 @@ _COMPONENTS = {
 
 
 def open_reference(subject: Subject, when: When, maps: tuple[ShadowMap, ...] = ()) -> ReferenceMoment:
-    """What the GPU should write for this subject. maps : of the renderer that draws it."""
+    """Return the values that the GPU should write for this subject. maps : of the renderer that draws it."""
     return ReferenceMoment(subject.scene, when, subject.config.render.mip_bias, maps)
 
 
 def luma_of(albedo: np.ndarray) -> np.ndarray:
-    """(..., 3) grey of the luminance of (..., 3) albedo: what the event pass, whose textures
-    have one channel, shows as its albedo."""
+    """Return the (..., 3) grey of the luminance of (..., 3) albedo: the albedo of the event pass, whose textures have
+    one channel."""
     return np.repeat((albedo @ LUMA)[..., None], 3, axis=-1)

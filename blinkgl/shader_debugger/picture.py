@@ -23,7 +23,7 @@ INK, PAPER, MUTED = "#1f2933", "#ffffff", "#64748b"
 
 
 def png_bytes(rgb: np.ndarray) -> bytes:
-    """A PNG file of (H, W, 3) uint8."""
+    """Return a PNG file of (H, W, 3) uint8."""
     out = io.BytesIO()
     Image.fromarray(rgb).save(out, "PNG", compress_level=1)
     return out.getvalue()
@@ -39,7 +39,7 @@ def _style(axes) -> None:
 
 
 def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict, size: float) -> None:
-    """Draws the colour bar, or what stands for it, into box (x, y, w, h in figure fractions)."""
+    """Draw the colour bar, or its replacement, into box (x, y, w, h in figure fractions)."""
     kind = legend["kind"]
     if kind == "bar":
         scale = (LogNorm if legend["log"] else Normalize)(legend["low"], legend["high"])
@@ -47,7 +47,7 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
         bar = figure.colorbar(ScalarMappable(scale, legend["map"]), cax=axes, orientation="horizontal")
         bar.outline.set_visible(False)
         if legend["log"]:
-            # matplotlib would name powers of ten alone, of which a scale of depths may have one.
+            # matplotlib would label only powers of ten, and a scale of depths may contain a single one.
             ticks = [float(f"{v:.1g}") for v in np.geomspace(legend["low"], legend["high"], 5)[1:-1]]
             bar.set_ticks(ticks, labels=[f"{v:g}" for v in ticks], minor=False)
             bar.minorticks_off()
@@ -66,29 +66,29 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
 
 
 def _save(figure: Figure, path: Path, palette: bool = False) -> None:
-    """palette : 256 colours, dithered; a third of the size."""
+    """Save the figure. palette : 256 colours, dithered; a third of the size."""
     figure.set_dpi(100)
     figure.set_facecolor(PAPER)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     if palette:
-        # Pillow dithers to given palettes only.
+        # Pillow dithers only to given palettes.
         image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
     with atomic_file(path) as temporary, output_errors(path):
         image.save(temporary, "PNG", optimize=palette)
 
 
 def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str, str]) -> None:
-    """A line above a picture: what it is at the left end, its unit at the right one (figure fractions)."""
+    """Write a line above a picture: its name at the left end, its unit at the right one (figure fractions)."""
     figure.text(ends[0], y, texts[0], fontsize=8.5, color=INK, va="center", weight="bold")
     figure.text(ends[1], y, texts[1], fontsize=7, color=MUTED, va="center", ha="right")
 
 
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
-    """One buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
+    """Save one buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
     height, width = rgb.shape[:2]
-    # Whole factors, or pixels would be of different sizes.
+    # Whole factors, otherwise pixels would have different sizes.
     factor = max(1, round(700 / width))
     w, h, top, bottom = width * factor, height * factor, 46, 74
     W, H = w + 40, h + top + bottom
@@ -103,7 +103,7 @@ def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption
 
 
 def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], caption: str, columns: int = 5) -> None:
-    """All buffers on one page."""
+    """Save all buffers on one page."""
     height, width = tiles[0][1].shape[:2]
     w = 232
     h = round(w * height / width)
@@ -123,12 +123,12 @@ def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], c
 
 
 def save_errors(path: Path, reports: list, caption: str) -> None:
-    """The error of each compared buffer on a logarithmic scale; what is not graded is greyed."""
+    """Save the error of each compared buffer on a logarithmic scale; pixels that are not graded are greyed."""
     tiles = []
     for report in reports:
         errors = np.clip(np.where(report.errors > 0, report.errors, 1e-9), 1e-9, 1e2)
         rgb, legend = picture("depth", errors, which="length", colours=ERROR_MAP, low=1e-9, high=1e2)
-        # Greyed, not left out: a shape is easier to find with what is around it.
+        # Greyed, not left out: a shape is easier to find with its surroundings.
         rgb[~report.graded] = (rgb[~report.graded] * 0.35 + 255 * 0.3).astype(np.uint8)
         verdict = "ok" if report.passed else "over tolerance"
         unit = f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}"

@@ -1,5 +1,5 @@
-"""One pixel: each buffer beside the float64 reference, where the point is in every frame of reference, and why it is
-invalid or occluded when it is."""
+"""One pixel: each buffer beside the float64 reference, the point's position in every frame of reference, and the reason
+if it is invalid or occluded."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from blinkgl.shader_debugger.twins import TWINNED
 
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
-    """Largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not finite."""
+    """Return the largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not
+    finite."""
     g, r = np.atleast_1d(np.asarray(gpu, np.float64)), np.atleast_1d(np.asarray(ref, np.float64))
     with np.errstate(all="ignore"):
         # The distance of two neighbouring float32 at the reference's value.
         apart = np.abs(g - r) / np.spacing(np.abs(r).astype(np.float32)).astype(np.float64)
-    # Equal is no difference, of infinities, too; nan is what one of them leaves.
+    # Equal values, infinities included, have no difference; other infinities give nan.
     return float(np.where(g == r, 0.0, np.nan_to_num(apart, nan=np.inf, posinf=np.inf)).max())
 
 
@@ -40,7 +41,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
     parts = casting.scene_parts(scene)
     seen = {way: reference_probe(scene, when.t_ns, x, y, getattr(when, f"{way}_ns")) for way in ("forward", "backward")}
     drawn, true = int(gpu["part"][y, x]), int(ref["part"][y, x])
-    # Behind a lens the pixel of the flat picture that it looks at; what is later is of the lens's own ray.
+    # Behind a lens: the pixel of the flat picture that it reads; later results are of the lens's own ray.
     hit = reference_probe(ref.scene, when.t_ns, *ref.frame.xy[y, x])
     return {
         "pixel": [x, y],
@@ -139,8 +140,8 @@ def _barycentric(parts, p, gpu, x, y, t_ns):
 
 
 def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
-    """The GPU's clip position is what it used: gl_FragCoord at t; at t' the position and
-    depth that its flow implies."""
+    """Return the positions. The GPU's clip position is the one it used: gl_FragCoord at t; at t' the position and depth
+    that its flow implies."""
     scene, when = ref.scene, gpu.when
     P = scene.camera.clip_from_cam()
     size = np.array([scene.camera.width, scene.camera.height], float)
@@ -163,7 +164,7 @@ def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
     add("world, t", world(when.t_ns), point.world)
     add("camera, t", None, point.camera)
     window = gpu["window"][y, x].astype(np.float64)
-    # gl_FragCoord has all that the GPU knows of the clip position: w is 1 / Z there.
+    # gl_FragCoord contains all of the GPU's clip position: w is 1 / Z there.
     ndc = window[:2] / size * 2 - 1
     clip = np.array([*ndc, window[2], 1.0]) / window[3] if window[3] else None
     add("clip, t", clip, P @ [*point.camera, 1.0] if point.hit else None)
@@ -197,7 +198,7 @@ def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
 
 
 def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
-    """Why the GPU's masks say invalid or occluded here, from the buffers that render/occlusion.py looked at."""
+    """Return why the GPU's masks are invalid or occluded here, from the buffers that render/occlusion.py used."""
     if gpu["part"][y, x] < 0 and gpu["id"][y, x] == 0:
         return "nothing hit"
     w = float(gpu[f"next_depth_{way}"][y, x])
@@ -208,13 +209,13 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
         return ""
     renderer: Renderer = gpu.renderer
     xt, yt = x + float(flow[0]), y + float(flow[1])
-    # What leaves the picture is occluded, whatever else is there.
+    # A point that leaves the picture is occluded in any case.
     if not (-0.5 <= xt < renderer.width - 0.5 and -0.5 <= yt < renderer.height - 0.5):
         return f"outside the image at t' (x' = {xt:.3f}, y' = {yt:.3f})"
     if w < renderer.scene.camera.near:
         return f"in front of the near plane at t' (Z' = {w:.6g} < {renderer.scene.camera.near:g})"
     there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "depth", "ids")
-    # The pixel that holds the point then.
+    # The pixel that contains the point then.
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
     other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
@@ -228,7 +229,7 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
 
 
 def as_text(found: dict) -> str:
-    """The probe as fixed-width text."""
+    """Return the probe as fixed-width text."""
     x, y = found["pixel"]
     lines = [
         (

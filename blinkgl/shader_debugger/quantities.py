@@ -1,5 +1,4 @@
-"""How each buffer is graded: in which unit, by which error, how much of it is allowed. :mod:`compare` says at which
-pixels."""
+"""Grading of each buffer: its unit, its error and the tolerance. :mod:`compare` chooses the pixels."""
 
 from __future__ import annotations
 
@@ -20,11 +19,11 @@ from blinkgl.shader_debugger.twins import EDGED, LENSED
 
 @dataclass(frozen=True)
 class Quantity:
-    """How one buffer is graded. error : (what the GPU wrote, the reference, both moments) -> (H, W) >= 0 in ``unit``.
+    """Grading of one buffer. error : (what the GPU wrote, the reference, both moments) -> (H, W) >= 0 in ``unit``.
 
     statistic : "max" of the graded pixels' errors, or "mean" (the fraction of pixels, for
     masks), must not exceed ``tolerance``.
-    fit : error, in tolerances, that is left to a suspicion that explains the buffer.
+    fit : error, in tolerances, that may remain for a suspicion that explains the buffer.
     """
 
     name: str
@@ -54,16 +53,16 @@ def _relative(g, r, gpu, ref):
 
 
 def _pixels_of_texture(g, r, gpu, ref):
-    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's
-    rounding. Whole repeats are no shift."""
-    # A texture repeats: float32 tells its place, not how many repeats it is away.
+    """Return the shift of the texture, px: at a grazing angle float32's rounding spans as many repeats as a pixel does.
+    Whole repeats are not a shift."""
+    # A texture repeats: float32 gives the position in it, not the number of repeats.
     shift = g.astype(np.float64) - r
     return length((shift - np.rint(shift)) * ref["texture_size"]) / np.exp2(ref["level"])
 
 
 def _beyond_the_range(g, r, gpu, ref):
-    """How far a level is outside of what OpenGL allows, moved by what ``r`` is beside the level itself; below 0 the
-    texture is magnified, and all levels do the same."""
+    """Return how far a level is outside the range of OpenGL, shifted by the difference of ``r`` to the level itself;
+    below 0 the texture is magnified, and all levels are equivalent."""
     with np.errstate(invalid="ignore"):
         # Both are infinite beside a horizon, where any level is right.
         moved = np.where(r == ref["level"], 0.0, r - ref["level"])
@@ -72,13 +71,13 @@ def _beyond_the_range(g, r, gpu, ref):
 
 
 def _of_the_lamps(g, r, gpu, ref):
-    """What a wrong shadow does to the light: where a lamp hardly shines nobody sees its shadow."""
+    """Return the effect of a wrong shadow on the light: a shadow of a weak lamp is invisible."""
     return np.abs(g.astype(np.float64) - r) * np.minimum(ref["direct"], 1.0)
 
 
 def _of_the_picture(g, r, gpu, ref):
-    """Where it is bright of the pixel itself, else of what the picture has in the mean."""
-    # In the dark a part of nearly nothing would be a large error.
+    """Return the error relative to the pixel where it is bright, otherwise to the picture's mean."""
+    # In the dark a small error would be large relative to the pixel.
     size = length(r)
     return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
 
@@ -88,9 +87,9 @@ def _per_interval(g, r, gpu, ref):
 
 
 def _misplaced(g, r, gpu, ref):
-    """(H, W) px from each pixel's centre to where the point drawn there lies by the true poses, or, where that is more,
-    from that point to the plane of the triangle that was drawn, as it is then; inf where it is out of sight. Needs
-    nothing of the ray caster, so that a wrong pose or shape is told apart from what comes later."""
+    """Return (H, W) px from each pixel's centre to the drawn point by the true poses, or, if larger, from that point to
+    the plane of the drawn triangle at that time; inf where it is not visible. It does not use the ray caster, so that a
+    wrong pose or shape is separated from later errors."""
     part, scene, camera = gpu["part"], ref.scene, ref.scene.camera
     out = np.zeros(part.shape)
     for p, (thing, one) in enumerate(casting.scene_parts(scene)):
@@ -100,11 +99,11 @@ def _misplaced(g, r, gpu, ref):
         aside = np.linalg.norm(camera.project(there) - ref.frame.xy[y, x], axis=1)
         corners = casting.vertices_at(one.mesh, ref.when.t_ns)[one.mesh.faces[gpu["triangle"][y, x].astype(int) - 1]]
         with np.errstate(all="ignore"):
-            # Of the plane, not of the triangle: how far along it the point lies is said by ``aside``.
+            # Of the plane, not of the triangle: ``aside`` is the distance along it.
             shares = points_to_barycentric(corners, local, method="cross")
             off = np.linalg.norm(local - np.einsum("nc,nck->nk", shares, corners), axis=1)
             off *= camera.px_per_slope / there[:, 2]
-        # Of a triangle without width nothing is known but its line.
+        # Of a triangle without width only its line is known.
         out[y, x] = np.nan_to_num(np.fmax(aside, off), nan=np.inf)
     return out
 
@@ -126,7 +125,7 @@ _FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered p
 
 
 def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
-    """The steps of one pass that shades."""
+    """Return the steps of one pass that shades."""
     return (
         Quantity(f"{name}_uv", "px of shifted texture", MISPLACED, _pixels_of_texture, fit=2.0),
         Quantity(f"{name}_level", "levels", LOG2, _beyond_the_range, note=_LEVEL, fit=1.0),
@@ -177,4 +176,4 @@ def _of_label(label: Label, view: View) -> Quantity:
 
 
 QUANTITIES = OfLabels(_of_label, _BEFORE, _SHADED)
-"""In the order in which a pass makes them: the first that is wrong is where to look."""
+"""In the order in which a pass computes them: the first wrong one is the place of the fault."""

@@ -1,8 +1,8 @@
-"""``blinkgl shader serve``: the page and its few routes, over the standard library's HTTP server, a thread a request.
+"""``blinkgl shader serve``: the page and its routes, on the standard library's HTTP server, a thread per request.
 
-Listens on 127.0.0.1 unless told otherwise, answers only GET and HEAD of the routes below, and only when the Host header
-is its own address, so that no web site can reach it through a name that resolves to 127.0.0.1 (DNS rebinding). No path
-is ever turned into a file name: the page's three files are read by their fixed names.
+It listens on 127.0.0.1 by default, answers only GET and HEAD of the routes below, and only when the Host header is its
+own address, so that no web site can reach it by a name that resolves to 127.0.0.1 (DNS rebinding). No path becomes a
+file name: the page's three files are read by their fixed names.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ PAGE = {
     "/app.js": ("app.js", "text/javascript; charset=utf-8"),
     "/style.css": ("style.css", "text/css; charset=utf-8"),
 }
-WAIT_S = 20.0  # a long poll's patience
-SILENT_S = 20.0  # for a header, or for an answer that nobody takes
+WAIT_S = 20.0  # longest time of a long poll
+SILENT_S = 20.0  # for a header, or for an answer that the browser does not read
 LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADERS = {
     "Cache-Control": "no-store",
@@ -39,9 +39,9 @@ HEADERS = {
 
 
 def host_allowed(header: str | None, bound: str, port: int) -> bool:
-    """Whether a Host header names this server: a local name or the bound address, with its port if any.
+    """Return whether a Host header names this server: a local name or the bound address, with its port if any.
 
-    Bound to every address, any literal IP address will do, but no name."""
+    If bound to every address, it accepts any literal IP address, but no name."""
     if not header or len(header) > 255:
         return False
     try:
@@ -73,7 +73,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.close_connection = True
-        # Two Host headers may be read differently by a proxy: neither is believed.
+        # A proxy may read two Host headers differently: refuse both.
         hosts = self.headers.get_all("Host") or [None]
         if len(hosts) != 1 or not host_allowed(hosts[0], self.server.bound, self.server.server_port):
             return self._error(403, "this Host is not served here")
@@ -88,7 +88,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._wait(query) if route == "wait" else self._answer(route, query)
         except BlinkGLError as error:
             self._error(400, str(error))
-        except OSError:  # a browser that left in the middle, or takes for ever
+        except OSError:  # a browser that disconnected, or is too slow
             pass
         except Exception as error:  # noqa: BLE001 - said in the answer; the server goes on
             self._error(500, f"{type(error).__name__}: {error}")
@@ -96,7 +96,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def _answer(self, route: str, query: dict) -> None:
-        """What the inspector's method of that name makes of a query: a picture and its legend, or JSON."""
+        """Send the result of the inspector's method of that name for a query: a picture and its legend, or JSON."""
         worker = self.server.worker
         made = worker.call(getattr(worker.inspector, route), query)
         if isinstance(made, tuple):
@@ -128,11 +128,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, *arguments) -> None:
-        """Quiet."""
+        """Write no log."""
 
 
 class _Server(ThreadingHTTPServer):
-    """Raises OSError when it cannot listen."""
+    """The HTTP server. Raises OSError when it cannot listen."""
 
     daemon_threads = True
     allow_reuse_address = True
@@ -140,12 +140,12 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, host: str, port: int):
         self.bound = host
-        # Before the socket is made: IPv6 addresses are told by their colons.
+        # Before the socket is created: an address with colons is IPv6.
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__((host, port), _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Quiet: a browser that leaves in the middle is no news."""
+        """Write nothing: a browser may disconnect at any time."""
 
 
 class DebugServer:
@@ -159,7 +159,7 @@ class DebugServer:
         host: str = "127.0.0.1",
         port: int = 0,
     ):
-        # First of all: a taken port is said before a scene is built.
+        # First, so that a port in use is reported before a scene is built.
         self._server = _listen(host, port)
         try:
             self._server.worker = Worker(Inspector(subject, when, shaders))
@@ -180,7 +180,7 @@ class DebugServer:
 
     @property
     def folder(self) -> Path:
-        """Where the shaders are read."""
+        """The folder of the shaders."""
         return self._server.worker.inspector.folder
 
     def __enter__(self) -> DebugServer:
@@ -190,7 +190,7 @@ class DebugServer:
         self.close()
 
     def close(self) -> None:
-        """Ends the server; pages that wait are answered first. May be called again."""
+        """End the server; waiting pages are answered first. May be called again."""
         if self._thread.is_alive():
             self._server.shutdown()
             self._thread.join()
@@ -211,7 +211,7 @@ def _listen(host: str, port: int) -> _Server:
 
 
 def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int) -> None:
-    """Serves until interrupted."""
+    """Serve until interrupted."""
     with DebugServer(subject, when, shaders, host, port) as server:
         folder = server.folder
         print(f"{server.url}  (Ctrl-C ends it; watching {folder})", flush=True)

@@ -1,4 +1,4 @@
-"""What the debugger looks at: one sequence's scene as a generation run would build it, a time in it, and an OpenGL
+"""The subject of the debugger: one sequence's scene as a generation run would build it, a time in it, and an OpenGL
 renderer of it whose shaders may be edited while it runs."""
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class When:
-    """Times in ns: the moment, and the other ends of its flows."""
+    """Times in ns: the moment, and the end times of its flows."""
 
     t_ns: int
     forward_ns: int
@@ -55,26 +55,26 @@ class When:
 def open_subject(
     config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()
 ) -> Subject:
-    """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
+    """Return the sequence that ``blinkgl generate CONFIG --seed SEED`` would make with number
     ``sequence`` (default: its first), of a recipe with groups in its first group.
 
     Raises ConfigError and AssetError."""
     template = load_run(config, overrides, seed=seed)
-    # Only a group has numbered sequences; the first stands for the recipe.
+    # Only a group has numbered sequences; the first group represents the recipe.
     if "groups" in template.tree:
         template = template.groups[0].template
     index = template.sequence(0).output.first_index if sequence is None else sequence
     one = template.sequence(index)
-    # Before the scene is built, so that a missing file is said in a moment.
+    # Before the scene is built, so that a missing file is reported at once.
     check_assets(one.scene, template.base, one.output.split)
     return Subject(str(config), one, index, sequence_scene(one, index, template.base))
 
 
 def moment(subject: Subject, seconds: float | None = None) -> When:
-    """The times that belong to a moment ``seconds`` on the sequence's clock (default: the first label).
+    """Return the times of the moment ``seconds`` on the sequence's clock (default: the first label).
 
-    Flows run one label interval forward and backward; beyond the sequence's ends the poses are held, as everywhere.
-    Raises ConfigError for a time outside the sequence."""
+    Flows lead one label interval forward and backward; beyond the sequence's ends the poses are constant, as
+    everywhere. Raises ConfigError for a time outside the sequence."""
     timing, scene = subject.config.time, subject.scene
     if seconds is None:
         t_ns = timing.label_times_ns[0]
@@ -104,7 +104,7 @@ def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
 
 
 def open_folder(shaders: str | None) -> Path:
-    """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises
+    """Return the folder whose shaders are debugged: ``shaders``, or the included ones. Raises
     GLError when it cannot be read, or is older than the debugger."""
     if shaders is None:
         return Path(str(shader_folder()))
@@ -131,12 +131,12 @@ def open_folder(shaders: str | None) -> Path:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Every shader file below ``folder``, for watching and for messages."""
+    """Return every shader file below ``folder``, for watching and for messages."""
     return sorted([*folder.glob("*.glsl"), *(folder / "include").rglob("*.glsl")])
 
 
 class _Nothing:
-    """A uniform that the compiler optimised away: takes any value."""
+    """A uniform that the compiler removed: it accepts any value."""
 
     value = None
 
@@ -145,7 +145,7 @@ class _Nothing:
 
 
 class _Uniforms(Uniforms):
-    """Notes what the program does not use any more, where a run would stop: what comes out wrong says more."""
+    """Records uniforms that the program no longer uses, where a run would stop: the wrong result explains more."""
 
     def __init__(self, program: Any, unused: set[tuple[str, str]]):
         super().__init__(program)
@@ -157,7 +157,7 @@ class _Uniforms(Uniforms):
 
 
 class DebugPainter(Painter):
-    """Draws with edited shaders that no longer use a uniform or an attribute of a shape, and notes which.
+    """Draws with edited shaders that no longer use a uniform or an attribute of a shape, and records which.
 
     unused : (program, name) of each."""
 
@@ -169,7 +169,7 @@ class DebugPainter(Painter):
         return _Uniforms(program, self.unused)
 
     def draw(self, uniforms: Any, item: Any) -> None:
-        # Attributes that a program lacks are left out silently where vertex arrays are made.
+        # Vertex arrays silently leave out attributes that a program does not have.
         program, shape = uniforms[""], item.deformer
         if shape is not None:
             self.unused |= {(program.extra, name) for name in shape.attributes if name not in program}
@@ -182,8 +182,8 @@ class DebugPainter(Painter):
 
 @dataclass(frozen=True)
 class Inspection(ScenePass):
-    """Which primitive wrote a pixel, and where on it; 0 where nothing is hit. In [..., 3] of LOCAL: number of the part
-    + 1, an index into ``casting.scene_parts``."""
+    """The primitive that wrote a pixel, and the position on it; 0 where no surface is visible. [..., 3] of LOCAL:
+    number of the part + 1, an index into ``casting.scene_parts``."""
 
     program: ClassVar[str] = DEBUG_PROGRAM
     outputs: ClassVar[tuple[Output, ...]] = (
@@ -200,12 +200,12 @@ class Inspection(ScenePass):
 
 
 SHOWN = tuple(Output(name, "RGBA32F") for name in ("lookup", "albedo", "mirrored", "emission", "terms", "light"))
-"""What the variant SHOW_LOOKUP writes beside a pass's own output."""
+"""Outputs of the variant SHOW_LOOKUP beside a pass's own."""
 
 
 @dataclass(frozen=True)
 class LuminanceLookup(Luminance):
-    """The luminance pass, which shows its look-ups."""
+    """The luminance pass with its lookups as outputs."""
 
     still: ClassVar[bool] = False
 
@@ -223,7 +223,7 @@ class LuminanceLookup(Luminance):
 
 @dataclass(frozen=True)
 class ColourLookup(Colour):
-    """The colour pass, which shows its look-ups."""
+    """The colour pass with its lookups as outputs."""
 
     outputs: ClassVar[tuple[Output, ...]] = (*Colour.outputs, *SHOWN)
 
@@ -233,21 +233,21 @@ class ColourLookup(Colour):
 
 @dataclass(frozen=True)
 class WholeShadowMap(ShadowMap):
-    """Drawn anew, whatever stood still since the last one."""
+    """A shadow map that is drawn completely, static bodies included."""
 
     def stands_still(self, whole: bool) -> bool:
         return False
 
 
 LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}
-"""Passes that show what they look up. One sample at the pixel's centre, whatever the anti-aliasing."""
+"""Passes with lookups as outputs. One sample at the pixel's centre, whatever the anti-aliasing."""
 
 
 class DebugRenderer(Renderer):
-    """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame
-    may be other shaders' work.
+    """The production renderer with additional passes. It always draws whole frames, because data kept from an earlier
+    frame may come from other shaders.
 
-    twinned : which pictures that are made of others are shown and compared, see :mod:`twins`.
+    twinned : pictures made from other pictures that are shown and compared, see :mod:`twins`.
     as_configured : whether pictures are those of a generation run."""
 
     twinned: tuple[str, ...] = ()
@@ -267,28 +267,29 @@ class DebugRenderer(Renderer):
         self.gl.shaders = loader
 
     def at_pixels(self, flat: np.ndarray) -> np.ndarray:
-        """(H, W[, C]) of the camera's picture: itself, or of the flat picture that is drawn for a lens the pixels that
-        the lens looks at."""
+        """Return the (H, W[, C]) pixels of the camera: the picture itself, or, for a lens, the pixels of the flat
+        picture that the lens reads."""
         places = places_of(self.scene.camera)
-        # Indexed by a whole array of rows and of columns: a copy of the lens's size.
+        # Indexed by whole arrays of rows and columns: a copy of the lens's size.
         return flat if places is None else flat[places[..., 1], places[..., 0]]
 
     def picture(self, what: str, t_ns: int) -> np.ndarray:
-        """(H, W) "luminance" or (H, W, 3) "colour", float32: one sample at the pixel's centre, or ``as_configured``."""
+        """Return (H, W) "luminance" or (H, W, 3) "colour", float32: one sample at the pixel's centre, or
+        ``as_configured``."""
         if self.as_configured:
             return (self.colour if what == "colour" else self.luminance)(t_ns).read()
         return self.at_pixels(self.draw(pass_of(self, what), t_ns).read())
 
     def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
-        """The outputs of debug.glsl, see :class:`Inspection`."""
+        """Return the outputs of debug.glsl, see :class:`Inspection`."""
         frame = self.draw(Inspection(), t_ns)
         return {name: self.at_pixels(frame.read(name)) for name in frame.names}
 
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
-        """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
+        """Return the lookups and factors of the pass "luminance" or "colour", float32, from its own source (variant
         SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, count (H, W), the number of
-        look-ups; light, and its terms direct, shadow, around (H, W); albedo, mirrored, emission, light_rgb (H, W, 3).
-        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit."""
+        lookups; light, and its terms direct, shadow, around (H, W); albedo, mirrored, emission, light_rgb (H, W, 3).
+        One sample at the pixel's centre whatever the anti-aliasing; 0 where no surface is visible."""
         frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
         read = {output: self.at_pixels(frame.read(output)) for output in frame.names}
         lookup, albedo, terms = read["lookup"], read["albedo"], read["terms"]
@@ -309,11 +310,12 @@ class DebugRenderer(Renderer):
 
     @property
     def maps(self) -> tuple[ShadowMap, ...]:
-        """Of the lamps that cast shadows, in the shaders' order."""
+        """Maps of the lamps that cast shadows, in the shaders' order."""
         return self._shadows
 
     def shadow_map(self, k: int, t_ns: int) -> np.ndarray:
-        """(texels, texels) float32, the depths of map k with all that casts in it, 0 where nothing does."""
+        """Return (texels, texels) float32, the depths of map k with all bodies that cast shadows, 0 where there is
+        none."""
         frame = self.draw(WholeShadowMap(**vars(self.maps[k])), t_ns)
         depths = np.empty((self.maps[k].texels,) * 2, np.float32)
         frame.texture(DEPTH_BUFFER).read_into(depths)
@@ -322,7 +324,7 @@ class DebugRenderer(Renderer):
     def raw(
         self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None
     ) -> dict[str, np.ndarray]:
-        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
+        """Return buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
         the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
         frame = self.draw(self.geometry(names), t_ns, ends)
@@ -331,10 +333,10 @@ class DebugRenderer(Renderer):
 
 @contextmanager
 def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured: bool = False) -> Any:
-    """A :class:`DebugRenderer` of the subject with the shaders of a folder, on the configuration's OpenGL.
+    """Return a :class:`DebugRenderer` of the subject with the shaders of a folder, on the configuration's OpenGL.
 
-    as_configured : anti-aliasing as generation does; otherwise one sample at the pixel centre, which is what the
-    reference's rays see.   Raises GLError."""
+    as_configured : anti-aliasing as in generation; otherwise one sample at the pixel centre, as for the reference's
+    rays.   Raises GLError."""
     folder = open_folder(shaders)
     with create_context(subject.config.gl.backend, subject.config.gl.device) as gl:
         gl.shaders = ShaderLoader(gl.ctx, folder)

@@ -1,7 +1,7 @@
-"""What an error looks like: usual mistakes that turn the right buffer into what the GPU wrote.
+"""Likely causes of an error: common mistakes that change the right buffer to the GPU's.
 
-Each candidate is the buffer that a correct pipeline with one mistake would give. A candidate that explains nearly every
-wrong pixel, and far better than the right values do, is named."""
+Each candidate is the buffer that a correct pipeline with one mistake would give. A candidate is reported if it explains
+nearly every wrong pixel, and far better than the right values do."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from blinkgl.render.colour import LUMA
 from blinkgl.shader_debugger.moments import PASSES, lookup_of
 from blinkgl.srgb import linear_from_srgb, srgb_from_linear
 
-EXPLAINED = 0.9  # of the pixels that are wrong
-CLOSE = 1e-3  # relative: a candidate need not match to the last bit, other errors may be there, too
-BETTER = 0.5  # an explained pixel's error, as a part of what it was
+EXPLAINED = 0.9  # of the wrong pixels
+CLOSE = 1e-3  # relative: a candidate need not match exactly, because other errors may be present
+BETTER = 0.5  # error of an explained pixel, as a fraction of its error before
 MOST = 3  # suspicions of one buffer
-SEEN = 0.5  # of the pixels that a mistake would make wrong, those that are
+SEEN = 0.5  # of the pixels that a mistake would make wrong, the fraction that is wrong
 
 Candidates = Iterator[tuple[str, np.ndarray]]
 
 
 def suspicions(comparison: Any, report: Any) -> list[str]:
-    """One line per candidate that fits; best first, at most three.
+    """Return one line per candidate that fits; best first, at most three.
 
     comparison : of the moment.   report : of one buffer that is over its tolerance."""
     name = report.quantity.name
@@ -35,11 +35,11 @@ def suspicions(comparison: Any, report: Any) -> list[str]:
     if PASSES[name].kind in ("mask", "ids") or not wrong.any():
         return []
     owner = comparison.owner(name)
-    # A mistake is made everywhere on an object, not just where it is seen to be wrong.
+    # A mistake affects a whole object, not only the pixels at which it is visibly wrong.
     about = report.graded & np.isin(owner, np.unique(owner[wrong]))
     g, r = gpu.astype(np.float64)[about], np.asarray(right, np.float64)[about]
     with np.errstate(all="ignore"):
-        # What is known by name goes before what any two numbers would fit.
+        # Known mistakes come before those with fitted numbers.
         for candidates in (
             _mistakes(comparison, name, r, g, about),
             _fitted(name, r[wrong[about]], g[wrong[about]], r),
@@ -52,20 +52,21 @@ def suspicions(comparison: Any, report: Any) -> list[str]:
 
 
 def _share(comparison, report, gpu, right, about, candidate) -> float:
-    """The part of the wrong pixels that a candidate explains; 0 where it would make far more pixels wrong than are.
+    """Return the fraction of the wrong pixels that a candidate explains; 0 if it would make far more pixels wrong than
+    are.
 
-    about : (H, W) bool, the pixels that the candidate is of."""
+    about : (H, W) bool, the pixels to which the candidate applies."""
     quantity, before = report.quantity, report.errors[about]
     image = np.array(right, np.float64)
-    # A candidate is tried as if it were right: what is left of the error then?
+    # Take the candidate as right: how much of the error remains?
     candidate = np.broadcast_to(candidate, image[about].shape)
     image[about] = candidate
     error = quantity.error(gpu, image, comparison.gpu, comparison.ref)[about]
     fits = error <= quantity.fit * (report.tolerance or np.finfo(np.float32).eps)
-    # Look-ups have a unit of their own, and zeros that mean nothing.
+    # Lookups have their own units, and zeros without meaning.
     if lookup_of(quantity.name)[1] not in ("uv", "level", "albedo"):
         fits |= _size(gpu.astype(np.float64)[about] - candidate) <= CLOSE * _size(candidate)
-    # A mistake that all pixels should show, and few do, is another one.
+    # A mistake that would affect all pixels, but affects few, is another one.
     wrong = before > report.limit
     meant = quantity.error(image, np.asarray(right, np.float64), comparison.gpu, comparison.ref)[about] > report.limit
     if wrong.sum() < SEEN * meant.sum():
@@ -78,7 +79,8 @@ def _size(values: np.ndarray) -> np.ndarray:
 
 
 def _mistakes(comparison, name, r, g, on) -> Candidates:
-    """(text, what the GPU would have written) pairs; r, g : (N[, C]), right and written, at the pixels ``on``."""
+    """Return (text, what the GPU would have written) pairs; r, g : (N[, C]), right and written, at the pixels
+    ``on``."""
     what = lookup_of(name)[1]
     specific = _SPECIFIC.get(what or name)
     if specific is not None:
@@ -96,11 +98,11 @@ def _mistakes(comparison, name, r, g, on) -> Candidates:
 
 
 def _fitted(name, r, g, everywhere) -> Candidates:
-    """Candidates with numbers taken from the wrong pixels themselves, ``r`` and ``g``, for what is no usual mistake.
-    everywhere : right values of all pixels that they are of."""
+    """Return candidates with numbers fitted to the wrong pixels themselves, ``r`` and ``g``, for less common mistakes.
+    everywhere : right values of all their pixels."""
     if lookup_of(name)[1] in ("uv", "level"):
         return
-    # A ratio of two zeros says nothing.
+    # A ratio of two zeros has no information.
     ratios = _typical(np.where(np.abs(r) > 1e-6, g / r, np.nan))
     if r.ndim == 2 and r.shape[1] == 2:
         yield f"x is {ratios[0]:.4g} times, y {ratios[1]:.4g} times the right value", everywhere * ratios
@@ -110,7 +112,7 @@ def _fitted(name, r, g, everywhere) -> Candidates:
 
 
 def _typical(values: np.ndarray) -> np.ndarray:
-    """The median of each column, of what is finite in it."""
+    """Return the median of each column, of its finite values."""
     columns = values.reshape(len(values), -1).T
     return np.array([np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in columns])
 
@@ -165,7 +167,7 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
 
 
 def _light(comparison, name, r, g, on) -> Candidates:
-    """Of the light as a whole, and of its terms."""
+    """Return candidates for the light as a whole, and for its terms."""
     scene, normal = comparison.ref.scene, -comparison.ref.frame.normal[on]
     if scene.light.plain:
         direct = scene.light.sun * np.maximum(0.0, normal @ np.asarray(scene.light.sun_direction))
@@ -236,4 +238,4 @@ _SPECIFIC = {
     **dict.fromkeys(("luminance_edges", "rate_edges", "colour_edges"), _edges),
     **dict.fromkeys(("velocity", "velocity_pass", "flow_forward", "flow_backward"), _motion),
 }
-"""Mistakes of a look-up, or of a buffer, by its name."""
+"""Mistakes of a lookup, or of a buffer, by its name."""

@@ -1,5 +1,5 @@
-"""Pictures that a program makes of another picture, and their float64 twins of that very picture: silhouettes by area
-(``edges.glsl``, :mod:`edges_twin`), and what a lens sees (``gather.glsl``)."""
+"""Pictures that a program makes from another picture, and their float64 twins from the same picture: silhouettes by
+area (``edges.glsl``), and the picture of a lens (``gather.glsl``)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 
 UNDECIDED = 2.0**-22
-"""Relative: float32 may decide a comparison of depths that are nearer to each other in either way."""
+"""Relative: float32 may decide a comparison of depths that are nearer to each other either way."""
 
 
 def filtered(
@@ -47,22 +47,22 @@ def filtered(
     pixel: float,
     drawn: np.ndarray,
 ) -> np.ndarray:
-    """(H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
+    """Return (H, W) or (H, W, C) float64: the picture with its silhouettes and creases by area.
 
     picture : (H, W) or (H, W, C) float32.   depths : (H, W) float32, near / Z.   pixels, crossings : of
     :meth:`~blinkgl.render.contours.Lines.in_pixels`.   pixel : 1 / focal length, px.
-    drawn : (H, W) or (H, W, C) what the program made of it. Where comparisons of depths are undecided the value is the
-    one that is nearest to it."""
+    drawn : (H, W) or (H, W, C), the program's result. Where comparisons of depths are undecided the value is the one
+    nearest to it."""
     if picture.ndim == 3:
         each = (filtered(picture[..., k], depths, pixels, crossings, pixel, drawn[..., k]) for k in range(3))
         return np.stack(list(each), axis=-1)
     out = picture.astype(np.float64)
-    # What is compared is the picture's depths with the lines'.
+    # Compared are the picture's depths with the lines'.
     exact, *others = (
         _Pixel(out.copy(), depths.astype(np.float64) * (1 + scale), pixel) for scale in (0.0, UNDECIDED, -UNDECIDED)
     )
     for x, y, first, end in pixels.tolist():
-        # Only where the exact value is not what was written do the others have to be computed.
+        # The others are computed only where the exact value differs from the written one.
         lines, written = crossings[first:end].astype(np.float64), float(drawn[y, x])
         value = exact.mean(x, y, lines)
         if abs(value - written) > 1e-5 * abs(written):
@@ -72,7 +72,7 @@ def filtered(
 
 
 class _Pixel:
-    """What one pixel shows, among those around it."""
+    """The content of one pixel and its neighbours."""
 
     def __init__(self, picture: np.ndarray, depths: np.ndarray, pixel: float):
         self.picture, self.depths, self.pixel = picture, depths, pixel
@@ -94,7 +94,7 @@ class _Pixel:
         change, shares, sizes = 0.0, 0.0, 0.0
         creases, bent, towards = 0.0, 0.0, np.zeros(2)
         for share, turn, room, depth, lx, ly, further, kind in crossings.tolist():
-            # A crease or a seam: both sides are on one surface, so only their shares are added up here.
+            # A crease or a seam: both sides are on one surface, so only their shares are summed here.
             if kind > 0.5:
                 seam = kind > 1.5
                 if depth * (1 - (GAP * self.pixel if seam else SAME)) <= own <= depth * (1 + COVER * self.pixel):
@@ -102,29 +102,29 @@ class _Pixel:
                     towards += share * np.array([lx, ly])
                     bent += 0.0 if seam else abs(share)
                 continue
-            # A silhouette: its share moves light from what is behind to what is in front.
+            # A silhouette: its share moves light from the surface behind to the one in front.
             found = self._sides(x, y, own, room, depth, np.array([lx, ly]), further, kind < -0.5)
             if found is None:
                 continue
             front, back, inside = found
             on_left = room > 0
-            # A centre on the line itself is on the side of what was drawn there.
+            # A centre on the line itself belongs to the side that was drawn there.
             if abs(room) < SNAP and on_left != ((kind < -0.5) != inside):
                 share += (turn - _turn(turn, not on_left)) / 8
             change += share * (front - back)
             shares += share
             sizes += abs(share)
-        # More than the whole is the whole; from below minus one on the sum starts from two.
+        # Limit the sum to the whole; below minus one the sum starts from two.
         if shares < -1:
             change *= max(shares + 1, -1.0) / shares
         elif shares > 1:
             change /= shares
         result = plain + change
-        # A tangle of lines: the nearer to MANY, the more of the mean of the pixels around.
+        # A tangle of lines: the nearer to MANY, the larger the part of the mean of the pixels around.
         part = min(max((sizes - FEW) / (MANY - FEW), 0.0), 1.0)
         around = sum((2 - abs(dx)) * (2 - abs(dy)) / 16 * self._light(x + dx, y + dy) for dx, dy in _AROUND)
         result += part * part * (3 - 2 * part) * (around - result)
-        # Creases: towards the pixels on their other side, as far as these are of the same surface.
+        # Creases: towards the pixels on their other side, if these are of the same surface.
         if towards.any():
             level = (SAME if bent > 0 else COVER * self.pixel) * own
             towards /= np.hypot(*towards)
@@ -141,8 +141,8 @@ class _Pixel:
     def _sides(
         self, x: int, y: int, own: float, room: float, depth: float, left: np.ndarray, further: float, back_again: bool
     ) -> tuple[float, float, bool] | None:
-        """Of a silhouette's line: what is in front and behind, and whether the pixel's centre shows the first. None:
-        the line is hidden, or nothing is known of one of them."""
+        """Return, for a silhouette's line, what is in front and behind, and whether the pixel's centre shows the first.
+        None: the line is hidden, or one of them is unknown."""
         inwards = -left if back_again else left
         inside = back_again != (room > 0)
         behind, before = depth * (1 - GAP * self.pixel), depth * (1 + SAME)
@@ -195,7 +195,7 @@ class _Pixel:
             known = abs(front_depth - depth) < SAME * depth or horizon
             front, back = self._light(*there), self._light(*other)
         if not known:
-            # Narrower than a pixel: looked for along the line, one pixel at a time, to both ends.
+            # Narrower than a pixel: search along the line, one pixel at a time, to both ends.
             onwards = np.array([left[1], -left[0]]) / max(abs(left))
             for k in range(2 * ALONG):
                 steps = (k % 2 * 2 - 1) * (k // 2 + 2)
@@ -208,7 +208,7 @@ class _Pixel:
 
 
 def _turn(turn: float, on_left: bool) -> float:
-    """A turn of the boundary, in eighths, as it is for a centre on one side of the line."""
+    """Return a turn of the boundary, in eighths, for a centre on one side of the line."""
     least = turn - 8 * np.rint(turn / 8)
     return least + (8 if on_left else -8) if on_left != (least > 0) and abs(least) > 2 else least
 
@@ -219,9 +219,9 @@ TWINNED = EDGED + LENSED
 
 
 def twinned_of(config: SequenceConfig, scene: Scene) -> tuple[str, ...]:
-    """Those of :data:`TWINNED` that a generation run draws: with ``edges2`` on a finer grid, of which the image's own
-    pixels are looked at here."""
-    # A lens's flat picture is filtered before the lens looks at it, as without one.
+    """Return those of :data:`TWINNED` that a generation run draws: with ``edges2`` on a finer grid, of which this uses
+    the image's own pixels."""
+    # A lens's flat picture is filtered before the lens reads it, as without one.
     drawn = (config.render.antialiasing, config.render.image_antialiasing)
     edged = tuple(name for name, kind in zip(EDGED, drawn, strict=True) if samples_of(kind).edges)
     return edged + (() if places_of(scene.camera) is None else LENSED)
@@ -229,22 +229,22 @@ def twinned_of(config: SequenceConfig, scene: Scene) -> tuple[str, ...]:
 
 @lru_cache(maxsize=8)
 def places_of(camera: CameraModel) -> np.ndarray | None:
-    """(H, W, 2) column and row of the pixel of the flat picture that each pixel of a lens looks at; None where the
+    """Return (H, W, 2): column and row of the pixel of the flat picture that each pixel of a lens reads; None if the
     camera's own picture is drawn."""
     flat = seen_through(camera)
     if flat is camera:
         return None
-    # Of float32 places, as gather.glsl has them: which side of a pixel's border a ray is on hangs on the last bit.
+    # From float32 places, as in gather.glsl: the last bit decides on which side of a pixel's border a ray is.
     return np.floor(lens.places_of(camera, flat, camera.width, camera.height).places).astype(np.intp)
 
 
 def pass_of(renderer: DebugRenderer, what: str, samples: Samples = Samples()) -> Pass:
-    """The pass that draws "luminance" or "colour"."""
+    """Return the pass that draws "luminance" or "colour"."""
     return {"luminance": Luminance, "colour": Colour}[what](samples, renderer.maps)
 
 
 def _parts(renderer: DebugRenderer, name: str) -> tuple[str, Pass, Pass]:
-    """(what the picture is of, the pass that draws it before, the pass that makes ``name`` of that)"""
+    """Return (what the picture is of, the pass that draws it before, the pass that makes ``name`` from it)."""
     what = name.partition("_")[0]
     if name in LENSED:
         of = pass_of(renderer, what)
@@ -254,14 +254,14 @@ def _parts(renderer: DebugRenderer, name: str) -> tuple[str, Pass, Pass]:
 
 
 def drawn(renderer: DebugRenderer, name: str, t_ns: int) -> np.ndarray:
-    """What the program writes, (H, W) or (H, W, 3) float32; behind a lens ``edges`` makes a flat picture. name : of
+    """Return the program's result, (H, W) or (H, W, 3) float32; behind a lens ``edges`` makes a flat picture. name : of
     :data:`TWINNED`, here and below."""
     what, _, pass_ = _parts(renderer, name)
     return renderer.draw(pass_, t_ns).read(what)
 
 
 def twin_of(renderer: DebugRenderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """(the picture that the program reads, float32; what it should make of it, float64)"""
+    """Return (the picture that the program reads, float32; its expected result, float64)."""
     written = drawn(renderer, name, t_ns)
     what, of, _ = _parts(renderer, name)
     frame = renderer.draw(of, t_ns)
@@ -269,7 +269,7 @@ def twin_of(renderer: DebugRenderer, name: str, t_ns: int) -> tuple[np.ndarray, 
     if name in LENSED:
         return renderer.at_pixels(plain), _gathered(plain, renderer.scene.camera)
     depths, moment = frame.target.read_depth(), frame.moment
-    # The sky has no silhouette of its own: others stand before it.
+    # The sky has no silhouette: other surfaces are in front of it.
     items = [item for item in moment.visible if item.layer != SKY]
     pixels, crossings = Lines().in_pixels(moment, items, frame.width, frame.height)
     pixel = 2 / (frame.width * abs(moment.view.projection[0, 0]))
@@ -277,11 +277,11 @@ def twin_of(renderer: DebugRenderer, name: str, t_ns: int) -> tuple[np.ndarray, 
 
 
 def _gathered(picture: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """(H, W) or (H, W, C) float64: the mean of a flat picture over each pixel of a lens, at as many places between four
-    pixels as gather.glsl looks at."""
+    """Return (H, W) or (H, W, C) float64: the mean of a flat picture over each pixel of a lens, at the sample places of
+    gather.glsl, each between four pixels."""
     flat, grid = seen_through(camera), pixel_grid(camera)
     rays = camera.rays(grid)
-    # To first order, as the shader has it: the place of the pixel's centre and its two derivatives.
+    # To first order, as in the shader: the place of the pixel's centre and its two derivatives.
     place, slopes = flat.project(rays), flat.jacobian(rays) @ camera.ray_jacobian(grid)
     columns, rows = lens.steps_of(camera, 1)
     # map_coordinates takes one channel at a time.

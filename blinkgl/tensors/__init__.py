@@ -1,16 +1,16 @@
-"""ESIM and V2E in torch: events as tensors, of many environments at once, on the device that the frames lie on.
+"""ESIM and V2E in torch: events as tensors, of many environments at once, on the device of the frames.
 
 In:    linear luminance, (environments, H, W) float32 on one device; an emulator's configuration; seeds
 Out:   TensorEvents on that device, bit for bit those of the numba kernels, and grids made of them
 Start: batch.py (frames in, events out), then esim.py
 
-Every operation is an eager one of torch's, which IEEE 754 rounds the same way on every device; :mod:`~.arith` writes
-the functions of :mod:`blinkgl.events.arith` in the same sums and products. So the same frames and seed make the same
-events on a processor and on a card, without a proof for each card. (``torch.compile`` may contract a product and a sum
-into one rounding; do not compile these functions where the bits matter.)
+Every operation is an eager torch operation, which IEEE 754 rounds the same way on every device; :mod:`~.arith` computes
+the functions of :mod:`blinkgl.events.arith` by the same sums and products. So the same frames and seed make the same
+events on a CPU and on a GPU. (``torch.compile`` may contract a product and a sum into one rounding; do not compile
+these functions where the bits matter.)
 
-torch takes seconds to import, so names are loaded when they are first used. Nothing here is differentiable: an event
-is a decision.
+torch takes seconds to import, so names are loaded when they are first used. Nothing here is differentiable, because
+events are discrete.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The functions of :mod:`blinkgl.events.arith` on tensors: the same sums and products, so the same bits.
 
-Eager torch rounds every operation by itself, as IEEE 754 says, on processors and cards alike. What would break that is
-left out: fused operations (``addcmul``, ``lerp``), the libraries' own ``log``, ``exp`` and ``sin``, and division by a
+Eager torch rounds every operation separately, by IEEE 754, on CPUs and GPUs. Operations that would break this are
+avoided: fused operations (``addcmul``, ``lerp``), the libraries' own ``log``, ``exp`` and ``sin``, and division by a
 constant written as a multiplication. Coefficients come from the numba functions, so there is one copy of each.
 """
 
@@ -36,7 +36,7 @@ _ROUND_32, _ROUND_64 = _c("_ROUND_32"), _c("_ROUND_64")
 
 
 def horner(v: Tensor, coefficients: list[float], out: Tensor | None = None) -> Tensor:
-    """The polynomial of v, coefficients from the highest power down; one rounding for each product and sum."""
+    """Return the polynomial of v, coefficients from the highest power down; one rounding for each product and sum."""
     p = torch.mul(v, coefficients[0], out=out)
     p += coefficients[1]
     for c in coefficients[2:]:
@@ -46,11 +46,10 @@ def horner(v: Tensor, coefficients: list[float], out: Tensor | None = None) -> T
 
 
 def log_q25_(v: Tensor, out: Tensor, first: Tensor, second: Tensor) -> None:
-    """ln(v) in units of 2^-25 into ``out``.   v : float32 in [2^-30, 2^30], overwritten.   out : int32.
+    """Write ln(v) in units of 2^-25 to ``out``.   v : float32 in [2^-30, 2^30], overwritten.   out : int32.
     first, second : scratch, float32. All of one size."""
-    # In place throughout, with the caller's scratch memory.
-    # No memory is asked for: that would cost as much as the arithmetic.
-    # v = m 2^exponent with m in [sqrt(1/2), sqrt(2)): taking sqrt(1/2) off the bits moves the exponent's step there.
+    # In place, with the caller's scratch memory: allocating would cost as much as the arithmetic. v = m 2^exponent with
+    # m in [sqrt(1/2), sqrt(2)): subtracting sqrt(1/2) from the bits moves the exponent's step there.
     bits, shifted = v.view(torch.int32), first.view(torch.int32)
     exponent = torch.sub(bits, _ROOT_BITS_32, out=out)
     exponent >>= 23
@@ -67,14 +66,14 @@ def log_q25_(v: Tensor, out: Tensor, first: Tensor, second: Tensor) -> None:
 
 
 def sqrt(v: Tensor) -> Tensor:
-    """The square root, rounded as IEEE 754 says."""
-    # On some processors torch's root comes from a library and is off by a unit in the last place for every fourth
-    # float32. NumPy uses the processor's instruction; CUDA rounds correctly.
+    """Return the square root, rounded by IEEE 754."""
+    # On some CPUs torch's root comes from a library and is off by a unit in the last place for every fourth float32.
+    # NumPy uses the CPU's instruction; CUDA rounds correctly.
     return torch.from_numpy(np.sqrt(v.numpy())) if v.device.type == "cpu" else torch.sqrt(v)
 
 
 def log_f32(v: Tensor) -> Tensor:
-    """ln(v), float32 to float32, v normal and positive."""
+    """Return ln(v), float32 to float32, v normal and positive."""
     bits = v.view(torch.int32)
     # As in log_q25_, with a result in float32.
     exponent = (bits - _ROOT_BITS_32) >> 23
@@ -83,7 +82,7 @@ def log_f32(v: Tensor) -> Tensor:
 
 
 def exp_f32(v: Tensor) -> Tensor:
-    """exp(v), float32, v <= 80; below -87 it stays at exp(-87)."""
+    """Return exp(v), float32, v <= 80; below -87 it is exp(-87)."""
     v = v.clamp(min=-87.0)
     # Adding and subtracting 1.5 * 2^23 rounds to an integer, as in arith.exp_f32.
     n = (v * _LOG2E_32 + _ROUND_32) - _ROUND_32
@@ -92,7 +91,7 @@ def exp_f32(v: Tensor) -> Tensor:
 
 
 def log_f64(v: Tensor) -> Tensor:
-    """ln(v), float64, v normal and positive."""
+    """Return ln(v), float64, v normal and positive."""
     bits = v.view(torch.int64)
     exponent = (bits - _ROOT_BITS_64) >> 52
     m = (bits - (exponent << 52)).view(torch.float64)
@@ -103,7 +102,7 @@ def log_f64(v: Tensor) -> Tensor:
 
 
 def fall_f64(x: Tensor) -> Tensor:
-    """e^-x, float64, x >= 0; beyond 600 it stays at e^-600."""
+    """Return e^-x, float64, x >= 0; beyond 600 it is e^-600."""
     # For x <= 1/2 the exponent is 0 and nothing is reduced, as in arith.fall_f64.
     v = (-x).clamp(min=-600.0)
     t = torch.where(x <= 0.5, torch.full_like(x, _ROUND_64), v * _LOG2E_64 + _ROUND_64)
@@ -121,7 +120,7 @@ def fall_f64(x: Tensor) -> Tensor:
 
 
 def cos_sin_turn(u: Tensor) -> tuple[Tensor, Tensor]:
-    """(cos 2 pi u, sin 2 pi u), float64, u in [0, 1]."""
+    """Return (cos 2 pi u, sin 2 pi u), float64, u in [0, 1]."""
     turns = u * 4.0
     nearest = (turns + _ROUND_64) - _ROUND_64
     # Quarter turns, in [-1/2, 1/2].
@@ -140,8 +139,8 @@ def cos_sin_turn(u: Tensor) -> tuple[Tensor, Tensor]:
 # The draws of :mod:`blinkgl.events.philox` on tensors: Philox4x32-10 in int64, the same numbers.
 #
 # torch has no unsigned 64-bit multiplication, and needs none: the low 64 bits of a product are the same for signed
-# numbers, and a shift is masked to the bits that a logical one would leave. Arguments are int64 tensors or integers
-# that fit 32 bits; the key is the seed's two words.
+# numbers, and a shift is masked to the bits of a logical one. Arguments are int64 tensors or integers that fit 32 bits;
+# the key is the seed's two words.
 
 _MASK32, _MASK53 = 0xFFFFFFFF, 2**53 - 1
 _M0, _M1, _W0, _W1 = 0xD2511F53, 0xCD9E8D57, 0x9E3779B9, 0xBB67AE85
@@ -149,12 +148,12 @@ _ULP53, _ULP32 = 2.0**-53, 2.0**-32
 
 
 def words_of(seed: int) -> tuple[int, int]:
-    """The two 32-bit words of a 64-bit seed: the key."""
+    """Return the two 32-bit words of a 64-bit seed: the key."""
     return seed & _MASK32, (seed >> 32) & _MASK32
 
 
 def philox4x32(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> list[Any]:
-    """Four 32-bit words (int64) of the block (pixel, stream, index) under ``key``; at least one is a tensor."""
+    """Return four 32-bit words (int64) of the block (pixel, stream, index) under ``key``; at least one is a tensor."""
     c0, c1, c2, c3 = pixel & _MASK32, stream, index & _MASK32, (index >> 32) & _MASK32
     k0, k1 = key
     for turn in range(10):
@@ -167,15 +166,15 @@ def philox4x32(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> lis
 
 
 def uniform2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[Tensor, Tensor]:
-    """Two independent uniforms in (0, 1), float64."""
+    """Return two independent uniforms in (0, 1), float64."""
     w0, w1, w2, w3 = philox4x32(key, pixel, stream, index)
-    # The upper 53 of 64 bits, and a half: neither 0 nor 1 comes out.
+    # The upper 53 of 64 bits, and a half: 0 and 1 cannot occur.
     u, v = (((high << 32) | low) >> 11 & _MASK53 for low, high in ((w0, w1), (w2, w3)))
     return (u.to(torch.float64) + 0.5) * _ULP53, (v.to(torch.float64) + 0.5) * _ULP53
 
 
 def normal2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[Tensor, Tensor]:
-    """Two independent standard normals (Box-Muller), float64."""
+    """Return two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(key, pixel, stream, index)
     radius = sqrt(log_f64(u) * -2.0)
     c, s = cos_sin_turn(v)
@@ -183,7 +182,7 @@ def normal2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[
 
 
 def rough_normal(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> Tensor:
-    """Mean 0, variance 1, near normal: the sum of four uniforms, float64."""
+    """Return a nearly normal value of mean 0 and variance 1: the sum of four uniforms, float64."""
     w0, w1, w2, w3 = philox4x32(key, pixel, stream, index)
     # Mean 2 and variance 1/3, shifted and scaled as in events.philox.rough_normal.
     total = (w0 + w1 + w2 + w3).to(torch.float64)

@@ -1,9 +1,9 @@
-"""What the emulators on tensors share: frames and times in, checks, the order of events, reset, saving.
+"""Base of the emulators on tensors: frames and times in, checks, the order of events, reset, saving.
 
-A step has two halves. The first looks at every pixel: it computes the signal and how far it lies beyond the pixel's
-levels, into memory of its own. Then the host reads a few numbers in one transfer: whether every intensity can be used,
-how many pixels fire, how many events they have. Only after that does the second half work on the pixels that fire and
-change the state, so a frame that is refused leaves every environment as it was.
+A step has two halves. The first processes every pixel: it computes the signal and how far it lies beyond the pixel's
+levels, into separate memory. Then the host reads a few numbers in one transfer: whether every intensity is valid, how
+many pixels fire, how many events they have. Only then does the second half process the firing pixels and change the
+state, so a refused frame leaves every environment unchanged.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from blinkgl.types.events import Events
 
 _RADIX_BITS = 16
 _CHUNK = {"cpu": 2**18}
-"""Pixels that the first half takes in one go: on a processor they stay in the second-level cache; elsewhere 2^24 keep
-the scratch memory small beside the state of many environments."""
+"""Pixels per piece of the first half: on a CPU they fit the second-level cache; elsewhere 2^24 keep the scratch memory
+small compared with the state of many environments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class TensorEvents:
         return len(self.t)
 
     def numpy(self) -> list[Events]:
-        """The events of each environment in this process's memory (one transfer)."""
+        """Return the events of each environment in this process's memory (one transfer)."""
         starts = self.starts.tolist()
         x, y = (one.cpu().numpy().astype(np.uint16) for one in (self.x, self.y))
         t, p = self.t.cpu().numpy(), self.p.cpu().numpy()
@@ -79,21 +79,21 @@ class Interval:
 
     @property
     def longest_ns(self) -> int:
-        """The longest interval."""
+        """Return the longest interval."""
         return max(int((self.end_ns - self.start_ns).max()), 1)
 
     @property
     def lengths_ns(self) -> list[int]:
-        """Of each environment."""
+        """Return the length for each environment."""
         return np.maximum(self.end_ns - self.start_ns, 1).tolist()
 
     def of(self, value: Any, env: Tensor) -> Any:
-        """``value``, one of the times, for elements of these environments."""
+        """Return ``value``, one of the times, for elements of these environments."""
         return value[env] if isinstance(value, Tensor) else value
 
 
 class Found(NamedTuple):
-    """Events that are not in their order yet, (N,) int64.
+    """Events that are not in order yet, (N,) int64.
 
     word : pixel number over all environments, and the polarity in the lowest bit.
     after_us : microseconds after the environment's base."""
@@ -103,12 +103,12 @@ class Found(NamedTuple):
 
 
 def stable_order(keys: Sequence[tuple[Tensor, int]]) -> Tensor:
-    """Indices that sort by the keys, the first one first; equal elements keep their order.
+    """Return indices that sort by the keys, the first one first; equal elements keep their order.
 
-    keys : (N,) int64 >= 0, with the number of bits that they take."""
+    keys : (N,) int64 >= 0, with their numbers of bits."""
     order: Any = None
     for key, bits in reversed(keys):
-        # On a card torch's own sort is fast, and stable as well.
+        # On a GPU torch's own sort is fast and stable.
         if key.device.type != "cpu":
             fresh = torch.sort(key if order is None else key[order], stable=True).indices
             order = fresh if order is None else order[fresh]
@@ -126,7 +126,8 @@ def stable_order(keys: Sequence[tuple[Tensor, int]]) -> Tensor:
 
 
 def places(flags: Tensor) -> Tensor:
-    """Indices of the elements >= 0 of a flat int32 or float32 tensor, ascending; the host learns how many there are."""
+    """Return indices of the elements >= 0 of a flat int32 or float32 tensor, ascending; this synchronises with the
+    host."""
     # NumPy's comparison and search take a quarter of torch's time.
     if flags.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(flags.numpy() >= 0))
@@ -158,23 +159,23 @@ class Batch(ABC):
         self.device = torch.empty(0, device=device).device  # with its number, as tensors say it
         self.seed = int(seed) & (2**64 - 1)
         self.seeds = tuple((self.seed + k) & (2**64 - 1) for k in range(self.envs))
-        """Of each environment: that of the single emulator that it equals."""
+        """Seed of each environment: that of the single emulator that it equals."""
         self._pixels = self.height * self.width
         self._keys = torch.tensor([words_of(s) for s in self.seeds], dtype=torch.int64, device=self.device)
         self._clock = np.zeros((self.envs, 4), np.int64)  # started, t_ns, frames, start of the leak clock (V2E)
         self.saturated = torch.zeros(self.envs, dtype=torch.int64, device=self.device)
-        """(environments,) events cut by ``max_events_per_step`` so far."""
+        """Events cut by ``max_events_per_step`` so far, (environments,)."""
 
     # -- for users -----------------------------------------------------------------------------------------------
     @torch.no_grad()
     def step(self, frames: Tensor, t_ns: int | Sequence[int] | np.ndarray | Tensor) -> TensorEvents:
-        """The events of every environment since its last frame; none for an environment's first frame.
+        """Return the events of every environment since its last frame; none for an environment's first frame.
 
         frames : (environments, H, W) float32 linear luminance on :attr:`device`, finite, 0 to 2^30.
         t_ns : of these frames, an integer for all environments or (environments,) of them on the host, increasing in
         each environment by at most 17 minutes.
-        Raises EventDataError that names the environment, and the pixel where it is an intensity; no environment has
-        then changed. Gradients do not flow through events: frames are detached."""
+        Raises EventDataError that names the environment, and the pixel of an invalid intensity; no environment has then
+        changed. Gradients do not flow through events: frames are detached."""
         flat = self._checked(frames)
         interval = self._interval(t_ns)
         events = self._advance(flat, interval)
@@ -184,9 +185,10 @@ class Batch(ABC):
         return events
 
     def reset(self, mask: Any = None) -> None:
-        """The environments of ``mask`` ((environments,) bool; None: all) begin anew with their next frame, at any time.
+        """Reset the environments of ``mask`` ((environments,) bool; None: all), which restart with their next frame, at
+        any time.
 
-        What is frozen in a sensor (thresholds, leaks, seeds) stays. A mask on a card is brought to the host."""
+        Constant properties of a sensor (thresholds, leaks, seeds) stay. A mask on a GPU is copied to the host."""
         mask = np.ones(self.envs, bool) if mask is None else torch.as_tensor(mask).cpu().numpy()
         if mask.shape != (self.envs,) or mask.dtype != bool:
             raise EventDataError(
@@ -201,14 +203,14 @@ class Batch(ABC):
             self._forget(int(k))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything the future depends on besides configuration and seed: copies of tensors."""
+        """Return all state besides configuration and seed: copies of tensors."""
         state = {name: getattr(self, name).clone() for name in (*self._state, "saturated")}
         return {"clock": torch.from_numpy(self._clock.copy()), **state}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore :meth:`state_dict`'s result into one of the same size, configuration, seed and environments.
+        """Restore the result of :meth:`state_dict` in a batch of the same size, configuration, seed and environments.
 
-        Raises EventDataError: it is of another; nothing has then changed."""
+        Raises EventDataError: it belongs to another; nothing has then changed."""
         mine = {"clock": torch.from_numpy(self._clock), **{k: getattr(self, k) for k in (*self._state, "saturated")}}
         fits = set(state) == set(mine) and all(
             state[k].shape == v.shape and state[k].dtype == v.dtype for k, v in mine.items()
@@ -222,7 +224,7 @@ class Batch(ABC):
 
     # -- checks --------------------------------------------------------------------------------------------------
     def _checked(self, frames: Tensor) -> Tensor:
-        """(environments * H * W,) of the frames. What needs a look at the numbers comes with the first half."""
+        """Return the frames, (environments * H * W,). Checks of values are part of the first half."""
         wanted = (self.envs, self.height, self.width)
         if not isinstance(frames, Tensor) or tuple(frames.shape) != wanted or frames.dtype != torch.float32:
             value = (str(frames.dtype), tuple(frames.shape)) if hasattr(frames, "dtype") else type(frames).__name__
@@ -235,10 +237,10 @@ class Batch(ABC):
         return frames.detach().reshape(-1)
 
     def _interval(self, t_ns: Any) -> Interval:
-        """Return the interval of the step to ``t_ns``. Raises EventDataError naming the first environment whose time
-        cannot be."""
+        """Return the interval of the step to ``t_ns``. Raises EventDataError naming the first environment with an
+        invalid time."""
         try:
-            # An integer, or one per environment; a tensor on a card is brought to the host.
+            # An integer, or one per environment; a tensor on a GPU is copied to the host.
             times = np.asarray(t_ns.cpu() if isinstance(t_ns, Tensor) else t_ns)
             if times.dtype.kind not in "iu" or times.shape not in ((), (self.envs,)):
                 raise ValueError
@@ -258,7 +260,7 @@ class Batch(ABC):
                 value=f"{times[k]} ns",
                 accepted=f"more than {before[k]} ns" if started[k] else "less than 2^61 ns",
             )
-        # No division by an interval that does not exist.
+        # Avoids a division by an interval that does not exist.
         length = np.where(started, times - before, 1)
 
         def given(values: np.ndarray) -> Any:
@@ -269,13 +271,13 @@ class Batch(ABC):
         return Interval(given(before), given(length), given(before // 1000), fresh, before, times)
 
     def _refuse(self, flat: Tensor, lowest: int, highest: int) -> None:
-        """Raises EventDataError for intensities whose bits, read as integers, reach from ``lowest`` to ``highest``.
+        """Raise EventDataError for intensities whose bits, read as integers, range from ``lowest`` to ``highest``.
 
-        Negative numbers have negative bits; infinities and NaN lie above the largest number, so two extremes of a
-        frame check all of it. Only -0.0 looks wrong and is not."""
+        Negative numbers have negative bits; infinities and NaN are above the largest number, so two extremes of a frame
+        check all of it. Only -0.0 seems wrong and is valid."""
         if lowest >= 0 and highest <= int(INTENSITY_LIMIT_BITS):
             return
-        # Which pixel it is matters only when there is an error.
+        # The pixel is searched only for the error.
         bad = torch.nonzero(~((flat >= 0) & (flat <= LOG_MAX_INPUT))).view(-1)
         if len(bad):
             k, pixel = divmod(int(bad[0]), self._pixels)
@@ -301,11 +303,10 @@ class Batch(ABC):
         return torch.div(flat, self._pixels, rounding_mode="trunc") if self.envs > 1 else torch.zeros_like(flat)
 
     def _events(self, interval: Interval, found: Found, cause: Tensor | None, waves: bool) -> TensorEvents:
-        """Return the sorted columns of events that lie pixel by pixel, or wave by wave with each wave in raster
-        order.
+        """Return the sorted columns of events given pixel by pixel, or wave by wave with each wave in raster order.
 
-        waves : events of one pixel are not beside each other yet."""
-        # Sorted by environment, then time; without environments to tell apart that key is left out.
+        waves : events of one pixel are not adjacent yet."""
+        # Sorted by environment, then time; with one environment that key is left out.
         env = self._env_of(found.word >> 1) if self.envs > 1 else None
         keys = [(found.after_us, (interval.longest_ns // 1000 + 1).bit_length())]
         if env is not None:
@@ -341,13 +342,13 @@ class Batch(ABC):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is made of events where they lie: voxel grids, counts, times of last events, for each environment.
+# Grids of events, computed on their device for each environment: voxel grids, counts, times of last events.
 #
-# Nothing here is differentiable: grids are made of events, and whether there is an event does not depend smoothly on
-# the frames. None of these functions synchronises with the host.
+# Nothing here is differentiable: whether there is an event does not depend smoothly on the frames. None of these
+# functions synchronises with the host.
 
 NEVER_US = NEVER_NS // 1000
-"""Time of the last event of a pixel that had none."""
+"""Time of the last event of a pixel without events."""
 
 
 def _cells(events: TensorEvents, channel: Tensor, channels: int) -> Tensor:
@@ -357,12 +358,12 @@ def _cells(events: TensorEvents, channel: Tensor, channels: int) -> Tensor:
 
 
 def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tensor:
-    """(environments, bins, H, W) float32: polarities (+1, -1), each shared between the two bins beside
-    (bins - 1) (t - t0) / (t1 - t0); events outside [t0, t1] count as nothing.
+    """Return (environments, bins, H, W) float32: polarities (+1, -1), each divided between the two bins next to (bins -
+    1) (t - t0) / (t1 - t0); events outside [t0, t1] are ignored.
 
-    t0_us, t1_us : microseconds, one for all environments or (environments,) int64 tensors on the events' device.
-    On a processor the numbers are those of :func:`blinkgl.events.grids.voxel_grid`, bit for bit; on a card sums are
-    made in any order, so they agree to float32's rounding. Source: Zhu et al., CVPR 2019, section 3.1."""
+    t0_us, t1_us : microseconds, one for all environments or (environments,) int64 tensors on the events' device. On a
+    CPU the numbers are those of :func:`blinkgl.events.grids.voxel_grid`, bit for bit; on a GPU sums are in any order,
+    so they agree to float32's rounding. Source: Zhu et al., CVPR 2019, section 3.1."""
     # The kernel max(0, 1 - |place - bin|) of Zhu et al. touches two bins.
     envs, height, width = events.shape
     env = events.env.to(torch.int64)
@@ -375,7 +376,7 @@ def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tenso
     weight = (place - lower).to(torch.float32)
     inside = (events.t >= start) & (events.t <= end)
     sign = torch.where(events.p > 0, 1.0, -1.0) * inside
-    # Both shares of an event side by side: a cell then adds them up in the order of events, as the numba loop does.
+    # Both shares of an event are adjacent: a cell then adds them in the order of events, as the numba loop does.
     first, second = _cells(events, lower, bins), _cells(events, (lower + 1).clamp(max=last), bins)
     shares = torch.stack((sign * (1.0 - weight), torch.where(lower < last, sign * weight, 0.0)), 1)
     grid = torch.zeros(envs * bins * height * width, device=events.t.device)
@@ -384,7 +385,8 @@ def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tenso
 
 
 def event_counts(events: TensorEvents) -> Tensor:
-    """(environments, 2, H, W) int32: OFF events in channel 0, ON events in channel 1. The same on every device."""
+    """Return (environments, 2, H, W) int32: OFF events in channel 0, ON events in channel 1. The same on every
+    device."""
     envs, height, width = events.shape
     counts = torch.zeros(envs * 2 * height * width, dtype=torch.int32, device=events.t.device)
     counts.index_add_(0, _cells(events, events.p.to(torch.int64), 2), torch.ones_like(events.x))
@@ -392,8 +394,8 @@ def event_counts(events: TensorEvents) -> Tensor:
 
 
 def latest_times(events: TensorEvents, before: Tensor | None = None) -> Tensor:
-    """(environments, 2, H, W) int64 microseconds: when each pixel had its last OFF and ON event, :data:`NEVER_US` where
-    it had none. The same on every device.   before : the result for the events so far."""
+    """Return the time of each pixel's last OFF and ON event, (environments, 2, H, W) int64 microseconds,
+    :data:`NEVER_US` where it had none. The same on every device.   before : the result for the events so far."""
     envs, height, width = events.shape
     shape = (envs, 2, height, width)
     start = torch.full(shape, NEVER_US, dtype=torch.int64, device=events.t.device) if before is None else before
@@ -403,7 +405,7 @@ def latest_times(events: TensorEvents, before: Tensor | None = None) -> Tensor:
 
 
 def time_surface(latest: Tensor, t_us: Any, tau_us: float) -> Tensor:
-    """exp(-(t - latest) / tau), float32 of the shape of ``latest``; 0 where a pixel had no event.
+    """Return exp(-(t - latest) / tau), float32 of the shape of ``latest``; 0 where a pixel had no event.
 
     latest : of :func:`latest_times`.   t_us : now, one or (environments,).   Source: Lagorce et al., TPAMI 2017."""
     now = t_us.view(-1, 1, 1, 1) if isinstance(t_us, Tensor) else t_us

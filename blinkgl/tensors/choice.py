@@ -1,4 +1,4 @@
-"""Where events are made: ``events.device: cpu | cuda | auto``. torch is imported where a card is asked for."""
+"""The device of events: ``events.device: cpu | cuda | auto``. torch is imported only where a GPU is requested."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def make_on_device(
     seed: int = 0,
     gl: GLContext | None = None,
 ) -> Emulator:
-    """Return the emulator that a configuration asks for, on the device that it asks for.
+    """Return the emulator of a configuration, on its device.
 
-    gl : context that draws the frames; ``auto`` is the card where one draws them, its events are the processor's in a
-    short trial, and it makes what is asked for.
-    Raises EventDataError: ``events.device: cuda`` for what torch does not make, or without a card."""
+    gl : context that draws the frames; ``auto`` is the GPU where one draws them, it supports the configuration, and its
+    events equal the CPU's in a short trial.
+    Raises EventDataError: ``events.device: cuda`` for an unsupported configuration, or without a GPU."""
     device = getattr(config, "device", "cpu")
     if device == "cpu" or (device == "auto" and (gl is None or gl.is_software)):
         return make_emulator(config, height, width, seed)

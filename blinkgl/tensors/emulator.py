@@ -1,7 +1,7 @@
-"""``events.device: cuda``: ESIM and V2E on a card behind the interface that every other emulator has.
+"""``events.device: cuda``: ESIM and V2E on a GPU with the interface of the other emulators.
 
-A batch of one environment makes the events; checks, saving and restoring stay those of the emulator on the processor,
-so a state that was saved by one goes on in the other, and files are the same.
+A batch of one environment makes the events; checks, saving and restoring are those of the CPU emulator, so that a saved
+state of one continues in the other, and files are the same.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from blinkgl.tensors.v2e import TensorV2e
 from blinkgl.types.events import Events
 
 DEVICE = "cuda"
-"""What ``events.device: cuda`` means to torch; tests, which have no card, say "cpu"."""
+"""torch's device for ``events.device: cuda``; tests without a GPU set "cpu"."""
 _trials: dict[tuple[str, str], bool] = {}
 
 
 class _OnDevice(Emulator):
-    """What a class mixes in before the emulator whose events it makes."""
+    """Mix-in for a class before the emulator whose events it makes."""
 
     device = "cuda"
     _batch_kind: ClassVar[Any]
@@ -38,13 +38,13 @@ class _OnDevice(Emulator):
         self.tensor_device = self._batch.device
 
     def step(self, luminance: Any, t_ns: int, rows: Any = None) -> Events:
-        # Arrays take the checks of the emulator on the processor, which then calls _start or _advance.
+        # Arrays are checked by the CPU emulator, which then calls _start or _advance.
         if not isinstance(luminance, Tensor):
             return super().step(luminance, t_ns, rows)
-        # A frame that lies on the device: the batch checks it there.
+        # A frame on the device: the batch checks it there.
         t_ns = self._checked_time(t_ns)
         events = self._made(luminance[None] if luminance.ndim == 2 else luminance, t_ns)
-        # Rows that changed are not known of a frame on the device.
+        # The changed rows of a frame on the device are not known.
         self.t_ns, self._rows_before = t_ns, None
         self.frames += 1
         return events
@@ -52,7 +52,7 @@ class _OnDevice(Emulator):
     def _made(self, frames: Tensor, t_ns: int) -> Events:
         try:
             events = self._batch.step(frames, t_ns).numpy()[0]
-        except EventDataError as error:  # there is one environment, and nobody has numbered it
+        except EventDataError as error:  # there is only one environment, so its number is left out
             where = (error.where or "").replace("environment 0, ", "") or None
             alone = EventDataError(error.problem, where=where, value=error.value, accepted=error.accepted)
             alone.pixel = error.pixel
@@ -71,11 +71,11 @@ class _OnDevice(Emulator):
         return self._of_array(frame, t_ns)
 
     def decoded(self, frame: Any) -> Any:
-        """As :meth:`Emulator.decoded`; of a tensor, the tensor."""
+        """Return the decoded frame as :meth:`Emulator.decoded`; a tensor unchanged."""
         return frame if isinstance(frame, Tensor) else super().decoded(frame)
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """That of the emulator on the processor."""
+        """Return the state of the CPU emulator."""
         there = self._batch.state_dict()
         # The batch keeps V2e's leak clock in another form.
         epoch = {"_epoch_ns": there["clock"][:, 3]}
@@ -106,14 +106,14 @@ class DeviceEsim(_OnDevice, Esim):
 
 
 class DeviceV2e(_OnDevice, V2e):
-    """:class:`~blinkgl.events.v2e.V2e` on a torch device. A step of which the processor would cut events, by
-    ``max_events_per_step``, raises EventDataError: files must be the same either way."""
+    """:class:`~blinkgl.events.v2e.V2e` on a torch device. A step in which the CPU would cut events by
+    ``max_events_per_step`` raises EventDataError, because files must be the same on both."""
 
     _batch_kind = TensorV2e
 
     def _made(self, frames: Tensor, t_ns: int) -> Events:
         events = super()._made(frames, t_ns)
-        # The processor's limit is dealt out to blocks of pixels, see Emulator._run.
+        # The CPU's limit is divided among blocks of pixels, see Emulator._run.
         share = max(BLOCK, self.config.max_events_per_step // -(-self.height * self.width // BLOCK))
         if len(events) > share:
             pixels = events.y.astype(np.int64) * self.width + events.x
@@ -128,13 +128,13 @@ class DeviceV2e(_OnDevice, V2e):
 
 
 KINDS: dict[Any, type[_OnDevice]] = {Esim: DeviceEsim, V2e: DeviceV2e}
-"""The classes for a device, by those for the processor."""
+"""Classes for a device, by those for the CPU."""
 
 
 def emulator_on(kind: Any, config: Any, height: int, width: int, seed: int) -> Emulator:
-    """The emulator ``kind`` on :data:`DEVICE`; for ``events.device: auto`` that on the processor where it does not go.
+    """Return the emulator ``kind`` on :data:`DEVICE`; for ``events.device: auto`` the CPU's where it is not supported.
 
-    Raises EventDataError, naming the key, where the card is asked for and cannot do it."""
+    Raises EventDataError, naming the key, where the GPU is requested and cannot do it."""
     problem = _problem(kind, config, DEVICE)
     if problem is None:
         return KINDS[kind](height, width, config, seed, DEVICE)
@@ -144,7 +144,7 @@ def emulator_on(kind: Any, config: Any, height: int, width: int, seed: int) -> E
 
 
 def _problem(kind: Any, config: Any, device: Any) -> EventDataError | None:
-    """Why this device does not make these events; None: it does."""
+    """Return why this device cannot make these events; None: it can."""
     if kind not in KINDS:
         return EventDataError(
             "not computed on tensors", where="events.device", value=config.device, accepted="cpu, or auto"
@@ -164,15 +164,15 @@ def _problem(kind: Any, config: Any, device: Any) -> EventDataError | None:
 
 
 def same_events(kind: Any, config: Any, device: Any) -> bool:
-    """Whether a short clip, 32 x 64 pixels and three intervals, has the same events on a device as on the processor.
-    Asked once per configuration, device and process."""
-    # The trial's few pixels are not to be cut: the limit is compared with each step.
+    """Return whether a short clip, 32 x 64 pixels and three intervals, has the same events on a device as on the CPU.
+    Tested once per configuration, device and process."""
+    # The trial's few pixels must not be cut: the limit is compared with each step.
     limit = type(config).model_fields["max_events_per_step"].default
     config = config.model_copy(update={"max_events_per_step": limit})
-    # The trial's result is kept for the process: a card does not change in between.
+    # The trial's result is kept for the process: a GPU does not change meanwhile.
     key = (str(device), config.model_dump_json())
     if key not in _trials:
-        # Noise fires pixels of both polarities; 1_000_003 ns is no whole number of microseconds.
+        # Noise fires pixels of both polarities; 1_000_003 ns is not a whole number of microseconds.
         rng = np.random.default_rng(1)
         clip = np.exp(rng.normal(-1, 0.5, (4, 32, 64))).astype(np.float32)
         both = KINDS[kind](32, 64, config, 1, device), kind(32, 64, config, 1)

@@ -1,10 +1,10 @@
 """ESIM on tensors: the events of :class:`blinkgl.events.esim.Esim`, bit for bit, for many environments.
 
 The model is that of :mod:`blinkgl.events.esim` (Rebecq et al., CoRL 2018, section 3): logarithms and levels are
-integers of 2^-25, times are in nanoseconds. Between two frames the path is a straight line, so all levels that a pixel
-passes are known at once: the first lies ``whole - gap`` units along a path of ``whole``, and each further one a
-threshold on. Two things have to be walked level by level: a refractory period, which asks for the last event that was
-let through, and jitter, which draws the next thresholds at every level.
+integers in units of 2^-25, times are in nanoseconds. Between two frames the path is a straight line, so all levels that
+a pixel passes are known at once: the first lies ``whole - gap`` units along a path of ``whole``, and each further one a
+threshold farther. Two features need a loop over the levels: a refractory period, which depends on the last event that
+was kept, and jitter, which draws the next thresholds at every level.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from blinkgl.tensors.arith import log_q25_, normal2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, places
 
 _ASLEEP = 2**30 + 2**28
-"""A level that no signal reaches, and whose distance from any signal fits 32 bits: of pixels without a first frame."""
+"""A level that no signal reaches, and whose distance from any signal fits 32 bits: for pixels without a first frame."""
 _LONG_NS = 2**31
 
 
 class Firing(NamedTuple):
-    """The pixels at or beyond a level, (M,) int64 each but for thresholds that all share."""
+    """The pixels at or beyond a level, (M,) int64 each, except shared thresholds."""
 
     flat: Tensor  # pixel number over all environments, ascending
     env: Tensor
     log: Tensor  # log intensity now
-    whole: Tensor  # length of the path from the frame before
+    whole: Tensor  # length of the path from the previous frame
     gap: Tensor  # how far the signal ends beyond the level being passed
     polarity: Tensor
     on: Any  # thresholds of the pixel
@@ -43,8 +43,8 @@ class Firing(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """What the host has to know: events of all pixels and of the busiest one, before any is dropped; how far the
-    farthest signal is beyond its level (negative: none is)."""
+    """Numbers for the host: events of all pixels and of the busiest one, before any is dropped; how far the farthest
+    signal is beyond its level (negative: none is)."""
 
     total: int
     most: int
@@ -52,7 +52,8 @@ class Sizes(NamedTuple):
 
 
 def crossing_ns(part: Tensor, whole: Tensor, dt_ns: Any, longest_ns: int) -> Tensor:
-    """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly: ``crossing_ns`` of blinkgl.events.esim."""
+    """Return floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly: ``crossing_ns`` of
+    blinkgl.events.esim."""
     # Both factors are below 2^31, so the product fits int64.
     if longest_ns < _LONG_NS:
         return torch.div(part * dt_ns, whole, rounding_mode="trunc")
@@ -65,10 +66,10 @@ def crossing_ns(part: Tensor, whole: Tensor, dt_ns: Any, longest_ns: int) -> Ten
 
 
 def _known(flags: Tensor, size: int) -> Tensor:
-    """Indices of the ``size`` set flags, without asking the device how many there are."""
+    """Return indices of the ``size`` set flags, without synchronising to count them."""
     try:
         return torch.nonzero_static(flags, size=size).view(-1)
-    except (NotImplementedError, RuntimeError):  # early versions of torch have it on processors alone
+    except (NotImplementedError, RuntimeError):  # early versions of torch support it only on CPUs
         return torch.nonzero(flags).view(-1)
 
 
@@ -79,11 +80,11 @@ class TensorEsim(Batch):
         events = emulator.step(frames, t_ns)  # frames (8, 480, 640) float32, linear luminance
 
     Environment k makes the events of ``blinkgl.Esim`` with the seed ``seed + k`` (modulo 2^64), bit for bit and in
-    their order. A step synchronises with the host once, to learn how many pixels and events there are; once more where
-    a refractory period or ``max_events_per_step`` drops events, and once a level where thresholds jitter.
+    their order. A step synchronises with the host once, to get the numbers of pixels and events; once more where a
+    refractory period or ``max_events_per_step`` drops events, and once per level where thresholds jitter.
 
-    State: 16 bytes a pixel; 4 more with jitter, 8 with a refractory period, 8 for spread thresholds.
-    Raises EventDataError: a size that does not fit.   Source: Rebecq, Gehrig, Scaramuzza, CoRL 2018, section 3."""
+    State: 16 bytes per pixel; 4 more with jitter, 8 with a refractory period, 8 for spread thresholds. Raises
+    EventDataError: a size that does not fit.   Source: Rebecq, Gehrig, Scaramuzza, CoRL 2018, section 3."""
 
     def __init__(
         self,
@@ -109,14 +110,13 @@ class TensorEsim(Batch):
             self._on, self._off = zeros(torch.int32), zeros(torch.int32)
             smallest = min(self._draw(k, on, off) for k in range(self.envs))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
-        # With jitter every event may draw the floor, which bounds the number of events.
+        # With jitter every event may draw the smallest threshold, which bounds the number of events.
         self._jitter = config.threshold_jitter * Q_ONE
         if self._jitter:
             smallest = min(self._floor_on, self._floor_off)
         self._inverse_threshold = 1.0 / smallest
         self._refractory_ns = round(config.refractory_us * 1000)
-        # Each block of 1024 pixels may have its share of max_events_per_step, at least one event a
-        # pixel.
+        # Each block of 1024 pixels has its share of max_events_per_step, at least one event per pixel.
         self._share = max(BLOCK, config.max_events_per_step // -(-self._pixels // BLOCK))
         self._log, self._upper, self._lower = (zeros(torch.int32) for _ in range(3))
         # Levels out of reach until the environment's first frame.
@@ -197,21 +197,21 @@ class TensorEsim(Batch):
         return torch.stack(extremes)
 
     def _sized(self, flat: Tensor, extremes: Tensor) -> tuple[Firing, Tensor, Sizes]:
-        """Return the pixels that fire, the number of levels that each passes, and what the host has to know of both.
+        """Return the firing pixels, the number of levels that each passes, and the numbers for the host.
 
-        Here the host waits, once. Raises EventDataError: an intensity that cannot be used."""
-        # The host may look as often as it likes, so only pixels that fire are counted.
+        The host waits here, once. Raises EventDataError: an invalid intensity."""
+        # The host may read numbers freely, so only firing pixels are counted.
         if self._host_is_near:
             self._refuse(flat, int(extremes[:, 0].amin()), int(extremes[:, 1].amax()))
             firing = self._gathered(places(self._beyond))
-            # How many levels a pixel passes is known when they are drawn.
+            # The number of levels that a pixel passes is known only when they are drawn.
             if self._jitter:
                 return firing, firing.gap, Sizes(0, 0, int(self._beyond.amax()))
             # Levels that fit between the first one passed and the signal, and the first one itself.
             counts = torch.div(firing.gap, firing.step, rounding_mode="trunc") + 1
             most = int(counts.amax()) if len(counts) else 0
             return firing, counts, Sizes(int(counts.sum()), most, int(self._beyond.amax()))
-        # Elsewhere every pixel is counted, in order that all numbers come in one transfer.
+        # Otherwise every pixel is counted, so that all numbers come in one transfer.
         active = self._beyond >= 0
         step = self._on if self._same_steps else torch.where(self._now >= self._upper, self._on, self._off)
         levels = torch.where(active, torch.div(self._beyond, step, rounding_mode="trunc") + 1, 0)
@@ -229,8 +229,8 @@ class TensorEsim(Batch):
         return BLOCK * (int(max(farthest, 0) * self._inverse_threshold) + 2) > self._share
 
     def _caps(self, v: Interval, f: Firing) -> Tensor:
-        """Return the largest number of events of each pixel that fires, (M,) int64, as the kernel of the single
-        emulator shares them out among the pixels that fire of a block of 1024."""
+        """Return the largest number of events of each firing pixel, (M,) int64, shared as in the single emulator's
+        kernel among the firing pixels of a block of 1024."""
         blocks = -(-self._pixels // BLOCK)
         # Padded to whole blocks; -1 is a pixel that does not fire.
         beyond = torch.full((self.envs, blocks * BLOCK), -1, dtype=torch.int32, device=self.device)
@@ -295,13 +295,13 @@ class TensorEsim(Batch):
             return found
         if sizes.most <= 1:
             first = owner = torch.arange(len(word), device=self.device)
-        # Some events may be lost from here on.
+        # Some events may be dropped from here on.
         keep = torch.ones(len(word), dtype=torch.bool, device=self.device)
         if self._refractory_ns:
             keep = self._awake(f, counts, first, sizes.most, after + 1000 * v.of(v.base_us, env))
         if cap is not None:
             let = keep.to(torch.int64)
-            # rank: events of the same pixel that were let through before this one.
+            # rank: kept events of the same pixel before this one.
             before = let.cumsum(0) - let
             rank = before - before.index_select(0, first.index_select(0, owner))
             within = rank < cap.index_select(0, owner)
@@ -310,11 +310,11 @@ class TensorEsim(Batch):
         return Found(*(one[keep] for one in found))
 
     def _awake(self, f: Firing, counts: Tensor, first: Tensor, most: int, t_ns: Tensor) -> Tensor:
-        """Return which events come after their pixel's refractory period, (N,) bool; the others are lost.
+        """Return which events come after their pixel's refractory period, (N,) bool; the others are dropped.
 
-        first : each pixel's first event.   t_ns : of all events, pixel by pixel. One turn a level, over all pixels: no
-        size depends on what is lost."""
-        # Levels passed are walked together over all pixels, j-th with j-th.
+        first : each pixel's first event.   t_ns : of all events, pixel by pixel. One iteration per level, over all
+        pixels, so that no size depends on the dropped events."""
+        # The j-th levels of all pixels are processed together.
         last = self._last_ns.index_select(0, f.flat)
         # The additional last element takes the writes of pixels without a j-th level.
         keep = torch.zeros(len(t_ns) + 1, dtype=torch.bool, device=self.device)
@@ -329,13 +329,13 @@ class TensorEsim(Batch):
         return keep[:-1]
 
     def _walk(self, f: Firing, v: Interval, cap: Tensor | None) -> Found:
-        """Do :meth:`_at_once` level by level, with thresholds drawn anew at each."""
+        """Return the result of :meth:`_at_once` level by level, with new thresholds at each."""
         slots = torch.arange(len(f.flat), device=self.device)
         gap, fired = f.gap.clone(), self._fired.index_select(0, f.flat).to(torch.int64)
         up, down, emitted = torch.zeros_like(gap), torch.zeros_like(gap), torch.zeros_like(gap)
         last = self._last_ns.index_select(0, f.flat) if self._refractory_ns else gap
         found: list[Found] = []
-        # One turn per level; pixels that pass no further one drop out.
+        # One iteration per level; pixels without a further one drop out.
         while len(slots):
             flat, env, whole = (one.index_select(0, slots) for one in (f.flat, f.env, f.whole))
             here, polarity = gap.index_select(0, slots), f.polarity.index_select(0, slots)

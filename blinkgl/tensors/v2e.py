@@ -1,11 +1,11 @@
 """V2E on tensors: the events of :class:`blinkgl.events.v2e.V2e`, bit for bit, for many environments.
 
 The model is that of :mod:`blinkgl.events.v2e` (Hu, Liu, Delbruck, CVPRW 2021): a lin-log photoreceptor of finite
-bandwidth, thresholds spread over the pixels, leak, shot noise, photoreceptor noise, dead time. Its first half runs the
-photoreceptors of all pixels in float32; :mod:`blinkgl.tensors.waves` makes the events of those that fire.
+bandwidth, thresholds spread over the pixels, leak, shot noise, photoreceptor noise, dead time. Its first half computes
+the photoreceptors of all pixels in float32; :mod:`blinkgl.tensors.waves` makes the events of those that fire.
 
-The state before a first frame (leak and noise of a scene that has been watched for long) is drawn by the numba
-emulator on the host, once for each environment that begins, and then copied to the device.
+The state before a first frame (leak and noise after a long time in front of a scene) is drawn by the numba emulator on
+the host, once for each environment that begins, and then copied to the device.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ _INF = float("inf")
 
 
 def lin_log(intensity: Tensor) -> Tensor:
-    """ln(I) above 20 DN, the chord from the origin below; float32. See ``v2e_model.lin_log``."""
+    """Return ln(I) above 20 DN, the chord from the origin below; float32. See ``v2e_model.lin_log``."""
     # torch.where computes both sides, so the logarithm's argument is clamped to its range.
     dim = torch.where(intensity < _DARK, 0.0, intensity * _SLOPE)
     return torch.where(intensity <= 20.0, dim, log_f32(intensity.clamp(min=20.0)))
 
 
 def settled(lag: Tensor) -> Tensor:
-    """A lag, 0 where it is over: nothing subnormal comes up."""
+    """Return a lag, 0 where it is over, which avoids subnormal numbers."""
     return torch.where(lag.abs() < _SETTLED, 0.0, lag)
 
 
 def decay(k: Tensor) -> tuple[Tensor, Tensor]:
-    """(e^-k, (1 - e^-k)/k), float32, k >= 0. See ``v2e_model.decay``."""
+    """Return (e^-k, (1 - e^-k)/k), float32, k >= 0. See ``v2e_model.decay``."""
     small, large = k.clamp(max=0.5), k.clamp(min=0.5)
     # Taylor series below k = 1/2, the exponential above.
     p, e = horner(small, _GROWTH), exp_f32(-large)
@@ -62,10 +62,10 @@ def decay(k: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Numbers(NamedTuple):
-    """Of a step: one number where all environments have the same, else a tensor.
+    """Values of a step: one number where all environments have the same, else a tensor.
 
-    step : (environments,) where it is a tensor.   kappa_32, since_32 : float32, columns
-    (environments, 1) likewise.   lengths_ns : of the intervals."""
+    step : (environments,) where it is a tensor.   kappa_32, since_32 : float32, columns (environments, 1) likewise.
+    lengths_ns : of the intervals."""
 
     step: Step
     kappa_32: Any
@@ -77,10 +77,9 @@ class TensorV2e(Batch):
     """V2E of ``envs`` environments of one size and configuration on ``device``; used as :class:`TensorEsim`.
 
     Environment k makes the events of ``blinkgl.V2e`` with the seed ``seed + k`` (modulo 2^64), bit for bit and in their
-    order, its noise included, with two limits: ``max_events_per_step`` cuts nothing,
-    and the first frame of an environment goes through the host (0.1 to 1 s at 640x480). A step synchronises with the
-    host once for the checks, once a wave of events, and, with shot noise, once for each candidate of the busiest block
-    of 1024 pixels.
+    order, noise included, with two limits: ``max_events_per_step`` cuts nothing, and the first frame of an environment
+    is processed on the host (0.1 to 1 s at 640x480). A step synchronises with the host once for the checks, once per
+    wave of events, and, with shot noise, once for each candidate of the busiest block of 1024 pixels.
 
     Raises EventDataError: a size that does not fit.   Source: Hu, Liu, Delbruck, CVPRW 2021."""
 
@@ -163,14 +162,14 @@ class TensorV2e(Batch):
         self._state = tuple(name for name, (_, _, there) in wanted.items() if there)
 
     def _draw(self, k: int, c: V2eConfig) -> None:
-        """Draws what is frozen in the sensor of environment k."""
+        """Draw the constant properties of environment k's sensor."""
         seed, size = np.uint64(self.seeds[k]), (self.height, self.width)
         theta = c.contrast_threshold, c.contrast_threshold_off or c.contrast_threshold
         on, off = (one.astype(np.float32) for one in draw_thresholds(*size, *theta, c.threshold_sigma, seed))
         leak = model.draw_leaks(*size, c, on, seed)
         drawn = {"_on": on, "_off": off, "_mean_leak": leak}
         if leak.size and leak.max() > 0:
-            # The leak clock starts anew when the median pixel has leaked REBASE.
+            # The leak clock restarts when the median pixel has leaked REBASE.
             self._rebase_ns[k] = int(model.REBASE / float(np.median(leak[leak > 0])) * 1e9)
         if c.causes:
             drawn["_hot"] = model.draw_hot(*size, c, seed)
@@ -180,7 +179,7 @@ class TensorV2e(Batch):
         self._take(k, drawn)
 
     def _take(self, k: int, arrays: dict[str, np.ndarray]) -> None:
-        """Copies arrays to environment k's part of the tensors of their names."""
+        """Copy arrays to environment k's part of the tensors of their names."""
         for name, array in arrays.items():
             if array.size:
                 getattr(self, name).view(self.envs, -1)[k] = torch.from_numpy(array.reshape(-1))
@@ -206,7 +205,7 @@ class TensorV2e(Batch):
         shots = self._draw_shots(interval, now) if self._shots else None
         rows, step = self._rows(places(self._flagged(beyond, shots)), now, shots, each, interval)
         found = waves(rows, step, self._has, shots, self._put_back)
-        # The second half is done: what the photoreceptors hold becomes the state.
+        # The second half is done: the photoreceptors' values become the state.
         for name, value in now.items():
             getattr(self, name).copy_(value.reshape(-1))
         self._rest_leaks(interval, each)
@@ -237,7 +236,7 @@ class TensorV2e(Batch):
         return Numbers(step, column(kappa), column(since), lengths)
 
     def _refuse_noise(self, interval: Interval) -> None:
-        """Raises EventDataError: more shot noise in an interval than a step may emit."""
+        """Raise EventDataError for more shot noise in an interval than a step may emit."""
         lengths = interval.end_ns - interval.start_ns
         for k in np.flatnonzero(self._shots_per_ns * lengths > self.config.max_events_per_step)[:1]:
             raise EventDataError(
@@ -298,11 +297,10 @@ class TensorV2e(Batch):
         return self._sizes[dt_ns]
 
     def _draw_shots(self, interval: Interval, now: dict[str, Tensor]) -> Shots | None:
-        """Draw the shot noise of the interval, None without any. One Poisson clock a block of 1024 pixels, as fast
-        as if all were dark, thinned to what their intensities allow (Lewis and Shedler 1979); moves the clocks."""
+        """Draw the shot noise of the interval, None without any, and move the clocks. One Poisson clock per block of
+        1024 pixels, at the rate of dark pixels, thinned to the rate at their intensities (Lewis and Shedler 1979)."""
         table = self._shot_table.view(-1, 2 * BLOCK)
-        # Every block of every environment has a clock; those that are due move on together, one
-        # candidate a turn.
+        # Every block of every environment has a clock; all due ones advance together, one candidate per turn.
         env = torch.arange(self.envs, device=self.device).repeat_interleave(self._blocks)
         block = torch.arange(self._blocks, device=self.device).repeat(self.envs)
         end_ns = torch.from_numpy(interval.end_ns).to(self.device)[env]
@@ -325,7 +323,7 @@ class TensorV2e(Batch):
             before = self._intensity[flat]
             change = (now["_intensity"].view(-1)[flat] - before).to(torch.float64)
             light = before.to(torch.float64) + change * (after.to(torch.float64) / dt_ns[due])
-            # Thinning from the rate of the dark, see v2e_model.shot_factor.
+            # Thinning from the rate in the dark, see v2e_model.shot_factor.
             factor = 1.0 - ((light + 20.0) / 275.0).clamp(0.0, 1.0) * 0.75
             let = inside & (accept * model.DARKEST < factor)
             found.append((flat[let], after[let], on[let].to(torch.int64)))
@@ -352,7 +350,7 @@ class TensorV2e(Batch):
     def _rows(
         self, flat: Tensor, now: dict[str, Tensor], shots: Shots | None, each: Numbers, v: Interval
     ) -> tuple[Rows, Step]:
-        """Return the rows of the pixels to look at, without those that stay in their dead time, and their times."""
+        """Return the rows of the pixels to process, without those that stay in their dead time, and their times."""
         if self._has.refractory_ns:
             end_ns = torch.from_numpy(v.end_ns).to(self.device)[self._env_of(flat)]
             # A level of -inf marks the dead time; of those only the pixels that are released now take
@@ -385,8 +383,8 @@ class TensorV2e(Batch):
         return r, step
 
     def _put_back(self, r: Rows, v: Step) -> None:
-        """Write levels and other state that a wave has changed back. In a dead time both levels are passed, whatever
-        comes: the pixel is looked at until it is released."""
+        """Write levels and other state changed by a wave back. In a dead time both levels count as passed, so that the
+        pixel is processed until its release."""
         flat, dead = r["flat"], r["dead"]
         self._upper[flat] = torch.where(dead, -_INF, r["up"].to(torch.float32))
         self._lower[flat] = torch.where(dead, _INF, r["down"].to(torch.float32))
@@ -399,12 +397,11 @@ class TensorV2e(Batch):
             self._noise_then[flat] = r["noise_then"].to(torch.float32)
 
     def _rest_leaks(self, interval: Interval, each: Numbers) -> None:
-        """Move what has leaked into the levels where the leak clock has run for long, so that float32 is accurate
-        enough."""
+        """Move the leak into the levels where the leak clock has run for long, so that float32 stays accurate."""
         due = (self._clock[:, 0] == 1) & (interval.end_ns - self._clock[:, 3] >= self._rebase_ns)
         for k in np.flatnonzero(due):
             here = slice(int(k) * self._pixels, (int(k) + 1) * self._pixels)
-            # In float32, as V2e does it, so that the levels get the same bits.
+            # In float32, as in V2e, so that the levels get the same bits.
             gone = self._leak[here] * float(np.float32((int(interval.end_ns[k]) - int(self._clock[k, 3])) * 1e-9))
             self._upper[here] -= gone
             self._lower[here] -= gone

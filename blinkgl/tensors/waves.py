@@ -1,9 +1,9 @@
-"""V2E's events of the pixels that fire, on tensors: their first events together, then their second ones, and so on.
+"""V2E's events of the firing pixels, on tensors: their first events together, then their second ones, and so on.
 
 The sums and products of :mod:`blinkgl.events.v2e_blocks`, in its order, on float64 rows: over an interval a pixel's
 signal is z(s) = c + rise s + fall e^(-k s) for s in [0, 1] (``v2e_model.curve_of``). A wave finds where each pixel's
-signal meets its level, lets shot noise come first where it does, and sets the levels round the new reference; pixels
-that have another event go on into the next wave. How many do is known only then, so the host looks once a wave.
+signal meets its level, lets earlier shot noise come first, and sets the levels around the new reference; pixels with
+another event continue in the next wave. Their number is known only then, so there is one synchronisation per wave.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Shots:
 
 @dataclass(frozen=True)
 class Parts:
-    """Which parts the model has."""
+    """Parts of the model that are on."""
 
     low_pass: bool
     refractory_ns: int
@@ -45,7 +45,7 @@ class Parts:
 
 
 class Step(NamedTuple):
-    """What is the same for all pixels of an environment in a step: a number, or (M,) for the pixels that fire.
+    """Values of a step that are the same for all pixels of an environment: a number, or (M,) for the firing pixels.
 
     t0_ns, dt_ns, dt, since_0, since_1, kappa : of v2e.py's Interval.   start_ns : t0 after the base's microsecond.
     low, high : the seeds' words."""
@@ -61,14 +61,13 @@ class Step(NamedTuple):
     high: Any
 
     def of(self, which: Tensor) -> Step:
-        """For those of the pixels, or for pixels of these environments."""
+        """Return the step for these pixels, or for pixels of these environments."""
         return Step(*(value[which] if isinstance(value, Tensor) else value for value in self))
 
 
 def add_curves(r: Rows, v: Step, has: Parts) -> None:
-    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak move on straight
-    # lines.
-    """c, rise, fall, k, end of the rows' signals, seen from the interval's start (s = 0, e = e^(-k s) = 1)."""
+    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak change linearly.
+    """Compute c, rise, fall, k and end of the rows' signals, from the interval's start (s = 0, e = e^(-k s) = 1)."""
     dx = r["x1"] - r["x0"]
     base, drift = r["x0"] + r["noise"] + r["leak"] * v.since_0, r["shift"] + r["leak"] * v.dt
     r["rise"], r["s"], r["e"] = drift + dx, torch.zeros_like(dx), torch.ones_like(dx)
@@ -93,7 +92,7 @@ def _decayed(r: Rows, s: Tensor, low_pass: bool) -> Tensor:
 
 
 def wake(r: Rows, v: Step, has: Parts, waking: Tensor) -> None:
-    """Levels of the pixels whose dead time ends in the interval, at its end (row ``now``)."""
+    """Set the levels of the pixels whose dead time ends in the interval, at its end (row ``now``)."""
     # The signal at the end of the dead time is the new reference.
     s = r["now"].to(torch.float64) / v.dt_ns
     e = _decayed(r, s, has.low_pass)
@@ -147,11 +146,11 @@ def _meet(r: Rows) -> None:
     v = 1.0 - u
     guess = u * (v * stretch * (v * v_high - u * v_low) + u * (3.0 - u * 2.0))
     s = torch.where((v_low > 0) & (v_high > 0) & (guess > 0.0) & (guess < 1.0), low + width * guess, s)
-    # The signal stands beyond the level to begin with.
+    # The signal is beyond the level at the start.
     at_once = f_low >= 0
     following, lower, upper, done = _turn(s, low, torch.ones_like(low), r)
     r["at"] = torch.where(at_once, low, following)
-    # Pixels whose first turn was not enough; few, so they are gathered.
+    # The few pixels that need more iterations are gathered.
     left = torch.nonzero(r["fires"] & ~(at_once | done)).view(-1)
     names = ("c", "rise", "fall", "k", "target", "sign")
     part = {name: r[name][left] for name in names}
@@ -168,7 +167,7 @@ def _meet(r: Rows) -> None:
 
 def _meet_lines(r: Rows) -> None:
     s = (r["target"] - r["c"]) / r["rise"]
-    # 0 / 0 is NaN where the signal stands on the level; the comparison then selects s.
+    # 0 / 0 is NaN where the signal is on the level; the comparison then selects s.
     s = torch.where(s > r["s"], s, r["s"])
     r["at"] = torch.where(s < 1.0, s, torch.ones_like(s))
 
@@ -176,7 +175,7 @@ def _meet_lines(r: Rows) -> None:
 def _let_shots_come_first(r: Rows, shots: Shots, v: Step) -> None:
     """Replace the crossing by shot noise where that comes first. Row ``shot``: a pixel's next one, or their end."""
     end = len(shots.flat)
-    # Indices are held inside the list; ``mine`` says whether they mean anything.
+    # Indices are limited to the list; ``mine`` says whether they are valid.
     at = lambda column, key: column[key.clamp(max=end - 1)]
     mine = lambda key: (key < end) & (at(shots.flat, key) == r["flat"])
     key = r["shot"]
@@ -204,7 +203,7 @@ def _change_leaks(r: Rows, v: Step, jitter: float) -> None:
     fresh = (r["mean_leak"] / spread).to(torch.float32).to(torch.float64)
     change = torch.where(r["fires"], fresh - r["leak"], torch.zeros_like(fresh))
     r["leak"] = r["leak"] + change
-    # The reference stays where it is; its value relative to the new drift changes.
+    # The reference stays; its value relative to the new drift changes.
     r["target"] = r["target"] + change * (r["at"] * v.dt + v.since_0)
     r["c"] = r["c"] + change * v.since_0
     r["rise"] = r["rise"] + change * v.dt
@@ -212,9 +211,9 @@ def _change_leaks(r: Rows, v: Step, jitter: float) -> None:
 
 
 def _cause_bits(r: Rows) -> Tensor:
-    """Return the cause of each event, in its place in the packed word: the largest part of what moved the pixel."""
+    """Return the cause of each event, in its place in the packed word: the largest part of the pixel's change."""
     sign, size = r["sign"], torch.where(r["polarity"].bool(), r["on"], r["off"])
-    # How far leak and noise have moved the signal since the reference was taken; light is the rest.
+    # Change of the signal by leak and noise since the reference was taken; light is the rest.
     by_leak = sign * r["leak"] * ((r["at_ns"] - r["since"]).to(torch.float64) * 1e-9)
     by_noise = sign * (r["noise"] + r["shift"] * r["at"] - r["noise_then"])
     light = size - by_leak - by_noise

@@ -1,6 +1,6 @@
-"""Plain values that every room may import: events, boxes. Nothing but NumPy is imported here.
+"""Plain values that every room may import: events, boxes. Only NumPy is imported here.
 
 In:    arrays.
-Out:   frozen classes that say what each array is.
+Out:   frozen classes that define each array.
 Start: events.py (``Events``).
 """

@@ -1,4 +1,4 @@
-"""Boxes of the objects in a picture."""
+"""Bounding boxes of the objects in a picture."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of N objects, in the scene's order, of which some part would be in the picture if nothing hid it.
+    """Boxes of N objects, in the scene's order, that would be visible in the picture if nothing hid them.
 
-    instance : (N,) int64, as in ``ids``.   category : (N,) int64, as in ``semantics``.   kind : (N,) text, what the
-    name says it is.
-    visible_box : (N, 4) float64 px, left, top, right, bottom edges of the pixels that show it (the top-left pixel's are
-    -0.5, -0.5, 0.5, 0.5); 0 where none does.   visible_pixels : (N,) int64.
-    amodal_box : (N, 4) float64 px, of all of it before the near plane, whether hidden, in the picture or beside it.
-    cut_box : (N, 4) float64 px, the same, cut at the picture's edges.
+    instance : (N,) int64, as in ``ids``.   category : (N,) int64, as in ``semantics``.   kind : (N,) text, from its
+    name.
+    visible_box : (N, 4) float64 px, left, top, right, bottom edges of its visible pixels (the top-left pixel's are
+    -0.5, -0.5, 0.5, 0.5); 0 where there are none.   visible_pixels : (N,) int64.
+    amodal_box : (N, 4) float64 px, of all of it before the near plane, hidden and outside parts included.
+    cut_box : (N, 4) float64 px, the same, clipped at the picture's edges.
     amodal_pixels : (N,) int64, pixels of the picture that would show it if nothing hid it.
-    size : (N, 3) float64, of its box in space along that one's axes, world units.
+    size : (N, 3) float64, of its 3-D box along that box's axes, world units.
     T_cam_box, T_world_box : (N, 4, 4) float64, from the box's axes, which are the object's, and its middle, to the
-    camera's and to the world's.   occluded : (N,) float64, share of ``amodal_pixels`` that is hidden.
-    truncated : (N,) float64, share of ``amodal_box`` that is outside the picture.
+    camera's and to the world's.   occluded : (N,) float64, hidden fraction of ``amodal_pixels``.
+    truncated : (N,) float64, fraction of ``amodal_box`` outside the picture.
     resolution : (2,) int64 width and height of the picture, px."""
 
     instance: np.ndarray
@@ -59,7 +59,7 @@ SHAPES: dict[str, tuple[tuple[int, ...], str]] = {
     "occluded": ((), "f"),
     "truncated": ((), "f"),
 }
-"""Array -> its shape behind the objects, NumPy's kind of number."""
+"""Array -> its shape after the objects' axis, NumPy's number type."""
 
 
 def no_boxes() -> dict[str, Any]:

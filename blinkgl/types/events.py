@@ -1,4 +1,4 @@
-"""The one event container of the project, and what an event is caused by."""
+"""The event container of the project, and the causes of events."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from blinkgl.errors import EventDataError
 class Cause(IntEnum):
     """The origin of an event: what moved the pixel to its threshold.
 
-    Of the parts that its signal has moved by since its last event (or the end of the dead time after it), in the
-    direction of the crossing, the largest is the cause; the light where two are alike. An event that an emulator draws
-    by itself, V2E's shot noise, is its own.
+    The cause is the largest part of the signal's change since the pixel's last event (or the end of the dead time after
+    it), in the direction of the crossing; light where two are equal. An event that an emulator draws directly, V2E's
+    shot noise, has its own cause.
 
-    So every event has one cause, the parts add up to the threshold, and an event is a noise event where the light alone
-    would have brought the pixel less than its noise did. The numbers are part of the file format."""
+    So every event has one cause, the parts add up to the threshold, and an event is noise where light alone moved the
+    pixel less than noise did. The numbers are part of the file format."""
 
     SIGNAL = 0  # the light changed
     LEAK = 1  # V2E: leak; DVS-Voltmeter: k4 and k5
@@ -27,12 +27,12 @@ class Cause(IntEnum):
 
 
 TRUTH = np.dtype([("instance", np.uint16), ("depth", np.float32), ("velocity", np.float32, (2,))])
-"""What is known of the surface that made an event: its instance id, 0: nothing; depth along the optical axis, world
-units, inf: nothing; image velocity, px/s, +x right, +y down."""
+"""The surface that made an event: its instance id, 0: nothing; depth along the optical axis, world units, inf: nothing;
+image velocity, px/s, +x right, +y down."""
 TOLD = ("instance", "depth", "velocity")
 """Fields of :data:`TRUTH`."""
 OPTIONAL = ("cause", "truth")
-"""Columns that events may be without."""
+"""Columns that may be absent."""
 _TYPES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "cause": np.uint8, "truth": TRUTH}
 
 
@@ -94,7 +94,7 @@ class Events:
         return Events(**{k: getattr(self, k)[which] for k in self.columns})
 
     def copy(self) -> Events:
-        """Return a copy with memory of its own."""
+        """Return a copy with its own memory."""
         return Events(**{k: getattr(self, k).copy() for k in self.columns})
 
     @staticmethod

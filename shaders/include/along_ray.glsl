@@ -1,11 +1,11 @@
-// Where on its surface a fragment is evaluated, for programs that write labels.
+// The place on its surface at which a fragment is evaluated, for programs that write labels.
 //
-// Behind a lens (LENS_CLAIMS) that is where the ray of the one pixel of the lens's picture passes that will look at
-// this fragment: up to half a pixel beside its centre (lens_claims, blinkgl/render/lens.py). Whether it is on this
-// facet is asked of the ray, too, not of the centre. So a geometry stage (GEOMETRY_STAGE) makes every triangle as large
-// as all pixels that it touches, and hands on the corners of the one that it is; the fragment finds where the ray meets
-// that, and its depth there, and is none where it passes it by. Neighbours share a corner's bits and ask the same
-// product with opposite signs, so no ray passes between them.
+// Behind a lens (LENS_CLAIMS) it is where the ray of the lens's pixel that reads this fragment passes: up to half a
+// pixel beside its centre (lens_claims, blinkgl/render/lens.py). The ray, not the centre, also decides whether it is on
+// this facet. So a geometry stage (GEOMETRY_STAGE) enlarges every triangle to all pixels that it touches, and passes on
+// its true corners; the fragment finds where the ray meets the true triangle, and its depth there, and is discarded
+// where it misses. Neighbours share a corner's bits and compute the same product with opposite signs, so no ray passes
+// between them.
 #ifdef LENS_CLAIMS
 
 // What vertex.glsl gives, as F(type, name).
@@ -54,7 +54,7 @@ flat out vec3 corner_1;
 flat out vec3 corner_2;
 flat out float near_depth;
 
-// Half a pixel, and a little for what is rounded.
+// Half a pixel, and a little for rounding.
 const float ASIDE = 0.51;
 // px: a corner so sharp that it would be moved further is cut off.
 const float FARTHEST = 4.0;
@@ -72,7 +72,7 @@ void corner_at(vec2 px)
     EmitVertex();
 }
 
-// The rectangle about what was seen of a triangle, seen from the side from which that is.
+// The rectangle around the visible part of a triangle, with the triangle's orientation.
 void rectangle(vec2 low, vec2 high, bool turned)
 {
     vec2 most = 0.5 * target_size + 2.0;
@@ -93,13 +93,13 @@ void main()
     for (int k = 0; k < 3; ++k)
         c[k] = gl_in[k].gl_Position.xyw;
     float near = gl_in[0].gl_Position.z;
-    // All of it before the near plane: nothing is seen.
+    // All of it is before the near plane: nothing is visible.
     if (max(max(c[0].z, c[1].z), c[2].z) < near)
         return;
     vec2 half_size = 0.5 * target_size;
     if (min(min(c[0].z, c[1].z), c[2].z) < near)
     {
-        // Through the near plane: about the part before it.
+        // It crosses the near plane: the rectangle around the part beyond it.
         vec2 low = vec2(1e9), high = vec2(-1e9);
         for (int k = 0; k < 3; ++k)
         {
@@ -123,8 +123,7 @@ void main()
     float away[3];
     for (int k = 0; k < 3; ++k)
         p[k] = c[k].xy / c[k].z * half_size;
-    // Signed area in px: its sign says which way the triangle is seen; outward: unit normals of its sides, px to move
-    // them.
+    // Signed area in px: its sign is the triangle's orientation; outward: unit normals of its sides, px to move them.
     vec2 u = p[1] - p[0], v = p[2] - p[0];
     float turn = u.x * v.y - u.y * v.x;
     bool fits = turn != 0.0;
@@ -139,7 +138,7 @@ void main()
     {
         int before = (k + 2) % 3;
         vec2 a = outward[before], b = outward[k];
-        // Where two moved sides meet: Cramer's rule on their two line equations.
+        // Intersection of two moved sides: Cramer's rule on their two line equations.
         vec2 by = vec2(away[before] * b.y - away[k] * a.y, away[k] * a.x - away[before] * b.x);
         by /= a.x * b.y - a.y * b.x;
         fits = fits && max(abs(by.x), abs(by.y)) < FARTHEST; // NaN does not
@@ -157,7 +156,7 @@ void main()
 #endif
 
 #ifdef FRAGMENT_SHADER
-uniform sampler2D lens_claims; // px of the target from the fragment's centre to the ray; 9 where nobody looks
+uniform sampler2D lens_claims; // px of the target from the fragment's centre to the ray; 9 where no pixel reads it
 #define ON_FACET(type, name) flat in type name##_0; flat in type name##_1; flat in type name##_2; type name;
 HANDED_ON(ON_FACET)
 flat in vec3 corner_0;
@@ -169,14 +168,14 @@ float ray_inverse_depth;
 #define INVERSE_DEPTH ray_inverse_depth
 #define FRAGMENT_XY ray_xy
 
-// Of a and b as seen from the ray, times their depths: on which side of the edge between them it passes.
+// Product of a and b as seen from the ray, times their depths: the side of the edge on which it passes.
 float beside(vec2 a, vec2 b)
 {
     precise float side = a.x * b.y - a.y * b.x;
     return side;
 }
 
-// First of all.
+// Call first.
 void look_along_ray()
 {
     vec2 shift = texelFetch(lens_claims, ivec2(gl_FragCoord.xy), 0).xy;

@@ -1,20 +1,20 @@
-// A shape that changes with time, q(p, t) in the place of p (blinkgl/scene/shapes): included by vertex.glsl in the
-// variants of such shapes alone. One of DEFORM_<NAME> is defined; include/deform/<name>.glsl or its class's text has
+// A deforming shape, q(p, t) instead of p (blinkgl/scene/shapes): included by vertex.glsl only in the variants of such
+// shapes. One of DEFORM_<NAME> is defined; include/deform/<name>.glsl or its class's text has
 //   vec3 deformed(vec3 p)                      q
 //   vec3 deformed_rate(vec3 p)                 dq/dt
-//   vec3 deformed_change(vec3 p, int other)    q at the other time less q, never as the difference of two positions
+//   vec3 deformed_change(vec3 p, int other)    q at the other time minus q, never as the difference of two positions
 //   vec3 deformed_normal(vec3 p, vec3 n)       direction of the normal n of p
 //   vec3 deformed_normal_rate(vec3 p, vec3 n)  its rate
-// of what the class gives: SHAPE_ROWS rows for now, for the rate, for the times that flow leads to.
+// from the class's numbers: SHAPE_ROWS rows for now, for the rate, and for the other times of flow.
 layout(std140) uniform Shape
 {
     vec4 shape[4 * SHAPE_ROWS];
 };
-// First rows; those of now begin at 0.
+// First rows; those of the present time begin at 0.
 const int SHAPE_RATE = SHAPE_ROWS, SHAPE_FORWARD = 2 * SHAPE_ROWS, SHAPE_BACKWARD = 3 * SHAPE_ROWS;
 
-// sin and cos to float32's precision, near 0 relative to the result: drivers' own are only as good as 2^-21, which
-// would be all of a small motion. Angles beyond some hundred turns lose digits.
+// sin and cos with float32's precision, relative near 0: drivers' own are only accurate to 2^-21, which would exceed a
+// small motion. Angles beyond some hundred turns lose digits.
 float sine(float x)
 {
     float k = round(x * 0.31830988618);

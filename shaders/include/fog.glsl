@@ -27,7 +27,7 @@ float in_fog(float luminance)
 
 #ifdef CHANGES
 // d(L')/dt = T (dL/dt - (L - F) density dd/dt), of the luminance without fog and its rate. At a fixed pixel depth
-// changes by what the surface itself comes nearer, and by what of it slides by: with W = 1/Z, grad Z = -grad W / W^2.
+// changes because the surface approaches and because it slides by: with W = 1/Z, grad Z = -grad W / W^2.
 float in_fog_rate(float luminance, float change, vec2 motion)
 {
     float W = gl_FragCoord.w;

@@ -1,21 +1,19 @@
-// Keeps out what a rasteriser makes of triangles without width: collinear ones, and any seen from its edge. Corners are
-// snapped to a fraction of a pixel and may then cover a pixel's centre, while gradients are divided by the area before
-// the snapping: 1/w and all that is interpolated with it may be anything there, NaN included.
+// Drops the artefacts of triangles without width: collinear ones, and any seen from its edge. Corners are snapped to a
+// fraction of a pixel and may then cover a pixel's centre, while gradients are divided by the area before the snapping:
+// 1/w and everything interpolated with it may have any value there, NaN included.
 //
-// Bit patterns of floats >= 0 are ordered as the numbers are, and those of negative numbers, infinities and NaN are
-// larger. So everything is compared as unsigned integers: compilers may turn !(a < b) into a >= b, which NaN does not
-// survive.
+// Bit patterns of floats >= 0 have the order of the numbers, and those of negative numbers, infinities and NaN are
+// larger. So values are compared as unsigned integers: compilers may turn !(a < b) into a >= b, which is wrong for NaN.
 
-#ifndef LENS_CLAIMS // behind a lens rays meet facets where they are (along_ray.glsl)
-// Smallest 1/Z of the part in this frame, as bits; by how much the largest's bits exceed them.
+#ifndef LENS_CLAIMS // behind a lens rays meet the facets themselves (along_ray.glsl)
+// Smallest 1/Z of the part in this frame, as bits; the difference of the largest's bits to them.
 uniform uvec2 inverse_depths;
 
-// Corners are snapped to 1/256 px: where depth changes by more than a quarter over so little, it is not known at all.
-const float STEEPEST = 64.0; // of its own value per pixel
+// Corners are snapped to 1/256 px: where depth changes by more than a quarter over that, it is unknown.
+const float STEEPEST = 64.0; // of its own value, per pixel
 #endif
 
-// A fragment at no depth that the part has is not of the part. To be called last: derivatives are undefined after a
-// discard.
+// Drops a fragment whose depth the part does not have. Call it last: derivatives are undefined after a discard.
 void drop_artefact()
 {
 #ifndef LENS_CLAIMS
@@ -31,8 +29,8 @@ void drop_artefact()
 #endif
 }
 
-// Texture coordinates that differences between neighbours may be taken of. Beside a surface that ends at the horizon
-// the neighbour outside may have 1/w = 0; it then counts as far away, so that the coarsest mip level is chosen.
+// Texture coordinates that are safe for differences between neighbours. Beside a surface that ends at the horizon the
+// outside neighbour may have 1/w = 0; it then counts as far away, which selects the coarsest mip level.
 const uint REPEATS = 0x4e6e6b28u; // bits of 1e9, beyond which a float tells nothing about a texture
 vec2 within_reach(vec2 at)
 {
@@ -40,7 +38,7 @@ vec2 within_reach(vec2 at)
     return max(size.x, size.y) < REPEATS ? at : vec2(1e6);
 }
 
-// 0 for what is no number.
+// 0 for NaN.
 float finite(float value)
 {
     return (floatBitsToUint(value) & 0x7fffffffu) < 0x7f800000u ? value : 0.0;

@@ -1,6 +1,6 @@
-// A lens that distorts (blinkgl/camera): what a change of place on the image plane at distance 1 is in its pixels.
+// A lens with distortion (blinkgl/camera): converts a displacement on the image plane at distance 1 to its pixels.
 // RADTAN, EQUIDISTANT: which model.
-uniform vec4 lens_plane; // place on the image plane: ndc * lens_plane.xy + lens_plane.zw
+uniform vec4 lens_plane; // position on the image plane: ndc * lens_plane.xy + lens_plane.zw
 uniform vec2 lens_focal; // px
 uniform float lens_k[5];
 
@@ -28,8 +28,8 @@ mat2 lens_slope(vec2 u)
 #endif
 
 #ifdef EQUIDISTANT
-// atan(x) to the last place or two, relatively, also of x near 0: tan of the quarter, then its series. What cards have
-// is good to 1e-5, which is 1e-3 px of a flow of 100.
+// atan(x) to the last place or two, relatively, also for x near 0: tan of the quarter, then its series. GPUs' own is
+// accurate to 1e-5, which is 1e-3 px of a flow of 100.
 float lens_atan(float x)
 {
     // tan(a/2) = tan a / (1 + sqrt(1 + tan^2 a)), twice.
@@ -58,8 +58,7 @@ mat2 lens_slope(vec2 u)
     float r = length(u), t = lens_atan(r);
     if (r < 1e-4)
         return mat2(1.0);
-    // Along the radius theta changes by dr / (1 + r^2); across it a circle of radius r becomes one of radius
-    // g(theta).
+    // Along the radius theta changes by dr / (1 + r^2); across it a circle of radius r becomes one of radius g(theta).
     vec2 e = u / r;
     float along = lens_g_rate(t) / (1.0 + r * r), across = lens_g(t) / r;
     return mat2(along * e.x * e.x + across * e.y * e.y, (along - across) * e.x * e.y,

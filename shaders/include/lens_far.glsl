@@ -1,6 +1,6 @@
-// A lens that distorts, from one place on the image plane to another (lens.glsl: at one).
+// A lens with distortion: displacement between two places on the image plane (lens.glsl: derivative at one).
 #include "lens.glsl"
-uniform float lens_limit; // radius on the image plane up to which the model goes
+uniform float lens_limit; // largest radius on the image plane for which the model is valid
 
 #ifdef RADTAN
 bool lens_sees(vec2 u)
@@ -9,7 +9,7 @@ bool lens_sees(vec2 u)
     return length(u) < lens_limit && slope[0][0] > 0.0 && determinant(slope) > 0.0;
 }
 
-// D(u + d) - D(u), each difference of powers written as a product with d, so that nothing cancels
+// D(u + d) - D(u), each difference of powers written as a product with d, so that nothing cancels.
 vec2 lens_difference(vec2 u, vec2 d)
 {
     vec2 v = u + d;
@@ -49,7 +49,7 @@ vec2 lens_difference(vec2 u, vec2 d)
 {
     vec2 v = u + d;
     float r = length(u), q = length(v);
-    if (min(r, q) < 1e-3) // s is 1 but for terms of r^2, in which nothing is lost
+    if (min(r, q) < 1e-3) // s is 1 except for terms of r^2, so nothing cancels
         return v * (q > 1e-6 ? lens_g(lens_atan(q)) / q : 1.0) - u * (r > 1e-6 ? lens_g(lens_atan(r)) / r : 1.0);
     float longer = dot(d, u + v) / (q + r);             // q - r
     float turned = lens_atan(longer / (1.0 + q * r));        // theta' - theta

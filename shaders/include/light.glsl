@@ -1,11 +1,10 @@
-// What light does to a surface: the one place where the two meet, of the event pass, its rate and the colour pass alike
-// (the float64 reference: blinkgl/render/reference.py, received()). Without LIGHTS it is the white sun and sky
-// (blinkgl/scene/types.py: Light):
+// Light on a surface, for the event pass, its rate and the colour pass (the float64 reference:
+// blinkgl/render/reference.py, received()). Without LIGHTS it is the white sun and sky (blinkgl/scene/types.py: Light):
 //   E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_up)
-// where, with SHADOWS, of the sun what is seen of it arrives (shadows.glsl).
+// where, with SHADOWS, the sun is multiplied by its visible fraction (shadows.glsl).
 // n, s and up in the object's own frame, so that normals need no matrix.
 #ifdef SHOW_LOOKUP
-#define SHOW(term, light) shown_##term += light; // the shader debugger's, see lookup.glsl
+#define SHOW(term, light) shown_##term += light; // for the shader debugger, see lookup.glsl
 #else
 #define SHOW(term, light)
 #endif
@@ -21,7 +20,7 @@ uniform vec3 up_direction;   // world z, object frame, unit
 uniform vec2 light_strength; // (sun, sky)
 #ifdef SHADOWS
 #include "shadows.glsl"
-float shadow_share; // of the sun, as irradiance() found it
+float shadow_share; // visible fraction of the sun, set by irradiance()
 #endif
 
 float irradiance(vec3 normal)
@@ -44,11 +43,11 @@ float irradiance(vec3 normal)
 uniform vec3 sun_rate; // ds/dt and d(up)/dt, object frame, 1/s
 uniform vec3 up_rate;
 
-// dE/dt of the same where the normal seen changes by normal_rate per second.
+// dE/dt of the same where the visible normal changes by normal_rate per second.
 float irradiance_rate(vec3 normal, vec3 normal_rate)
 {
 #ifdef SHADOWS
-    float sun = light_strength.x * shadow_share; // whose own change is not in the rate
+    float sun = light_strength.x * shadow_share; // whose own rate is not included
 #else
     float sun = light_strength.x;
 #endif

@@ -1,12 +1,12 @@
-// Light of a scene that asks for more than a white sun and sky; blinkgl/scene/lights.py says what each lamp sends.
+// Lights other than a white sun and sky; blinkgl/scene/lights.py defines the light of each lamp.
 //
 //   SUNS     number of suns           LAMPS    number of point and spot lights, SPOTS: the last of them are spot lights
-//   AMBIENT  light from all around    HUED     of three channels; else of one: what this material's luminance takes
+//   AMBIENT  light of the surroundings    HUED     of three channels; else one, weighted for this material's luminance
 //   SHADOWS  see shadows.glsl
-//   SURFACED with RATE: all of this is as it is ``later`` by so many seconds, to first order, for surface.glsl
+//   SURFACED with RATE: everything ``later`` by this many seconds, to first order, for surface.glsl
 //
-// Everything is in the object's own frame, made from float64 poses, so that neither normals nor positions need a
-// matrix. A lamp is a Beam at a point of the surface: whoever shades by more than Lambert's cosine asks for the same.
+// Everything is in the object's own frame, computed from float64 poses, so that neither normals nor positions need a
+// matrix. A lamp gives a Beam at a point of the surface, for Lambert and for other reflections.
 #ifdef HUED
 #define ILLUMINANT vec3
 #else
@@ -60,12 +60,12 @@ Beam sun_beam(int i)
 #endif
 
 #ifdef LAMPS
-const float NEAREST = 1e-3; // world units: what is nearer is lit as if it were this far
+const float NEAREST = 1e-3; // world units: nearer points are lit as if they were this far
 uniform vec3 lamp_place[LAMPS];
 uniform ILLUMINANT lamp_strength[LAMPS];
 uniform float lamp_fading[LAMPS]; // 1 / reach^4
 #ifdef SPOTS
-uniform vec3 spot_axis[SPOTS]; // unit, against the way it shines
+uniform vec3 spot_axis[SPOTS]; // unit, against the direction in which it shines
 uniform vec2 spot_cone[SPOTS]; // scale and offset of the cosine
 #endif
 
@@ -103,9 +103,9 @@ Beam lamp_beam(int i, vec3 at)
 #else
 #define BANDS 1
 #endif
-// Of a white surface with normal n: dot(even, (n, 1)), an even sky; and, of a panorama (AMBIENT 2), a quadratic form of
-// n besides: dot(squares, n n) + dot(mixed, n n.yzx); or, of one that is not smooth enough for that (AMBIENT 3), a
-// quartic form, which has the quadratic one in it: x^4 x²y² x³y xy³ x²yz, three of each.
+// For a white surface with normal n: dot(even, (n, 1)), a uniform sky; for a panorama (AMBIENT 2) also a quadratic form
+// of n: dot(squares, n n) + dot(mixed, n n.yzx); or, for one that is not smooth enough (AMBIENT 3), a quartic form,
+// which includes the quadratic one: x^4 x²y² x³y xy³ x²yz, three of each.
 uniform vec4 around_even[BANDS];
 #if AMBIENT == 2
 uniform vec3 around_squares[BANDS], around_mixed[BANDS];
@@ -148,12 +148,12 @@ ILLUMINANT ambient(vec3 n)
 }
 #endif
 
-// Of a Lambert surface. normal : object frame, of any length; ``local`` is where it is.
+// Light on a Lambert surface. normal : object frame, of any length; ``local`` is its position.
 ILLUMINANT irradiance(vec3 normal)
 {
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30)); // zero stays zero
     ILLUMINANT sum = ILLUMINANT(0.0);
-// From all around; a fit may dip below 0, light does not.
+// Surroundings; the fit may be below 0, light is not.
 #ifdef AMBIENT
 #if AMBIENT > 1
     sum += max(ambient(n), 0.0);
@@ -162,7 +162,7 @@ ILLUMINANT irradiance(vec3 normal)
 #endif
     SHOW(around, sum)
 #endif
-// Suns: Lambert's cosine, times what the shadow map says is seen. SHADOW_SUNS of them have a map.
+// Suns: Lambert's cosine, times the visible fraction from the shadow map. SHADOW_SUNS of them have a map.
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
     {
@@ -175,7 +175,7 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef MOVED
             if (later == 0.0)
 #endif
-            // Not looked up where the lamp does not shine.
+            // No lookup where the lamp does not shine.
             shadow_share[i] = facing > 0.0 ? shadow(i, n, facing, vec3(0.0)) : 1.0;
             facing *= shadow_share[i];
         }
@@ -234,13 +234,13 @@ float around_band_rate(int band, vec3 n, vec3 turn)
           + dot(around_fourth_rate[k + 4], mixed * mixed.zxy);
 #endif
 #if AMBIENT > 1
-    rate *= step(0.0, around_band(band, n)); // none where it is cut off
+    rate *= step(0.0, around_band(band, n)); // none where it is clipped
 #endif
     return rate;
 }
 #endif
 
-// dE/dt of the same where the normal seen changes by normal_rate and the place seen by at_rate per second.
+// dE/dt of the same where the visible normal changes by normal_rate and the position by at_rate per second.
 ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
 {
     float scale = inversesqrt(max(dot(normal, normal), 1e-30));
@@ -260,7 +260,7 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
         float change = dot(n, sun_towards[i]) > 0.0 ? dot(turn, sun_towards[i]) + dot(n, sun_towards_rate[i]) : 0.0;
 #ifdef SHADOW_SUNS
         if (i < SHADOW_SUNS)
-            change *= shadow_share[i]; // whose own change is not in the rate
+            change *= shadow_share[i]; // whose own rate is not included
 #endif
         sum += change * sun_strength[i];
     }
@@ -271,7 +271,7 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
         // E = s (n.d) f(|d|) a(c): the product rule, with d the way to the lamp and c the cosine at a spot's axis.
         vec3 way = lamp_place[i] - local, way_rate = lamp_place_rate[i] - at_rate;
         float square = dot(way, way), facing = dot(n, way);
-        // No rate where it does not shine, nor nearer than NEAREST, where the strength is held.
+        // No rate where it does not shine, nor nearer than NEAREST, where the strength is constant.
         if (facing <= 0.0 || square <= NEAREST * NEAREST)
             continue;
         float along = dot(way, way_rate) / square; // of d|d|/dt / |d|

@@ -1,12 +1,12 @@
-// What a pass looks up in its texture, for the shader debugger: included by the variant SHOW_LOOKUP alone, which
-// nothing but blinkgl/shader_debugger asks for. Every look-up that follows in the pass's own source is noted with the
-// coordinates and the level that it really uses, whatever expression the source has in its place.
+// Texture lookups of a pass, for the shader debugger: included only by the variant SHOW_LOOKUP, which only
+// blinkgl/shader_debugger uses. Every later lookup in the pass's source is recorded with the coordinates and the level
+// that it really uses.
 
 layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level (before clamping), light
-layout(location = 2) out vec4 shown_albedo; // what is multiplied by the light; number of look-ups
-layout(location = 3) out vec4 shown_mirrored; // added to their product: what a gloss mirrors
-layout(location = 4) out vec4 shown_emission; // and light of its own
-layout(location = 5) out vec4 shown_terms; // of the light: lamps without shadows, share that shadows leave, all around
+layout(location = 2) out vec4 shown_albedo; // the factor of the light; number of lookups
+layout(location = 3) out vec4 shown_mirrored; // added to their product: mirrored light
+layout(location = 4) out vec4 shown_emission; // and emitted light
+layout(location = 5) out vec4 shown_terms; // of the light: lamps without shadows, share left by shadows, surroundings
 layout(location = 6) out vec4 shown_light;    // r, g, b of the light
 
 vec4 noted = vec4(0.0); // sum over the look-ups of (u, v, level, 1)
@@ -23,7 +23,7 @@ vec4 noted_texture(sampler2D image, vec2 at, float bias)
     return texture(image, at, bias);
 }
 
-float noted_texture(sampler2DShadow map, vec3 at) // a shadow map is no albedo
+float noted_texture(sampler2DShadow map, vec3 at) // a shadow map is not an albedo
 {
     return texture(map, at);
 }
@@ -41,9 +41,9 @@ vec4 noted_texture_grad(sampler2D image, vec2 at, vec2 along_x, vec2 along_y)
     return textureGrad(image, at, along_x, along_y);
 }
 
-// To be called once, when the albedo is known and the light has not been multiplied yet.
+// Call once, when the albedo is known and before it is multiplied by the light.
 // direct, arrives : of the lamps, without shadows and with them.   around : of the sky or panorama.
-// seen : of the light, in the luminance of what it falls on.
+// seen : of the light, as luminance on this surface.
 void show_lookup(vec3 unlit, vec3 light, float seen, vec3 mirrored, vec3 emission,
                  float direct, float arrives, float around)
 {
@@ -55,7 +55,7 @@ void show_lookup(vec3 unlit, vec3 light, float seen, vec3 mirrored, vec3 emissio
     shown_albedo = vec4(unlit, noted.w);
 }
 
-// From here on every look-up of the source that includes this goes through the functions above.
+// From here on every lookup of the including source uses the functions above.
 #define texture noted_texture
 #define textureLod noted_texture_lod
 #define textureGrad noted_texture_grad

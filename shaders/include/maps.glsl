@@ -1,4 +1,4 @@
-// Look-ups that are no albedo, for surface.glsl: to be included before lookup.glsl, which would note them.
+// Lookups other than the albedo, for surface.glsl: include before lookup.glsl, which would record them.
 vec4 map_at(sampler2D map, vec2 at, float bias)
 {
     return texture(map, at, bias);

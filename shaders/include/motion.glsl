@@ -6,20 +6,20 @@
 // in the result however small the motion is. ndc comes from gl_FragCoord, which is exact.
 
 //
-// LENS: in pixels of a lens that distorts (lens.glsl), not in those of the flat picture that is drawn.
+// LENS: in pixels of a lens with distortion (lens.glsl), not in those of its pinhole picture.
 #include "along_ray.glsl"
 #ifdef LENS
 #include "lens.glsl"
 #endif
 
-const float BEYOND = 1e37; // px, px/s: further than anything that is told apart from infinity
+const float BEYOND = 1e37; // px, px/s: beyond it values are not distinguished from infinity
 
 vec2 ndc_of_fragment(vec2 image_size)
 {
     return FRAGMENT_XY / image_size * 2.0 - 1.0;
 }
 
-// In the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p (of a shape that changes: d(MVP)/dt * q +
+// In the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p (for a deforming shape: d(MVP)/dt * q +
 // MVP * dq/dt); half the image is one unit of ndc.
 // rate: rows x, y, w of d(MVP)/dt.  Returns px/s, at most BEYOND, whose square is infinite.
 vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)

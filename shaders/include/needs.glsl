@@ -1,10 +1,10 @@
-// What a program that is lit takes of a vertex, by the variant of its material and of the light; to be included before
-// vertex.glsl. SURFACED: light is no factor on the albedo alone, see surface.glsl.
+// Vertex data that a lit program uses, by the variant of its material and of the light; include it before vertex.glsl.
+// SURFACED: light is not only a factor on the albedo, see surface.glsl.
 #if defined(LIT) && (defined(GLOSSY) || defined(BUMPED))
 #define SURFACED
 #endif
-// FACETED: of flat facets, whose corners have one normal. Where the light hangs on nothing else it is the same all over
-// a facet, and the vertex stage's: a panorama's form of up to 57 numbers is then not evaluated at every pixel.
+// FACETED: of flat facets, whose corners have one normal. Where the light depends only on the normal it is constant on
+// a facet and computed in the vertex stage: a panorama's form of up to 57 numbers is then not evaluated at every pixel.
 #if defined(FACETED) && defined(LIT) && defined(LIGHTS) && !defined(SURFACED) && !defined(SHADOWS) \
     && !defined(LAMPS) && !defined(RATE) && !defined(DEFORM) && !defined(SHOW_LOOKUP)
 #define LIT_AT_CORNERS
@@ -24,7 +24,7 @@
 #define NEEDS_LOCAL
 #endif
 
-// The side that is seen: of TWO_SIDED surfaces either, towards which the normal is turned.
+// The visible side: for TWO_SIDED surfaces either one; the normal is turned towards it.
 #ifdef TWO_SIDED
 #define SIDE (gl_FrontFacing ? 1.0 : -1.0)
 #define TURNED(way) (gl_FrontFacing ? (way) : -(way))

@@ -1,16 +1,16 @@
-// How much of a lamp is seen from a point of the surface, by its shadow map (shadow.glsl): 1 all of it, 0 nothing.
+// Fraction of a lamp that is visible from a surface point, from its shadow map (shadow.glsl): 1 all of it, 0 nothing.
 //
 //   SHADOW_SUNS, SHADOW_SPOTS   the first of the suns and of the spot lights have a map each, in this order
 //   SHADOWS   their number, 1 to 4          SOFT   by the size of the lamp; else each edge is one texel wide
 //
-// Depth is reversed: what is nearer to the lamp is larger. What is compared with the map is moved towards the lamp by
-// as much as the surface's own plane changes over the texels that are looked at, so that no surface is in its own
-// shadow; it is not moved aside, so that edges stay where they are.
+// Depth is reversed: larger means nearer to the lamp. The compared depth is moved towards the lamp by the change of the
+// surface's own plane over the texels read, so that no surface shadows itself; it is not moved sideways, so that shadow
+// edges stay in place.
 #ifdef SOFT
-uniform mat3 shadow_plane[SHADOWS];      // by rows: what makes of a normal the slope of its plane's depth in the map
+uniform mat3 shadow_plane[SHADOWS];      // by rows: transform of a normal to the slope of its plane's depth in the map
 #endif
 uniform vec4 shadow_scale[SHADOWS];      // width of a texel: .x + .y w, world units; depth per world unit: .z (suns);
-                                         // what softens: a sun's angle, rad, or a lamp's diameter, world units: .w
+                                         // softening: a sun's angle, rad, or a lamp's diameter, world units: .w
 #ifdef SOFT
 #define SHADOW_MAP sampler2D
 #else
@@ -28,23 +28,23 @@ uniform SHADOW_MAP shadow_map_2;
 uniform SHADOW_MAP shadow_map_3;
 #endif
 
-const float SPARE = 0.25, FARTHEST = 16.0; // texels towards the lamp: always, and at most (where light grazes)
+const float SPARE = 0.25, FARTHEST = 16.0; // texels towards the lamp: always, and at most (grazing light)
 
 #ifdef SOFT
-const float WIDEST = 24.0; // texels, radius of what is looked at
+const float WIDEST = 24.0; // texels, radius of the search
 const int TAPS = 16;
 
 const float ANGLE = 2.39996323;
 const vec2 TURN = vec2(cos(ANGLE), sin(ANGLE));
 
-// Of a disc of radius 1, as evenly as sunflower seeds; the same for every pixel: no noise, which would be events.
+// Sunflower points in a disc of radius 1; the same for every pixel, because noise would cause events.
 vec2 seed(int i)
 {
     float angle = float(i) * ANGLE;
     return sqrt((float(i) + 0.5) / float(TAPS)) * vec2(cos(angle), sin(angle));
 }
 
-// A comparison at the four texels around, weighted bilinearly: what sampler2DShadow does.
+// A comparison at the four texels around, weighted bilinearly, as sampler2DShadow does.
 float nearer(SHADOW_MAP map, vec2 at, float depth)
 {
     vec2 size = vec2(textureSize(map, 0)), f = fract(at * size - 0.5);
@@ -52,14 +52,14 @@ float nearer(SHADOW_MAP map, vec2 at, float depth)
     return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
 }
 
-// at: where the point is in the map; slope: of its plane's depth there; unit, texel: depth and width of one.
+// at: position of the point in the map; slope: of its plane's depth there; unit, texel: depth and width of one.
 float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, vec4 scale)
 {
-    // Least and most distance towards the lamp that spares a surface its own shadow, as depth.
+    // Smallest and largest offset towards the lamp that avoids self-shadowing, as depth.
     vec2 one = 1.0 / vec2(textureSize(map, 0));
     float most = FARTHEST * texel * unit, least = dot(abs(slope), one) + SPARE * texel * unit;
     bool sun = scale.z > 0.0;
-    // What is in the way, and how far from here: of the sun a cone's width, of a lamp what its disc spans from there.
+    // Blockers, and their mean distance: for a sun within a cone, for a lamp within the cone of its disc.
     float reach = sun ? scale.w * (1.0 - at.z) / scale.z : scale.w, sum = 0.0, count = 0.0;
     vec2 search = clamp(0.5 * reach / texel, 1.0, WIDEST) * one;
     for (int i = 0; i < TAPS; i += 2)
@@ -72,15 +72,15 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
             count += 1.0;
         }
     }
-    // llvmpipe computes both sides of an if, and a loop whose length is known; this one ends with the last pixel.
+    // llvmpipe executes both sides of an if, and a loop of known length; this one ends with the last pixel.
     int taps = count > 0.0 ? TAPS : 0;
     float blocker = sum / max(count, 1.0);
-    // The penumbra's width: the sun's angle times the way from the blocker, or by similar triangles from the lamp's
+    // The penumbra's width: the sun's angle times the distance to the blocker, or by similar triangles from the lamp's
     // width.
     float width = sun ? scale.w * (blocker - at.z) / scale.z : scale.w * max(blocker / at.z - 1.0, 0.0);
     vec2 radius = clamp(0.5 * width / texel, 0.5, WIDEST) * one;
     float lit = 0.0;
-    vec2 way = vec2(1.0, 0.0); // seed(i) by turning
+    vec2 way = vec2(1.0, 0.0); // seed(i), by rotation
     for (int i = 0; i < taps; ++i)
     {
         vec2 aside = sqrt((float(i) + 0.5) / float(TAPS)) * way * radius;
@@ -91,8 +91,8 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
 }
 #endif
 
-// Of map k for a surface with unit normal n; its place in the map is the vertex stage's (``shadow_place``). facing: n.l
-// > 0. aside: from the lamp to the surface, of a spot light. Beside a map nothing is in the way: its edge is empty.
+// For map k and a surface with unit normal n; its position in the map comes from the vertex stage (``shadow_place``).
+// facing: n.l > 0. aside: from the lamp to the surface, for a spot light. Beside a map there are no blockers.
 float shadow(int k, vec3 n, float facing, vec3 aside)
 {
     vec4 scale = shadow_scale[k];

@@ -1,12 +1,12 @@
-// What a surface sends that is more than a matt one with its own normal (docs/materials.md; the float64 reference:
-// blinkgl/render/reference.py, radiated()). Included after light.glsl.
+// Radiance of a surface that is more than matt (docs/materials.md; the float64 reference: blinkgl/render/reference.py,
+// radiated()). Included after light.glsl.
 //
 //   BUMPED      a normal map
-//   GLOSSY      metal and roughness: GGX, height-correlated Smith, Schlick; what several reflections inside the
-//               surface keep is given back (energy) and missing below, so that white under even light is white
+//   GLOSSY      metal and roughness: GGX, height-correlated Smith, Schlick; energy of multiple reflections is added
+//               to the mirrored light (energy) and removed from the scattered, so white under uniform light is white
 //   GLOSS_MAP   both from a map
 //
-// With RATE a surface is looked at twice more, a little before and after: all of it is smooth, in one formula.
+// With RATE the surface is evaluated twice more, a little before and after: everything is one smooth formula.
 #ifdef RATE
 #define MAP(map, at) map_at(map, map##_place * vec3(at, 1.0), mat2(map##_place) * map_x, mat2(map##_place) * map_y)
 vec2 map_x, map_y; // d(uv) of a pixel to the right and downwards
@@ -15,7 +15,7 @@ vec2 map_x, map_y; // d(uv) of a pixel to the right and downwards
 float map_bias = 0.0;
 #endif
 
-ILLUMINANT shown_matt; // radiance that a white surface of this kind scatters, without what it mirrors
+ILLUMINANT shown_matt; // radiance scattered by a white surface of this kind, without mirrored light
 
 #ifdef BUMPED
 uniform sampler2D bumps;
@@ -26,7 +26,7 @@ uniform float bump_scale;
 vec3 bumped(vec3 normal, vec3 along, float hand, vec2 at)
 {
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));
-    // Tangent made orthogonal to the normal (Gram and Schmidt); cross(n, t) times its hand is the way of v.
+    // Tangent made orthogonal to the normal (Gram-Schmidt); cross(n, t) times its hand is the direction of v.
     vec3 t = along - n * dot(n, along);
     t *= inversesqrt(max(dot(t, t), 1e-30));
     vec3 bump = 2.0 * MAP(bumps, at).xyz - 1.0;
@@ -36,7 +36,7 @@ vec3 bumped(vec3 normal, vec3 along, float hand, vec2 at)
 #endif
 
 #ifdef GLOSSY
-const float SMOOTHEST = 0.05, DIELECTRIC = 0.04; // least roughness; reflectance of what is no metal
+const float SMOOTHEST = 0.05, DIELECTRIC = 0.04; // smallest roughness; reflectance of non-metals
 uniform vec3 eye;      // the camera's centre, object frame
 uniform mat3 to_world; // from the object's axes
 uniform vec2 gloss;    // metallic, roughness
@@ -44,8 +44,8 @@ uniform vec2 gloss;    // metallic, roughness
 uniform sampler2D gloss_map;
 uniform mat3x2 gloss_map_place;
 #endif
-uniform sampler2D energy; // what is reflected of even light, over (cosine, roughness): F0 r + g; b: the mean of r + g
-uniform sampler2D looks; // where it comes from, over the same: of two looks how far from the normal to the mirror's
+uniform sampler2D energy; // reflection of uniform light, over (cosine, roughness): F0 r + g; b: the mean of r + g
+uniform sampler2D looks; // its direction, over the same: for two looks the fraction from the normal to the mirror
                                 // direction, and roughness; energy's a: how much is the first one's (gloss.py, both())
 // Radiance seen in a mirror, by longitude, latitude and roughness.
 #ifdef HUED
@@ -65,7 +65,7 @@ uniform mat3 to_world_rate;
 #define TO_WORLD to_world
 #endif
 
-// Radiance from direction d, world axes, as a surface of this roughness mirrors it.
+// Radiance from direction d, world axes, mirrored by a surface of this roughness.
 ILLUMINANT mirrored(vec3 d, float roughness)
 {
     float levels = float(textureSize(SURROUNDINGS, 0).z);
@@ -78,7 +78,7 @@ ILLUMINANT mirrored(vec3 d, float roughness)
 #endif
 }
 
-// Of what hits more than once, what comes out: F is the mean of Schlick's term, even that of the energy.
+// Light that leaves after multiple reflections: F is the mean of Schlick's term, even that of the energy.
 #define SEVERAL(F0, F, even) { F = F0 + (1.0 - F0) * (1.0 / 21.0); F = F * even / (1.0 - F * (1.0 - even)); }
 
 ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
@@ -98,14 +98,14 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
     vec4 part = map_at(energy, cell, 0.0), look = map_at(looks, cell, 0.0);
     float lost = 1.0 / (part.r + part.g) - 1.0, clear;
     ILLUMINANT metal;
-    // Several reflections between the facets return the energy that one alone loses (lost).
+    // Multiple reflections between the facets return the energy that a single one loses (lost).
     SEVERAL(DIELECTRIC, clear, part.b)
     SEVERAL(base, metal, part.b)
     clear = 1.0 + clear * lost;
     metal = 1.0 + metal * lost;
     float even_clear = clear * (DIELECTRIC * part.r + part.g);
     ILLUMINANT even_metal = metal * (base * part.r + part.g);
-    // Scattered light: what the dielectric's surface does not reflect. Metals scatter none.
+    // Scattered light: the part that the dielectric's surface does not reflect. Metals scatter none.
     shown_matt = (1.0 - metallic) * (1.0 - even_clear) * irradiance(normal);
     ILLUMINANT sum = base * shown_matt;
     // Mirrored surroundings: two looks between the normal and the mirror direction, weighted by energy's a.
@@ -161,8 +161,7 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
 }
 #endif
 
-// Of the surface at a pixel: albedo, its front's interpolated normal and tangent, place in the object's axes, texture
-// coordinates.
+// At a pixel: albedo, the front's interpolated normal and tangent, position in the object's axes, texture coordinates.
 struct Spot
 {
     ILLUMINANT base;
@@ -172,7 +171,7 @@ struct Spot
     vec2 coordinates;
 };
 
-// side: -1 where the back is seen.
+// side: -1 where the back is visible.
 ILLUMINANT radiated(Spot spot, float side)
 {
     vec3 normal = spot.normal;
@@ -188,10 +187,10 @@ ILLUMINANT radiated(Spot spot, float side)
 }
 
 #ifdef MOVED
-// Over how much time the surface is looked at to either side: a quarter of a pixel, a fraction of a highlight's width.
+// Half the time between the two evaluations: a quarter of a pixel, a fraction of a highlight's width.
 float pause(Spot spot, Spot change, float speed)
 {
-    // How fast directions turn, rad/s: of normals, suns, lamps and the eye. width: of a highlight.
+    // Rotation rates of directions, rad/s: of normals, suns, lamps and the eye. width: of a highlight.
     float turning = length(change.normal) * inversesqrt(max(dot(spot.normal, spot.normal), 1e-30)), width = 0.5;
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
@@ -208,7 +207,7 @@ float pause(Spot spot, Spot change, float speed)
     return 1.0 / max(speed * 4.0 + turning * 8.0 / width, 1e-3);
 }
 
-// d(radiated)/dt where the pixel sees all of the spot change by ``change`` per second.
+// d(radiated)/dt where the spot's data change by ``change`` per second at the pixel.
 ILLUMINANT radiated_rate(Spot spot, Spot change, float side, float speed)
 {
     float step = pause(spot, change, speed);

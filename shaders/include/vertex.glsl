@@ -1,18 +1,17 @@
-// The vertex stage of every program that draws the scene, and what it hands to the fragment stage. All of them have to
-// place a vertex at the same bits, or a pixel would show one surface to one pass and another one to the next.
+// The vertex stage of every program that draws the scene, and its outputs for the fragment stage. All programs must
+// compute a vertex's position with the same bits; otherwise passes would show different surfaces at a pixel.
 //
-// To be included once, outside of both stages, after the program has defined what of a vertex its fragment stage looks
-// at:
+// Include it once, outside both stages, after the program has defined the vertex data that its fragment stage uses:
 //   NEEDS_UV      in vec2 uv      texture coordinates, times the material's scale
 //   NEEDS_NORMAL  in vec3 normal  object frame, not normalised
 //   NEEDS_LOCAL   in vec3 local   position, object frame
 //   NEEDS_TINT    in vec3 tint    the vertices' colours
-//   NEEDS_TANGENT in vec4 tangent the way a texture's u runs, object frame, of any length; 1 or -1 (tangents.py)
+//   NEEDS_TANGENT in vec4 tangent direction of a texture's u, object frame, of any length; 1 or -1 (tangents.py)
 //
-// MASKED, a surface with holes: is_hole(), which drop_artefact() of guard.glsl asks.
+// MASKED, a surface with holes: is_hole(), which drop_artefact() of guard.glsl calls.
 //
-// Of a shape that changes with time (DEFORM, deform.glsl) all of these are as they are now, and there is besides, in
-// clip space, rows x, y, w:
+// For a deforming shape (DEFORM, deform.glsl) all of these are at the present time, and in addition, in clip space,
+// rows x, y, w:
 //   NEEDS_RATE         in vec3 shape_rate      MVP dq/dt, per second
 //   NEEDS_FORWARD      in vec3 shape_forward   MVP' (q' - q) of the time that forward flow leads to
 //   NEEDS_BACKWARD     in vec3 shape_backward  the same of backward flow
@@ -24,8 +23,8 @@
 #define NEEDS_UV
 #endif
 
-// SHADOWS, of a surface that is LIT: in SHADOW_PLACE shadow_place[SHADOWS], where it is in each lamp's map, times w.
-// Affine in the position, so that the rasteriser's interpolation is exact, and two dot products a pixel less each.
+// SHADOWS, for a LIT surface: shadow_place[SHADOWS] in SHADOW_PLACE, its position in each lamp's map, times w. It is
+// affine in the object position, so interpolation is exact and saves two dot products per pixel and map.
 #if defined(SHADOWS) && defined(LIT)
 #ifdef SHADOW_SPOTS
 #define SHADOW_PLACE vec4
@@ -34,7 +33,8 @@
 #endif
 #endif
 
-// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind. LIGHT_SEEN: of the seen side.
+// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind. LIGHT_SEEN: the visible
+// side's.
 #ifdef LIT_AT_CORNERS
 #ifdef HUED
 #define LIGHT_HERE vec3
@@ -51,7 +51,7 @@
 #ifdef VERTEX_SHADER
 in vec3 in_position;
 uniform mat4 mvp;
-// The same bits whatever else the compiler makes of the stage: depths are compared between passes.
+// The same bits in every program: depths are compared between passes.
 invariant gl_Position;
 #ifdef NEEDS_UV
 in vec2 in_uv;
@@ -111,7 +111,7 @@ out vec3 tangent_rate;
 
 void main()
 {
-// Position first: every pass has to get the same bits from it.
+// Position first: every pass must get the same bits.
 #ifdef DEFORM
     vec3 position = deformed(in_position);
 #else
@@ -230,7 +230,7 @@ in vec3 tangent_rate;
 uniform sampler2D coverage; // opacity over the coordinates of the base colour
 uniform float cutoff;
 
-// Of the finest level whatever the distance: a hole is a shape, which passes, shadow maps and the ray caster see alike.
+// Always the finest level: a hole is a shape, which must be the same in all passes, shadow maps and the ray caster.
 bool is_hole()
 {
     return textureLod(coverage, uv, 0.0).r < cutoff;

@@ -1,4 +1,4 @@
-"""Blender's side: programs that its own process runs, and nothing imports.
+"""Blender's side: programs that a separate process runs, and that no module imports.
 
 In:    a folder with a job, the scene's file.
 Out:   a GLB in that folder, lines of JSON.

@@ -29,9 +29,9 @@ import numpy as np
 
 MOST_FRAMES = 100_000
 MOST_SHAPES = 200
-"""Frames of a shape that is baked frame by frame."""
+"""Largest number of frames of a shape that is baked frame by frame."""
 MOVED = 1e-5
-"""Of a shape's size: what counts as a change."""
+"""Smallest change, as a fraction of a shape's size."""
 CONSTANT = 1e-7
 STILL = set(
     """ARRAY BEVEL DATA_TRANSFER DECIMATE EDGE_SPLIT MIRROR MULTIRES NORMAL_EDIT REMESH SCREW SOLIDIFY SUBSURF
@@ -53,7 +53,7 @@ class Refused(Exception):
 
 
 def names(things: Iterable[Any], limit: int = 3) -> str:
-    """'a', 'b', 'c' and 4 more."""
+    """Return 'a', 'b', 'c' and 4 more."""
     listed = [f"'{thing.name}'" for thing in things]
     return ", ".join(listed[:limit]) + (f" and {len(listed) - limit} more" if len(listed) > limit else "")
 
@@ -62,7 +62,8 @@ def names(things: Iterable[Any], limit: int = 3) -> str:
 
 
 def open_file(bpy: Any, source: Path, fps: float | None) -> None:
-    """The file as Blender's data, without scripts. Refused: damaged, not of its kind, or saved by a newer Blender."""
+    """Load the file as Blender's data, without scripts. Refused: damaged, of another kind, or saved by a newer
+    Blender."""
     operators = bpy.ops.wm
     openers = {
         ".fbx": lambda path: operators.fbx_import(filepath=path),
@@ -73,24 +74,24 @@ def open_file(bpy: Any, source: Path, fps: float | None) -> None:
     usd = lambda path: operators.usd_import(filepath=path, import_textures_mode="IMPORT_PACK", set_frame_range=True)
     ending = source.suffix.lower()
     operators.read_factory_settings(use_empty=True)
-    # Whatever the defaults are: text blocks marked 'register' and drivers' expressions are never run.
+    # Independent of the defaults: text blocks marked 'register' and drivers' expressions are never run.
     bpy.context.preferences.filepaths.use_scripts_auto_execute = False
     try:
         if ending == ".blend":
             operators.open_mainfile(filepath=str(source), load_ui=False, use_scripts=False)
         else:
-            set_rate(bpy.context.scene, fps or 24.0)  # Alembic's seconds become frames while it is read
+            set_rate(bpy.context.scene, fps or 24.0)  # Alembic's seconds become frames when it is read
             if "FINISHED" not in openers.get(ending, usd)(str(source)):
                 raise Refused(f"Blender cannot read it as {ending[1:].upper()}", "a whole file of that kind")
-    except RuntimeError as problem:  # what operators report as an error
+    except RuntimeError as problem:  # errors of operators
         text = " ".join(str(problem).split()).removeprefix("Error: ")
         raise Refused(f"Blender cannot read it ({text[:200]})", "a whole file") from problem
     saved, here = tuple(bpy.data.version[:2]), tuple(bpy.app.version[:2])
-    if saved > here:  # which would leave out what it does not know without saying so
+    if saved > here:  # it would leave out unknown data silently
         raise Refused(f"saved by Blender {saved[0]}.{saved[1]}, newer than the {here[0]}.{here[1]} that would open it")
     if bpy.context.preferences.filepaths.use_scripts_auto_execute:
         raise Refused("the file's scripts could not be switched off")
-    if ending in (".fbx", ".dae"):  # whose importers do not say how long the scene lasts
+    if ending in (".fbx", ".dae"):  # their importers do not set the scene's length
         spans = [tuple(action.frame_range) for action in bpy.data.actions]
         if spans:
             bpy.context.scene.frame_start = round(min(first for first, _ in spans))
@@ -100,13 +101,13 @@ def open_file(bpy: Any, source: Path, fps: float | None) -> None:
 
 
 def set_rate(scene: Any, fps: float) -> None:
-    """Frames per second, which Blender keeps as a whole number over a divisor."""
+    """Set the frames per second, which Blender stores as a whole number over a divisor."""
     scene.render.fps = max(round(fps), 1)
     scene.render.fps_base = scene.render.fps / fps
 
 
 def set_clock(scene: Any, frames: list[int] | None, per: int) -> dict:
-    """Sets the scene to ``per`` key frames per frame: its time is stretched and its frames come faster by as much.
+    """Set the scene to ``per`` key frames per frame: its time is stretched and its frame rate multiplied by ``per``.
     Returns first, last (frames of the file), fps (of the file) and duration_s."""
     first, last = frames or (scene.frame_start, scene.frame_end)
     render = scene.render
@@ -128,7 +129,7 @@ def set_clock(scene: Any, frames: list[int] | None, per: int) -> dict:
 
 
 def rendered(bpy: Any) -> list[Any]:
-    """Objects of the view layer that Blender would render; they are shown from here on, so that they are evaluated."""
+    """Return the objects of the view layer that Blender would render, and show them, so that they are evaluated."""
     found = []
     for thing in bpy.context.view_layer.objects:
         if not (thing.hide_render or all(collection.hide_render for collection in thing.users_collection)):
@@ -139,7 +140,7 @@ def rendered(bpy: Any) -> list[Any]:
 
 
 def check(things: list[Any]) -> None:
-    """Refuses what would come wrong."""
+    """Refuse objects whose result would be wrong."""
     for thing in things:
         if thing.instance_type in ("VERTS", "FACES"):
             raise Refused(
@@ -157,12 +158,12 @@ def check(things: list[Any]) -> None:
 
 
 def active_modifiers(thing: Any) -> list[Any]:
-    """Those that the viewport shows."""
+    """Return the modifiers that the viewport shows."""
     return [modifier for modifier in thing.modifiers if modifier.show_viewport]
 
 
 def realize(bpy: Any, things: list[Any]) -> None:
-    """Makes what geometry nodes show several times into faces of the object itself; the exporter leaves it out."""
+    """Convert instances of geometry nodes to faces of the object itself, because the exporter leaves them out."""
     group = bpy.data.node_groups.new("Realize", "GeometryNodeTree")
     for way in ("INPUT", "OUTPUT"):
         group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
@@ -176,14 +177,15 @@ def realize(bpy: Any, things: list[Any]) -> None:
 
 
 def bake_shapes(bpy: Any, things: list[Any]) -> list[str]:
-    """Makes shapes that change in time by other means than bones and shape keys into a shape key per frame; who."""
+    """Convert shapes that change by other means than bones and shape keys to a shape key per frame; return their
+    names."""
     scene, candidates, faces = bpy.context.scene, {}, {}
     for thing in things:
         kinds = {modifier.type for modifier in active_modifiers(thing)} - {"ARMATURE"}
         if thing.type == "MESH" and not kinds <= STILL:
             candidates[thing] = []
     for frame in range(scene.frame_start, scene.frame_end + 1) if candidates else ():
-        scene.frame_set(frame)  # one after the other, as simulations need it
+        scene.frame_set(frame)  # in order, as simulations require
         graph = bpy.context.evaluated_depsgraph_get()
         for thing, shapes in candidates.items():
             shown = thing.evaluated_get(graph)
@@ -207,14 +209,14 @@ def bake_shapes(bpy: Any, things: list[Any]) -> list[str]:
 
 
 def changed(first: np.ndarray, other: np.ndarray) -> bool:
-    """Whether vertices are elsewhere, or others."""
+    """Return whether positions or number of vertices differ."""
     if first.shape != other.shape:
         return True
     return bool(len(first)) and float(np.abs(other - first).max()) > MOVED * float(np.ptp(first, axis=0).max())
 
 
 def as_shape_keys(thing: Any, mesh: Any, shapes: list[np.ndarray], first: int) -> None:
-    """One shape key per frame, mixed linearly from one to the next. Refused: too many frames."""
+    """Create one shape key per frame, linearly interpolated. Refused: too many frames."""
     if len(shapes) > MOST_SHAPES:
         raise Refused(
             f"'{thing.name}' changes its shape for more than {MOST_SHAPES} frames",
@@ -237,7 +239,7 @@ def as_shape_keys(thing: Any, mesh: Any, shapes: list[np.ndarray], first: int) -
 
 
 def left_out(bpy: Any, things: list[Any]) -> list[str]:
-    """What glTF has no words for, in lines."""
+    """Return lines about what glTF cannot represent."""
     lines = []
     for kind, words in UNKNOWN.items():
         if found := [thing for thing in things if thing.type == kind]:
@@ -260,7 +262,7 @@ def left_out(bpy: Any, things: list[Any]) -> list[str]:
 
 
 def has_plain_colour(material: Any) -> bool:
-    """Whether the exporter understands the colour: that of a Principled or an emitting surface, or a picture's."""
+    """Return whether the exporter supports the colour: that of a Principled or an emitting surface, or a picture's."""
     if not material.use_nodes:
         return True
     outputs = [node for node in material.node_tree.nodes if node.type == "OUTPUT_MATERIAL" and node.is_active_output]
@@ -276,8 +278,8 @@ def has_plain_colour(material: Any) -> bool:
 
 
 def export(bpy: Any, out: Path, clips: bool) -> dict:
-    """Writes the GLB; its JSON."""
-    for part in ("object", "armature", "shapekeys"):  # the exporter's own limit is 1e-4: slow motions were lost
+    """Write the GLB and return its JSON."""
+    for part in ("object", "armature", "shapekeys"):  # the exporter's own limit of 1e-4 would remove slow motions
         import_module(f"io_scene_gltf2.blender.exp.animation.sampled.{part}.keyframes").fcurve_is_constant = is_constant
     bpy.ops.export_scene.gltf(
         filepath=str(out),
@@ -306,13 +308,13 @@ def export(bpy: Any, out: Path, clips: bool) -> dict:
 
 
 def is_constant(keyframes: list) -> bool:
-    """Whether a channel says the same at all its key frames, but for the rounding of float32 matrices."""
+    """Return whether all key frames of a channel are equal, except for the rounding of float32 matrices."""
     values = np.array([list(key.value) for key in keyframes], float)
     return bool((np.ptp(values, axis=0) <= CONSTANT * np.maximum(np.abs(values).max(axis=0), 1e-3)).all())
 
 
 def counts(tree: dict) -> dict[str, int]:
-    """What is in the GLB."""
+    """Return the counts of the GLB's contents."""
     nodes, accessors = tree.get("nodes", []), tree.get("accessors", [])
     triangles = 0
     for node in nodes:
@@ -331,7 +333,8 @@ def counts(tree: dict) -> dict[str, int]:
 
 
 def run(bpy: Any, job: dict, out: Path, say: Any) -> dict:
-    """Writes ``out``; the report: blender, counts, left_out, cameras, camera, size, first, last, fps, duration_s."""
+    """Write ``out`` and return the report: blender, counts, left_out, cameras, camera, size, first, last, fps,
+    duration_s."""
     say(doing="opening the file")
     open_file(bpy, Path(job["source"]), job["fps"])
     if job["scene"] is not None:
@@ -362,7 +365,7 @@ def run(bpy: Any, job: dict, out: Path, say: Any) -> dict:
 
 
 def main(folder: Path) -> int:
-    """Exit status: 0, or 1 when a line says what is wrong."""
+    """Return the exit status: 0, or 1 when a line reports an error."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # Blender and its libraries print to standard output from C
     sys.stdout = sys.stderr
@@ -392,7 +395,7 @@ def main(folder: Path) -> int:
 
 
 def end_with_the_parent() -> None:
-    """Blender must not outlive a driver that was killed (Linux; elsewhere it does, until it is done)."""
+    """End this process when its parent is killed (on Linux only; elsewhere it continues until it is done)."""
     try:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     except (OSError, AttributeError):
@@ -402,4 +405,4 @@ def end_with_the_parent() -> None:
 if __name__ == "__main__":
     status = main(Path(sys.argv[1]))
     sys.stderr.flush()
-    os._exit(status)  # not through Blender's own end, which now and then waits for itself for ever
+    os._exit(status)  # not by Blender's own exit, which sometimes never returns

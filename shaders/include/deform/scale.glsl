@@ -1,4 +1,4 @@
-// Larger and smaller about a point: q = c + f * (p - c).
+// A scale about a point: q = c + f * (p - c).
 // rows: c | f;  rate: f's;  change: f's.
 
 vec3 deformed(vec3 p)
@@ -18,7 +18,7 @@ vec3 deformed_change(vec3 p, int other)
 
 vec3 deformed_normal(vec3 p, vec3 n)
 {
-    // Normals scale by the inverse of what positions scale by.
+    // Normals are scaled by the inverse of the positions' scale.
     return n / shape[1].xyz;
 }
 

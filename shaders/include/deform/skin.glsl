@@ -7,7 +7,7 @@ in vec4 in_joints_0, in_weights_0;
 in vec4 in_joints_1, in_weights_1;
 #endif
 
-// Columns are the rows of sum w_i J_i from row ``first`` on: vec4(p, 1.0) * skin_blend(...) is where it takes p.
+// The columns are the rows of sum w_i J_i from row ``first`` on: vec4(p, 1.0) * skin_blend(...) is the transformed p.
 mat3x4 skin_blend(int first)
 {
     mat3x4 sum = mat3x4(0.0);
@@ -57,7 +57,7 @@ vec3 deformed(vec3 p)
 
 vec3 deformed_rate(vec3 p)
 {
-    // The product rule: joints move the shape, and morph targets change what the joints move.
+    // The product rule: joints move the shape, and morph targets change the points that the joints move.
     vec3 q = vec4(p + skin_morphed(0, 0), 1.0) * skin_blend(SHAPE_RATE);
 #ifdef SKIN_MORPHS
     q += vec4(skin_morphed(SHAPE_RATE, 0), 0.0) * skin_blend(0);
@@ -75,7 +75,7 @@ vec3 deformed_change(vec3 p, int other)
     return q;
 }
 
-// By the cofactors of the blend: right for uneven scales, too.
+// By the cofactors of the blend: valid for non-uniform scales, too.
 vec3 deformed_normal(vec3 p, vec3 n)
 {
     mat3x4 rows = skin_blend(0);

@@ -1,4 +1,4 @@
-// Turned about an axis by an angle that grows along the mesh: q = c + R_b(a u(p)) (p - c), u(p) = s . p + s0.
+// A rotation about an axis by an angle that grows along the mesh: q = c + R_b(a u(p)) (p - c), u(p) = s . p + s0.
 // rows: b | c | s, s0 | a;  rate: a's;  change: a's.
 
 float turn_share(vec3 p)
@@ -25,7 +25,7 @@ vec3 deformed_rate(vec3 p)
     return cross(shape[0].xyz, turned(p - shape[1].xyz, shape[3].x * u)) * (shape[SHAPE_RATE + 3].x * u);
 }
 
-// The difference of two turns is a chord: across the direction halfway, twice the sine of half the angle long.
+// The difference of two rotations is a chord: perpendicular to the direction halfway, twice the sine of half the angle.
 vec3 deformed_change(vec3 p, int other)
 {
     float u = turn_share(p), half_turn = 0.5 * shape[other + 3].x * u;
@@ -47,6 +47,6 @@ vec3 deformed_normal_rate(vec3 p, vec3 n)
     float a = shape[3].x, a_rate = shape[SHAPE_RATE + 3].x, u = turn_share(p), turning = a_rate * u;
     vec3 w = cross(b, turned(p - shape[1].xyz, a * u)), s = turned(shape[2].xyz, a * u), N = turned(n, a * u);
     vec3 g = a * s, w_rate = turning * cross(b, w), g_rate = a_rate * s + turning * a * cross(b, s);
-    // w and N turn together: w.N stays as it is.
+    // w and N rotate together: w.N is constant.
     return N * (dot(w_rate, g) + dot(w, g_rate)) + (1.0 + dot(w, g)) * turning * cross(b, N) - g_rate * dot(w, N);
 }

@@ -6,7 +6,7 @@ uniform mat4x3 difference_backward;
 vec4 label_flow_backward()
 {
     vec3 d = difference_backward * vec4(local, 1.0); // d.z is the w row
-// Of a shape that changes its own motion comes on top.
+// The motion of a deforming shape is added.
 #ifdef DEFORM
     d += shape_backward;
 #endif

@@ -1,4 +1,4 @@
-// How far the point moves in space until the other time, camera axes now, world units.
+// Displacement of the point in space until the other time, camera axes now, world units.
 uniform mat4x3 change_in_space;
 #ifdef DEFORM
 uniform mat3 space_from_clip; // from differences in clip space at the other time, rows x, y, w, to camera axes now

@@ -116,8 +116,9 @@ class Explanation:
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     """Explain one sequence (default: the first), of a recipe its first group's. Raises the errors of generating it."""
     if "groups" in template.tree:
-        result = explain(template.groups[0].template, sequence)
-        result.scene = {"group": f"{template.groups[0].name}, the first of {len(template.groups)}", **result.scene}
+        used = [group for group in template.groups if group.enabled]
+        result = explain(used[0].template, sequence)
+        result.scene = {"group": f"{used[0].name}, the first of {len(used)}", **result.scene}
         return result
     config = template.sequence(template.sequence(0).output.first_index if sequence is None else sequence)
     index = config.output.first_index if sequence is None else sequence

@@ -51,12 +51,12 @@ def test_expected_frames_and_passes_are_those_of_the_run(tmp_path):
 
 def test_of_a_recipe_the_first_group_that_is_used_is_explained(tmp_path):
     groups = {
-        "off": {"enabled": False, "camera": {"width": 32}},
-        "wide": {"camera": {"width": 96}},
-        "rest": {"output": {"name": "rest"}},
+        "a_off": {"enabled": False, "camera": {"width": 32}},
+        "b_wide": {"camera": {"width": 96}},
+        "c_rest": {"output": {"name": "rest"}},
     }
     told = explain(template(tmp_path, groups=groups))
-    assert told.scene["group"] == "wide, the first of 2" and told.scene["camera"].startswith("96x48")
+    assert told.scene["group"] == "b_wide, the first of 2" and told.scene["camera"].startswith("96x48")
 
 
 def test_what_is_left_out_follows_the_configuration(tmp_path):

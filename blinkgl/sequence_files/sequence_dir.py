@@ -12,10 +12,10 @@
       occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
       frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)
-      imu/  tracks.npz               an inertial unit; tracks of points on surfaces (blinkgl.io.imu, .tracks; on request)
+      imu/  tracks.npz               an inertial unit; point tracks (blinkgl.io.imu, .tracks; on request)
       poses.npz  config.yaml  manifest.json  preview.mp4
 
-Each label's row says where it stands (``blinkgl.labels``). DSEC's loaders take every file of ``flow/forward`` for a PNG.
+Each label's row says its place (``blinkgl.labels``). DSEC's loaders take every file of ``flow/forward`` for a PNG.
 """
 
 from __future__ import annotations

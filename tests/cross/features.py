@@ -302,7 +302,7 @@ RUN_LEVEL = {
 Kind = tuple[str, str]
 REFUSED: dict[tuple[Kind, Kind], str] = {
     **{
-        (("source", source), ("frame camera", camera)): "images: recorded frames are images already"
+        (("source", source), ("frame camera", camera)): "images: recorded frames are already images"
         for source in FEATURES["source"]
         if source.startswith("frames")
         for camera in FEATURES["frame camera"]

@@ -121,7 +121,7 @@ def in_a_process(program: str, checkout: str, density: str, frames: int) -> dict
 def table(checkouts: dict[str, str], rounds: int, frames: int) -> str:
     """The figures as Markdown: medians of the rounds, programs in turns."""
     lines = [
-        "|model|events per pixel and frame|authors' program, ms|BlinkGL, ms|times as fast|\n|---|---|---|---|---|\n"
+        "|model|events per pixel and frame: theirs, ours|authors' program, ms|BlinkGL, ms|ratio|\n|---|---|---|---|---|\n"
     ]
     for model, checkout in checkouts.items():
         for density in ("mid", "dense"):
@@ -129,7 +129,7 @@ def table(checkouts: dict[str, str], rounds: int, frames: int) -> str:
             theirs, own = (median(turn[k]["ms"] for turn in turns) for k in (0, 1))
             rates = [turns[0][k]["events"] / (frames - 1) / (HEIGHT * WIDTH) for k in (0, 1)]
             lines.append(
-                f"|{model}: {PARAMETERS[model]}|{rates[0]:.3f}, ours {rates[1]:.3f}|{theirs:.1f}|{own:.1f}|"
+                f"|{model}: {PARAMETERS[model]}|{rates[0]:.3f}, {rates[1]:.3f}|{theirs:.1f}|{own:.1f}|"
                 f"{theirs / own:.1f}|\n"
             )
             print(lines[-1], end="", flush=True)

@@ -121,7 +121,7 @@ def in_a_process(program: str, checkout: str, density: str, frames: int) -> dict
 def table(checkouts: dict[str, str], rounds: int, frames: int) -> str:
     """The figures as Markdown: medians of the rounds, programs in turns."""
     lines = [
-        "|model|events per pixel and frame: theirs, ours|authors' program, ms|BlinkGL, ms|ratio|\n|---|---|---|---|---|\n"
+        "|model|events per pixel, frame: theirs, ours|authors' program, ms|BlinkGL, ms|ratio|\n|---|---|---|---|---|\n"
     ]
     for model, checkout in checkouts.items():
         for density in ("mid", "dense"):

@@ -115,10 +115,9 @@ def _moved(a: np.ndarray, b: np.ndarray, mean: Callable[[np.ndarray], np.ndarray
         return False
     flow = cv2.blur(DenseFlow().forward(DenseFlow.codes(a), DenseFlow.codes(b)), (_SMOOTH_PX, _SMOOTH_PX))
     row, column = np.indices(a.shape, np.float32)
-    # A bilinear look-up would average noise away; Lanczos' keeps it.
-    followed = cv2.remap(
-        b, column + flow[..., 0], row + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    # Bilinear interpolation would average noise away; Lanczos interpolation keeps it.
+    place = column + flow[..., 0], row + flow[..., 1]
+    followed = cv2.remap(b, *place, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     return mean((followed - a) ** 2) < _EXPLAINED * mean((b - a) ** 2)
 
 

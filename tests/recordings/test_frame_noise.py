@@ -11,7 +11,7 @@ from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events
 from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
-from blinkgl.recordings.frame_noise import BAND, Steadied, frame_noise
+from blinkgl.recordings.frame_noise import BAND, Steadied, _moved, frame_noise
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
 from tests.shared_data import shared
 
@@ -56,9 +56,14 @@ def test_where_nearly_all_blocks_change_smoothly_no_noise_is_told():
     assert frame_noise([frame[:24] for frame in frames], CODE) is not None, "which is noise by itself"
 
 
-@pytest.mark.parametrize("photograph", ["grass", "gravel", "coins"])
-@pytest.mark.parametrize("step_px", [0.5, 2.0, 7.0])
-def test_a_fine_texture_that_moves_is_no_noise(photograph, step_px):
+def block_means(image: np.ndarray) -> np.ndarray:
+    """Means of blocks of 8x8 px."""
+    height, width = (side // 8 for side in image.shape)
+    return image[: 8 * height, : 8 * width].reshape(height, 8, width, 8).mean(axis=(1, 3)).ravel()
+
+
+def moving(photograph: str, step_px: float) -> list[np.ndarray]:
+    """Five frames of a photograph that moves, as 8-bit codes of sRGB say its light."""
     image = getattr(skimage.data, photograph)().astype(np.float32)
     frames = []
     for k in range(5):
@@ -67,7 +72,22 @@ def test_a_fine_texture_that_moves_is_no_noise(photograph, step_px):
         large = cv2.warpAffine(image, shift, (480, 360), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         moved = cv2.resize(large, (240, 180), interpolation=cv2.INTER_AREA).clip(0, 255)
         frames.append(((np.round(moved) / 255) ** 2.2).astype(np.float32))
+    return frames
+
+
+@pytest.mark.parametrize("photograph", ["grass", "gravel", "coins"])
+@pytest.mark.parametrize("step_px", [0.5, 2.0, 7.0])
+def test_a_fine_texture_that_moves_is_no_noise(photograph, step_px):
+    frames = moving(photograph, step_px)
     assert frame_noise(frames, CODE) is None
+    assert _moved(*frames[:2], block_means).mean() > 0.75
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.04])
+def test_dense_flow_explains_no_noise(sigma):
+    """An interpolation that averages, as a bilinear one does, would explain a quarter of the blocks."""
+    a, b = (0.4 + sigma * np.random.default_rng(0).standard_normal((2, 180, 240))).astype(np.float32)
+    assert _moved(a, b, block_means).mean() < 0.1
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.04])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from blinkgl.dataset.shards import export_shards
-from blinkgl.errors import ConfigError, OutputError
+from blinkgl.errors import ConfigError
+from blinkgl.io.atomic import refuse_existing
 from blinkgl.layouts import export_layout, layout_of
 from blinkgl.machine.terminal import plain_console, say
 
@@ -16,14 +15,23 @@ def refuse_early(out: str, layout: str) -> None:
     """Raise ConfigError for an unknown layout, OutputError if ``out`` exists. For exports after hours of other work."""
     if layout != SHARDS:
         layout_of(layout)
-    if Path(out).exists():
-        raise OutputError("exists already", where=out, accepted="another folder, or remove it")
+    refuse_existing(out)
 
 
-def run(root: str, out: str, *, layout: str | None, shard_mb: float | None = None, seed: int | None = None) -> int:
-    """layout : "webdataset", the default, or one of :data:`~blinkgl.layouts.LAYOUTS`; the others are of
+def run(
+    root: str,
+    out: str,
+    *,
+    layout: str | None,
+    shard_mb: float | None = None,
+    seed: int | None = None,
+    quiet: bool = False,
+) -> int:
+    """Export and print what was written, unless ``quiet``; return 0.
+
+    layout : "webdataset", the default, or one of :data:`~blinkgl.layouts.LAYOUTS`; the others are of
     :func:`~blinkgl.dataset.shards.export_shards`. Raises ConfigError and as the two do."""
-    console = plain_console()
+    console = plain_console(quiet=quiet)
     layout = layout or SHARDS
     if layout == SHARDS:
         with console.status("writing shards"):

@@ -70,7 +70,7 @@ def run(
             for name, reason in sorted(outcome.set_aside.items()):
                 say(plain_console(stderr=True), f"set aside: {name}: {reason}")
     if layout is not None and not outcome.set_aside:
-        export.run(out, exported, layout=layout)
+        export.run(out, exported, layout=layout, quiet=quiet)
     return SET_ASIDE if outcome.set_aside else 0
 
 

@@ -217,9 +217,11 @@ def test_generate_writes_a_layout_too_when_all_are_whole(tmp_path, capsys):
     asked = ["generate", str(recipe), "--out", f"{tmp_path}/out", "--quiet", "--layout"]
     assert run([*asked, "colmap"]) == 2 and "no such layout" in capsys.readouterr().err
     (tmp_path / "out-tapvid").mkdir()
+    (tmp_path / "out-tapvid/mine").touch()
     assert run([*asked, "tapvid"]) == 2 and "out-tapvid" in capsys.readouterr().err
     assert not (tmp_path / "out").exists(), "nothing is made for an export that cannot be written"
     assert run([*asked, "blinkflow"]) == 0
+    assert capsys.readouterr().out == "", "--quiet"
     assert blinkflow_sequence(next((tmp_path / "out-blinkflow/training").rglob("config.yaml")).parent)
 
 

@@ -25,6 +25,17 @@ def test_training_configurations(name):
         assert all(side % 16 == 0 and side >= 128 for side in config.data.crop)
 
 
+@pytest.mark.parametrize("crop", ["[128, 144]", "null"])
+def test_samples_of_two_sizes_are_refused(capsys, crop):
+    words = ["train", str(FOLDER / "smoke.yaml"), "--print-config", "--set", f"data.crop={crop}", "--set"]
+    assert run([*words, "data.augment.transpose=0.5"]) == 2
+    error = capsys.readouterr().err
+    assert (
+        error.startswith("error: data: transposed samples differ in size: set a square crop") and "\n" not in error[:-1]
+    )
+    assert run([*words, "data.augment.transpose=0"]) == 0
+
+
 def test_a_training_from_the_command_line_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     blinkgl_set(tmp_path / "set", sequences=1, labels=1)

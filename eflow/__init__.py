@@ -1,8 +1,8 @@
-"""Optical flow from events: networks, training, scores. Reads what ``blinkgl.io`` wrote, or
-what :mod:`blinkgl.online` renders meanwhile; never imports render or scene.
+"""Optical flow from events: networks, training and evaluation. This package reads files of ``blinkgl.io`` or windows
+that :mod:`blinkgl.online` renders during training; it never imports render or scene.
 
 In:    data sets, a YAML of eflow.config.
-Out:   a trained network, its scores, files for benchmarks.
+Out:   a trained network, its scores, submission files of benchmarks.
 Start: train.py; evaluate.py, infer.py, cli.py.
 """
 
@@ -19,7 +19,7 @@ _FROM = {"load_model": "checkpoint", "Predictor": "infer", "open_sized": "infer"
 
 
 def __getattr__(name: str) -> Any:
-    """The names above, looked up when they are first used: torch is not imported before."""
+    """Import the names above when they are first used, so that ``import eflow`` does not import torch."""
     if name not in _FROM:
         raise AttributeError(f"module 'eflow' has no attribute '{name}'")
     from importlib import import_module

@@ -1,8 +1,8 @@
-"""Checkpoints: a folder that appears whole, of safetensors files and one JSON file.
-Nothing here can execute what it reads.
+"""Checkpoints: folders of safetensors files and one JSON file, written completely or not at all.
+Reading one cannot execute code.
 
     000500/weights.safetensors      parameters and buffers; the metadata holds the model configuration
-           ema.safetensors          the same, averaged (what evaluation uses), where averaging is on
+           ema.safetensors          their moving average, which evaluation uses (if optim.ema is set)
            optimizer.safetensors    AdamW's moments, named by parameter, and torch's generator states
            state.json               step, seconds, configuration
 """
@@ -32,12 +32,13 @@ FORMAT = "eflow-1"
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file. Raises AssetError: missing, truncated, or
-    something else, e.g. a pickle."""
+    """Return the tensors and the metadata of a safetensors file.
+
+    Raises AssetError: the file is missing, truncated or of another format, e.g. a pickle."""
     try:
         with open(path, "rb") as file:
             head = file.read(9)
-        # Eight bytes of header length, then JSON: a length may begin like a pickle, so the brace decides.
+        # A safetensors file starts with 8 bytes of header length, which may look like a pickle's; then comes a brace.
         if head[8:] != b"{" and (head[:2] == b"PK" or head[:1] == b"\x80"):
             raise AssetError(
                 "is a PyTorch pickle, which could run any code when loaded; refused",
@@ -45,7 +46,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
                 accepted="a .safetensors file",
             )
         with safe_open(path, framework="pt") as file:
-            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - it has keys and is no mapping
+            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - it has keys() but is not a mapping
             return tensors, dict(file.metadata() or {})
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
@@ -60,7 +61,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    """Tensors by name as safetensors. Raises OutputError."""
+    """Write named tensors as a safetensors file. Raises OutputError."""
     with output_errors(path):
         try:
             save_file({k: v.detach().contiguous().cpu() for k, v in tensors.items()}, path, metadata)
@@ -71,33 +72,34 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, st
 
 
 def _sort_header(path: Path) -> None:
-    """Put the names in a file's header into order: the library writes those of the metadata as a hash map has them,
-    and two equal runs shall make equal files."""
+    """Sort the names in a file's header, so that two equal runs write equal files: the library writes metadata in
+    the random order of a hash map."""
     with open(path, "r+b") as file:
         size = int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(size))
         data = json.dumps(header, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
-        if len(data) <= size:  # blanks at the end are part of the format
+        if len(data) <= size:  # the format allows blanks at the end of the header
             file.seek(8)
             file.write(data.ljust(size))
 
 
 def metadata_of(model: FlowModel) -> dict[str, str]:
-    """What a file of weights says of the network that they are of."""
+    """Return the metadata of a file of weights: the format and the configuration of its network."""
     return {"format": FORMAT, "model": model.config.model_dump_json()}
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was found: ``folder`` (None for a lone weights file) and the weights file to use."""
+    """A checkpoint on disk: its ``folder`` (None for a single file) and the file of weights to use."""
 
     folder: Path | None
     weights: Path
 
 
 def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkpoint:
-    """``path``: a .safetensors file, a checkpoint folder, a run folder (its newest checkpoint), or the name of a
-    network that comes with the package (:mod:`eflow.shipped`), where no file or folder has it. Raises AssetError."""
+    """Return the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder, a run folder (its newest
+    checkpoint), or a network that comes with the package (:mod:`eflow.shipped`). A file or folder of that name has
+    priority over the package's network. Raises AssetError."""
     path = Path(path)
     if path.is_file():
         return Checkpoint(None, path)
@@ -121,16 +123,16 @@ def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkp
 
 
 def newest(run: Path) -> Path | None:
-    """The checkpoint of the highest step in ``run/checkpoints``."""
+    """Return the checkpoint with the highest step in ``run/checkpoints``, or None."""
     found = [p for p in (run / "checkpoints").glob("*") if p.name.isdigit() and p.is_dir()]
     return max(found, key=lambda p: int(p.name), default=None)
 
 
 def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any = None) -> FlowModel:
-    """The model a checkpoint holds, in evaluation mode on the CPU.
+    """Return the model of a checkpoint, in evaluation mode on the CPU.
 
-    averaged : the averaged weights where there are any. expected : a model configuration the checkpoint must be of.
-    Raises AssetError: none there, damaged, a pickle, or of another model or configuration."""
+    averaged : use the averaged weights if there are any. expected : configuration that the checkpoint must have.
+    Raises AssetError: no checkpoint, a damaged one, a pickle, or another model or configuration."""
     file = find_checkpoint(path, averaged=averaged).weights
     tensors, metadata = read_tensors(file)
     try:
@@ -150,7 +152,7 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
 
 
 def require_same(found: Any, expected: Any, where: str) -> None:
-    """AssetError naming the first key in which two model configurations differ."""
+    """Raise an AssetError that names the first key in which two model configurations differ."""
     a, b = found.model_dump(), expected.model_dump()
     for key in ["name", *sorted(set(a) | set(b))]:
         if a.get(key) != b.get(key):
@@ -163,14 +165,16 @@ def require_same(found: Any, expected: Any, where: str) -> None:
 
 
 def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> None:
-    """Copies tensors into the model. AssetError when a name, shape or type does not fit, or a value is
-    not finite; the model is then unchanged."""
+    """Copy tensors into the model.
+
+    Raises AssetError, and leaves the model unchanged: a name, a shape or a type does not fit, or a value is not
+    finite."""
     wanted = model.state_dict()
     for name in sorted(set(wanted) | set(tensors)):
         if name not in tensors:
             raise AssetError(f"lacks the tensor '{name}' of this model", where=where)
         if name not in wanted:
-            raise AssetError(f"holds a tensor '{name}' that this model has not", where=where)
+            raise AssetError(f"holds a tensor '{name}' that this model does not have", where=where)
         if wanted[name].shape != tensors[name].shape:
             raise AssetError(
                 f"tensor '{name}' has another shape",
@@ -203,7 +207,8 @@ def save_checkpoint(
     state: dict[str, Any],
     keep: int,
 ) -> Path:
-    """Writes ``run/checkpoints/<step>`` whole or not at all, and then deletes all but the newest ``keep``."""
+    """Write ``run/checkpoints/<step>`` completely or not at all, then delete all but the newest ``keep``
+    checkpoints."""
     final = run / "checkpoints" / f"{step:09d}"
     with output_errors(final):
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -236,7 +241,7 @@ def save_checkpoint(
 
 
 def optimizer_tensors(model: FlowModel, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """AdamW's state by parameter name, and torch's CPU (and GPU) generator states."""
+    """Return AdamW's state by parameter name, and the states of torch's random generators (CPU, and GPU if any)."""
     names = {p: n for n, p in model.named_parameters()}
     tensors = {f"{names[p]}/{k}": v for p, s in optimizer.state.items() for k, v in s.items() if torch.is_tensor(v)}
     tensors["/rng/cpu"] = torch.get_rng_state()
@@ -246,7 +251,7 @@ def optimizer_tensors(model: FlowModel, optimizer: torch.optim.Optimizer) -> dic
 
 
 def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimizer) -> None:
-    """The reverse of :func:`optimizer_tensors`. Raises AssetError."""
+    """Restore what :func:`optimizer_tensors` returned. Raises AssetError."""
     tensors, _ = read_tensors(path)
     for name, p in model.named_parameters():
         found = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
@@ -263,13 +268,13 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
 
 
 def read_state(folder: Path) -> dict[str, Any]:
-    """``state.json``. Raises AssetError."""
+    """Return the content of ``state.json``. Raises AssetError."""
     path = folder / "state.json"
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
         if state["format"] != FORMAT or type(state["step"]) is not int or state["step"] < 0:
             raise ValueError
-        state["seconds"] = float(state.get("seconds", 0.0))  # of all parts of the training; 0 before there was a clock
+        state["seconds"] = float(state.get("seconds", 0.0))  # of the whole training; old files lack it
         if not 0 <= state["seconds"] < 1e12:
             raise ValueError
     except OSError as error:
@@ -280,10 +285,10 @@ def read_state(folder: Path) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where a training begins: at another network's weights, or at a run's newest checkpoint.
+# How a training starts: from the weights of another network, or from the newest checkpoint of its run.
 
 _FREE = {"run"}
-"""Parts of the configuration that may change between a run and its resumption (how it runs, not what it computes)."""
+"""Sections of the configuration that may change when a run is resumed: they do not change the result."""
 _OTHER = {
     "optim.clock": "wall",
     "optim.scale_gamma": 1.0,
@@ -292,11 +297,11 @@ _OTHER = {
     "data.augment.transpose": 0.0,
     "model.quick": False,
 }
-"""Keys that earlier versions had or lacked, and their defaults: what those versions compute today."""
+"""Keys that earlier versions had or lacked, with the values that reproduce what those versions computed."""
 
 
 def resume_run(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> tuple[int, float]:
-    """Restores everything from the newest checkpoint; returns its step and the seconds that it took."""
+    """Restore a run from its newest checkpoint; return its step and the seconds of training so far."""
     folder = newest(out)
     if folder is None:
         raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
@@ -334,7 +339,7 @@ def _leaves(tree, prefix: str = "") -> dict[str, object]:
 
 
 def weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
-    """The weights that ``init_from`` names, and that name. Raises AssetError: of another model."""
+    """Return the weights that ``init_from`` names, and that name. Raises AssetError: they are of another model."""
     model = load_model(config.init_from, expected=None)
     if model.config.name != config.model.name:
         raise AssetError(

@@ -1,4 +1,4 @@
-"""The ``eflow`` command: thin functions over the library, one line per error, exit status as ``blinkgl``'s."""
+"""The ``eflow`` command: thin functions over the library. An error is one line; exit codes are those of ``blinkgl``."""
 
 from __future__ import annotations
 
@@ -68,28 +68,26 @@ def _print_version(wanted: bool) -> None:
 @app.command()
 def train(
     config: Annotated[
-        str | None, typer.Argument(help="YAML file; see configs/eflow/. Without one: --model and --data.")
+        str | None, typer.Argument(help="YAML file, see configs/eflow/. Without a file, give --model and --data.")
     ] = None,
     out: Annotated[
         str | None,
-        typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).", show_default=False),
+        typer.Option("--out", "-o", help="New run folder, or an existing one with --resume.", show_default=False),
     ] = None,
-    model: Annotated[
-        str | None, typer.Option("--model", "-m", help="A network and its size, e.g. ev_flownet-tiny.")
-    ] = None,
+    model: Annotated[str | None, typer.Option("--model", "-m", help="Network and size, e.g. ev_flownet-tiny.")] = None,
     data: Annotated[
         list[str] | None,
-        typer.Option("--data", help="Folder, or recipe (.yaml) that is rendered meanwhile; may be repeated."),
+        typer.Option("--data", help="Folder, or recipe (.yaml) to render during training; may be repeated."),
     ] = None,
     minutes: Annotated[
-        float | None, typer.Option(min=1e-3, help="Length of the training; the rate falls towards its end.")
+        float | None, typer.Option(min=1e-3, help="Length of the training; the learning rate falls towards its end.")
     ] = None,
     overrides: Overrides = None,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print all keys as they would be used, as YAML, and do nothing.")
+        bool, typer.Option("--print-config", help="Print the complete configuration as YAML and exit.")
     ] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")
+        bool, typer.Option("--resume", help="Continue from the newest checkpoint in the run folder.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -109,7 +107,7 @@ def train(
         typer.echo(as_yaml(whole), nl=False)
         return
     if out is None:
-        raise ConfigError("no run folder", where="--out", accepted="a new folder, or one to go on in, with --resume")
+        raise ConfigError("no run folder", where="--out", accepted="a new folder, or an existing one with --resume")
     result = run_training(whole, out, resume=resume, quiet=quiet)
     if not quiet:
         print(f"{result.reason} at step {result.step}: {result.checkpoint}", file=sys.stderr)
@@ -119,19 +117,23 @@ def train(
 def render(
     recipe: Annotated[str, typer.Argument(help="YAML file of `blinkgl generate`.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New folder of windows, to train on or to evaluate with.")],
-    samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="How many windows.")] = 1000,
-    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows out of each sequence.")] = 8,
+    samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="Number of windows.")] = 1000,
+    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows from each sequence.")] = 8,
     window_ms: WindowMs = None,
-    min_events: Annotated[int, typer.Option(min=1, help="Fewest events in each of a sample's two windows.")] = 40,
-    max_flow: Annotated[float, typer.Option(help="Longest median flow of a sample, px.")] = 40.0,
-    min_density: Annotated[float, typer.Option(help="Fewest events per pixel and px of mean flow.")] = 0.0,
-    split: Annotated[str, typer.Option(help="Whose groups: train or test.")] = "train",
-    seed: Annotated[int, typer.Option(min=0, help="Other windows for each.")] = 0,
+    min_events: Annotated[
+        int, typer.Option(min=1, help="Minimum number of events in each of a sample's two windows.")
+    ] = 40,
+    max_flow: Annotated[float, typer.Option(help="Maximum median flow of a sample, px.")] = 40.0,
+    min_density: Annotated[
+        float, typer.Option(help="Minimum number of events per pixel and per px of mean flow.")
+    ] = 0.0,
+    split: Annotated[str, typer.Option(help="Which groups to render: train or test.")] = "train",
+    seed: Annotated[int, typer.Option(min=0, help="Each seed gives other windows.")] = 0,
     overrides: Overrides = None,
     workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
     quiet: Quiet = False,
 ) -> None:
-    """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps what is there by then."""
+    """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps the finished windows."""
     from blinkgl.sequence_files.sequence_dir import refuse_existing
     from eflow.data.online import open_online
     from eflow.data.pool import render_pool
@@ -150,7 +152,7 @@ def render(
     )
     kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
-    refuse_existing(Path(out))  # before a worker has been started
+    refuse_existing(Path(out))  # before any worker starts
     with interruptible(signal.SIGTERM), open_online(source, seed, split=split) as stream:
         done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
     if not quiet:
@@ -170,14 +172,15 @@ def evaluate(
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Iterations = None,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
-    limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     sharpen: Sharpened = False,
     raw: Raw = False,
     focal: Focal = None,
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Score a network or a method on a data set, beside zero flow and what knows the global motion."""
+    """Score a network or a method on a data set, beside baselines: zero flow, and global motions fitted to the
+    truth."""
     from blinkgl.machine.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
@@ -192,7 +195,7 @@ def evaluate(
         with console.status("rendering"):
             source = rendered(dataset, window_ms, limit)
     elif window_ms is not None:
-        raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
+        raise ConfigError("needs a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
         source = open_source(dataset, known_format(format), dt=dt, protocol=protocol, truth=ground_truth)
     with console.status("evaluating") as status:
@@ -218,13 +221,15 @@ def predict(
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
     window_ms: Span = "100",
-    start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
-    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
+    start_ms: Annotated[
+        float | None, typer.Option("--start-ms", help="Start at this time after the first event.")
+    ] = None,
+    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Stop at this time after the first event.")] = None,
     whole: Whole = False,
     truth: Truth = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
-    npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
-    video: Annotated[str | None, typer.Option(help="Also a video of events and flow, .mp4.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None,
+    npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False,
+    video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None,
     warm_start: WarmStart = False,
     sharpen: Sharpen = True,
     empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
@@ -234,9 +239,10 @@ def predict(
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Flow from any event file, by a network or by a method that needs no training.
+    """Compute the flow of any event file, by a network or by a method that needs no training.
 
-    FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
+    FWL (flow warp loss) says how much sharper the events of the new window become when the flow moves them back to its
+    start; above 1 the flow helps."""
     from blinkgl.types.events import Events
     from eflow import infer
     from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
@@ -266,12 +272,12 @@ def submit(
     checkpoint: Network,
     dataset: Annotated[str, typer.Argument(help="The benchmark's test set.")],
     benchmark: Annotated[str, typer.Option(help="dsec or blinkflow.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Zip file to make.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="New zip file.")],
     full: Annotated[bool, typer.Option("--full", help="BlinkFlow: all pixels instead of one per 4x4 cell.")] = False,
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Write a benchmark's submission file; it is checked before it gets its name."""
+    """Write the submission file of a benchmark and check it."""
     from blinkgl.machine.terminal import plain_console
     from eflow.submit import submit_blinkflow, submit_dsec
 
@@ -293,8 +299,8 @@ def import_(
     checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
 ) -> None:
-    """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take. Tensors are read
-    and nothing else; E-RAFT's padding, border and time bins go with them."""
+    """Convert a published checkpoint of E-RAFT to a file for predict, evaluate, submit and train (init_from). Only
+    tensors are read. The file also stores E-RAFT's padding, border and time bins."""
     from eflow.models import parameters_of
     from eflow.published import import_published
 
@@ -304,10 +310,10 @@ def import_(
 
 @app.command()
 def models(
-    name: Annotated[str | None, typer.Argument(help="Only this one, with all that its card says.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Show only this network, with its whole card.")] = None,
     json_out: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
-    """The trained networks that come with the package. Their names stand where a checkpoint may stand."""
+    """List the trained networks that come with the package. Their names can be used in place of a checkpoint."""
     import json
 
     from eflow import shipped
@@ -328,14 +334,17 @@ def models(
 @app.command()
 def pack(
     checkpoint: Network,
-    name: Annotated[str, typer.Option(help="What it will be called by.")],
+    name: Annotated[str, typer.Option(help="Name of the network.")],
     card: Annotated[str, typer.Option(help="YAML: about, data, training, scores, limits, commands (docs/eflow.md).")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder that its folder is made in; eflow/weights ships it.")],
+    out: Annotated[
+        str,
+        typer.Option("--out", "-o", help="Parent of the new folder; networks in eflow/weights ship with the package."),
+    ],
     raw: Raw = False,
 ) -> None:
-    """Make a training a network that can come with the package: weights and a card, 5 MB at most.
+    """Pack a checkpoint as a network that can come with the package: weights (5 MB at most) and a card.
 
-    They are read back before the folder appears."""
+    The weights are read back before the folder appears."""
     from eflow import shipped
 
     folder, full = shipped.pack(checkpoint, name, card, out, averaged=not raw)
@@ -348,18 +357,18 @@ GONE = {
     "export": "torch.onnx.export of eflow.load_model(NAME)'s network: ONNX files are no longer written here",
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
-    "evaluate --confidence": "nothing: no network here says how sure it is",
-    "predict --confidence": "nothing: no network here says how sure it is",
+    "evaluate --confidence": "nothing: no network here estimates its confidence",
+    "predict --confidence": "nothing: no network here estimates its confidence",
     "predict --flo": "--npy",
     "predict --h5": "--npy",
     "import --bins": "E-RAFT's published weights: RAFT's own are no longer read",
-    "pack --store": "single precision, in which it computes",
+    "pack --store": "nothing: weights are stored in single precision",
 }
-"""What earlier versions had, and what to do instead."""
+"""Commands and options of earlier versions, and what to use instead."""
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    """Run one command line (without the program name) and return the exit status; errors of users do not raise."""
     return run_app(app, arguments, "eflow", "eflow", GONE)
 
 

@@ -1,4 +1,4 @@
-"""What the ``eflow`` commands take: options that several of them share, and from words to values."""
+"""Arguments of the ``eflow`` commands: options that several commands share, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -18,82 +18,82 @@ Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Answer = Annotated[
     str,
     typer.Argument(
-        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
-        f"models); or a method that needs no training: {', '.join(METHODS)}."
+        help="Run folder, checkpoint folder, .safetensors file, a network that comes with the package (eflow "
+        f"models), or a method that needs no training: {', '.join(METHODS)}."
     ),
 ]
 Network = Annotated[
     str,
     typer.Argument(
-        help="Run folder, checkpoint folder or .safetensors file; or a network that comes with the package (eflow "
+        help="Run folder, checkpoint folder, .safetensors file, or a network that comes with the package (eflow "
         "models)."
     ),
 ]
 Focal = Annotated[
-    float | None, typer.Option(min=1e-3, help="Focal length in px: contrast-rotation needs it.", show_default=False)
+    float | None, typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False)
 ]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
 WindowMs = Annotated[
     str | None,
-    typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
+    typer.Option(metavar="LOW-HIGH", help="Lengths of windows, of a recipe only. Default: its label interval."),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Raw = Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")]
-Iterations = Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
+Raw = Annotated[bool, typer.Option("--raw", help="Use the last weights instead of the averaged ones.")]
+Iterations = Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")]
 
 Dataset = Annotated[
     str,
     typer.Argument(
-        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of rendered windows; or a recipe (.yaml), "
-        "whose groups of split test are rendered for it."
+        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences or of rendered windows, or a recipe (.yaml), "
+        "whose test groups are rendered."
     ),
 ]
-Protocol = Annotated[
-    str, typer.Option(help="MVSEC: which frames and rows are scored: all, ste-flownet or e-raft (20 Hz).")
-]
+Protocol = Annotated[str, typer.Option(help="MVSEC: frames and rows to score: all, ste-flownet or e-raft (20 Hz).")]
 GroundTruth = Annotated[
     str | None,
     typer.Option(
         "--ground-truth",
-        help="MVSEC: propagated through the 20 Hz flow, or one field scaled; default: the protocol's.",
+        help="MVSEC: propagated (through the 20 Hz flow) or scaled (one field). Default: the protocol's.",
     ),
 ]
 Sharpened = Annotated[
-    bool, typer.Option("--sharpen", help="A network's flow as long as makes the events of its windows sharpest.")
+    bool, typer.Option("--sharpen", help="Scale the flow of a network to the length that makes the events sharpest.")
 ]
 Span = Annotated[
     str,
-    typer.Option("--window-ms", help="Δ: length of each of the two windows; auto: as things move by about 5 px in it."),
+    typer.Option("--window-ms", help="Length Δ of each of the two windows; auto: motion of about 5 px in a window."),
 ]
 Whole = Annotated[
-    bool, typer.Option("--whole", help="One flow: all of the file as one window, or its halves as a pair.")
+    bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
 ]
-Truth = Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")]
-WarmStart = Annotated[bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")]
+Truth = Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo); prints AEE and cosine.")]
+WarmStart = Annotated[
+    bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
+]
 Sharpen = Annotated[
     bool,
-    typer.Option(help="A network's flow as long as makes the events of its windows sharpest; else as it says."),
+    typer.Option(help="Scale the flow of a network to the length that makes the events sharpest."),
 ]
 
 
 def method_named(name: str, focal: float | None, **network: object):
-    """Return the method of that name, unless a file has it; None for a network's.
+    """Return the method of that name; None if it is a network's name or a file.
 
-    network : options that only networks have; with a method, a value that is set is a ConfigError."""
+    network : options that only networks have. Raises ConfigError: one of them is set, but the name is a method's."""
     if name not in METHODS or Path(name).exists():
         if focal is not None:
-            raise ConfigError("only a method takes it", where="--focal", value=focal, accepted=", ".join(METHODS))
+            raise ConfigError("only a method uses it", where="--focal", value=focal, accepted=", ".join(METHODS))
         return None
     for option, value in network.items():
         if value:
-            raise ConfigError(f"{name} is no network", where="--" + option.replace("_", "-"), value=value)
+            raise ConfigError(f"{name} is not a network", where="--" + option.replace("_", "-"), value=value)
     return make_method(name, focal)
 
 
 def network_of(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):
-    """Return the trained network on its device. Raises ConfigError: an option that it, or this machine, has not."""
+    """Return the trained network on its device. Raises ConfigError: this network or machine lacks an option."""
     import torch
 
     from eflow.allocator import keep_memory
@@ -113,14 +113,14 @@ def network_of(checkpoint: str, device: str, raw: bool, precision: str, iteratio
 
 
 def precision_for(model, wanted: str) -> str:
-    """Return fp32 where bf16 is wanted of a device without it."""
+    """Return the precision to use on the model's device: fp32 if it does not support bf16."""
     from eflow.precision import precision_on
 
     return precision_on(next(model.parameters()).device, wanted)
 
 
 def known_format(name: str) -> str:
-    """Return the name of a data set's layout. Raises ConfigError."""
+    """Return the name of a layout of data sets. Raises ConfigError: there is none of that name."""
     from eflow.data.sources import FORMATS
 
     one_of("--format", name, ("auto", *FORMATS))
@@ -128,20 +128,20 @@ def known_format(name: str) -> str:
 
 
 def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
-    """Raises ConfigError where the value is not among those accepted."""
+    """Raise ConfigError if the value is not one of those accepted."""
     if value not in accepted:
         raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
 
 
 def rendered(recipe: str, window_ms: str | None, limit: int | None):
-    """Return samples of a recipe, held in memory."""
+    """Return samples of a recipe, rendered and kept in memory."""
     from eflow.data.online import held
 
     return held(windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
 
 
 def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
-    """Return the online source of a recipe, as a command line asks for it."""
+    """Return the online source of a recipe for the options of a command line."""
     from blinkgl.config.problems import validate
     from eflow.config import SourceConfig
 
@@ -153,7 +153,10 @@ def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
             validate(SourceConfig, tree)
         except (ValueError, ConfigError):
             raise ConfigError(
-                "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
+                "not a range of window lengths",
+                where="--window-ms",
+                value=window_ms,
+                accepted="LOW-HIGH in ms, such as 5-100",
             ) from None
     return validate(SourceConfig, tree)
 

@@ -1,4 +1,4 @@
-"""Where a training computes: its device, the processes of torchrun, and what passes between them."""
+"""Devices of a training, the processes of torchrun, and communication between them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from eflow.precision import use_tf32
 
 
 def setup(config: TrainConfig) -> tuple[int, int, torch.device]:
-    """Return (rank, world, device) and join torchrun's process group where there is one.
+    """Join the process group of torchrun, if any, and return (rank, world, device).
 
-    world : number of processes, of which this is the ``rank``-th."""
+    world : number of processes; rank : the number of this one."""
     rank, world, local = (int(os.environ.get(k, d)) for k, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
     kind = config.run.device
     if kind == "auto":
@@ -38,7 +38,7 @@ def setup(config: TrainConfig) -> tuple[int, int, torch.device]:
 
 
 def to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:
-    """Copy a batch's tensors to the device; the events' in the memory layout that the network has."""
+    """Copy the tensors of a batch to the device, those of events in the memory layout of the network."""
     out = {k: v.to(device, non_blocking=True) if torch.is_tensor(v) else v for k, v in batch.items()}
     if channels_last:
         out.update({k: out[k].contiguous(memory_format=torch.channels_last) for k in ("old", "new") if k in out})
@@ -46,7 +46,7 @@ def to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:
 
 
 def agree(reason: str | None, device: torch.device) -> str | None:
-    """Return the gravest reason to stop that any process has, so that all stop at the same step; None goes on."""
+    """Return the most important reason to stop of all processes, so that all stop at the same step; None: continue."""
     codes = [None, "signal", "time limit", "stop"]
     code = torch.tensor(codes.index(reason), device=device)
     dist.all_reduce(code, op=dist.ReduceOp.MAX)
@@ -55,7 +55,7 @@ def agree(reason: str | None, device: torch.device) -> str | None:
 
 @contextlib.contextmanager
 def compile_errors(enabled: bool):
-    """What torch.compile needs and does not find (a C++ compiler, Triton) is the machine's lack, not a bug of ours."""
+    """Raise a ConfigError if torch.compile lacks something on this machine (a C++ compiler, Triton)."""
     try:
         yield
     except Exception as error:

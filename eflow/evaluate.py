@@ -1,4 +1,4 @@
-"""Scores of a network on a data set: table, JSON, pictures; beside it two answers that need no network."""
+"""Evaluation of a network or a method on a data set, beside baselines; tables, JSON and pictures."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from eflow.pictures import comparison, events_of, write_picture
 
 MEDIAN_FRAMES = 64
 BASELINES = ("zero flow", "median of the set", "median of the frame", "affine of the frame")
-"""Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of
-that frame's ground truth and the affine field nearest to it: the best an answer could be that saw only the global
-motion. But for zero they know the truth, so they are no methods."""
+"""Answers to compare with: zero flow; the component-wise median of the set's ground truth; the median of each frame's
+ground truth; and the affine field nearest to it. All but zero flow are computed from the truth: the last two are the
+best that any global motion can reach."""
 
 
 def evaluate(
@@ -46,17 +46,19 @@ def evaluate(
     sharpen: bool = False,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> dict[str, Any]:
-    """Scores ``model``, or a method that needs no training, on every labelled sample of ``source``.
+    """Score ``model``, or a method that needs no training, on every labelled sample of ``source``.
 
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
-    map); None: nothing is written. limit : score only so many samples, evenly spaced.   sharpen : a network's flow as
-    long as makes the events of its two windows sharpest, as `eflow predict` has it.
-    progress : called with (done, of, AEE so far).
+    map); None: write nothing.
+    limit : score only this many samples, evenly spaced.
+    sharpen : scale the flow of a network to the length that makes the events of its windows sharpest, as `eflow
+    predict` does.
+    progress : called with (samples done, samples in all, AEE so far).
     Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics
     as in :mod:`eflow.metrics`.
 
-    Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events
-    (unless ``empty="skip"``)."""
+    Raises AssetError: no ground truth, unreadable files. EventDataError: a window has no events (unless
+    ``empty="skip"``)."""
     if out is not None:
         refuse_existing(out)
     out = Path(out) if out is not None else None
@@ -110,12 +112,12 @@ def evaluate(
 
 
 def _evenly(of: int, count: int) -> list[int]:
-    """``count`` whole numbers below ``of``, evenly spaced from the first to the last."""
+    """Return ``count`` integers from 0 to ``of`` - 1, evenly spaced, both ends included."""
     return [int(k) for k in np.linspace(0, of - 1, min(count, of)).round()]
 
 
 def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
-    """Its configuration, size and device, as plain data."""
+    """Return configuration, number of parameters and device of a model, as plain data."""
     if not isinstance(model, FlowModel):
         return {"model": {"name": model.name}, "parameters": 0, "device": "cpu"}
     device = next(model.parameters()).device
@@ -126,7 +128,7 @@ def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
 
 
 def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median (2,), and the affine field (H, W, 2) nearest to the truth in the mean square; 0 where nothing is valid."""
+    """Return the median (2,) and the least-squares affine field (H, W, 2) of the truth; zeros if nothing is valid."""
     if not valid.any():
         return np.zeros(2), np.zeros_like(truth)
     y, x = np.indices(valid.shape) / max(valid.shape)
@@ -136,7 +138,7 @@ def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
-    """Component-wise median of the ground truth, over at most 64 samples and every 8th pixel."""
+    """Return the component-wise median of the ground truth over at most 64 samples and every 8th pixel."""
     rows = []
     for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]:
         sample = dataset[i]
@@ -149,14 +151,13 @@ def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
 
 
 def write_json(path: Path, tree: dict) -> None:
-    """Whole or not at all."""
+    """Write a JSON file, completely or not at all."""
     with atomic_file(path) as temporary, output_errors(path):
         Path(temporary).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
 
 
 def show(result: dict[str, Any], console: Console | None = None) -> None:
-    """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80
-    columns."""
+    """Print two tables: all metrics of the network and the baselines, and the network's metrics by scene."""
     console = console or plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
     table = Table(
@@ -182,4 +183,4 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
             table.add_row(scene, str(scores["frames"]), *(f"{scores[c]:.3f}" for c in columns))
         console.print(table)
     if result["skipped"]:
-        console.print(f"{result['skipped']} samples without a valid pixel were left out")
+        console.print(f"{result['skipped']} samples without a valid pixel were skipped")

@@ -1,4 +1,4 @@
-"""The flow of an event file, window by window: a line each, and what is asked to be written."""
+"""Flow of an event file, window by window: one line each, and optionally pictures, arrays and a video."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from eflow.pictures import FlowVideo, events_of
 
 @dataclass(frozen=True)
 class WindowsAsked:
-    """Which windows of a file are looked at.
+    """The windows of a file to process.
 
-    milliseconds : length of each; None: as things move by about 5 px in it.   start_ms, end_ms : from and up to this
-    time after the first event; None: all of it.   whole : all of the file as one window, or its halves as a pair."""
+    milliseconds : length of each; None: motion of about 5 px in a window.
+    start_ms, end_ms : limits, as times after the first event; None: no limit.
+    whole : the whole file is one window, or its halves are a pair."""
 
     milliseconds: float | None = 100.0
     start_ms: float | None = None
@@ -34,8 +35,9 @@ class WindowsAsked:
 
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """What is written, each where it is not None: a new folder of flow and pictures, a video; truth : (H, W, 2) that
-    each flow is measured by.   npy : also float32 arrays in the folder."""
+    """What to write: a new folder of flow and pictures, a video; None: not written.
+
+    npy : also write float32 arrays to the folder.   truth : (H, W, 2) px, ground truth to score each flow with."""
 
     folder: str | None = None
     video: str | None = None
@@ -44,7 +46,7 @@ class Outputs:
 
 
 def milliseconds(text: str) -> float | None:
-    """Of --window-ms; None for "auto"."""
+    """Return the value of --window-ms; None for "auto". Raises ConfigError."""
     if text == "auto":
         return None
     try:
@@ -52,7 +54,7 @@ def milliseconds(text: str) -> float | None:
     except ValueError:
         value = 0.0
     if not 0.001 <= value < 1e9:
-        raise ConfigError("not a length", where="--window-ms", value=text, accepted="milliseconds, or auto")
+        raise ConfigError("not a window length", where="--window-ms", value=text, accepted="milliseconds, or auto")
     return value
 
 
@@ -64,9 +66,10 @@ def show_flows(
     outputs: Outputs,
     say: Callable[[str], None],
 ) -> None:
-    """Says a line for each window, and writes what is asked.   reads : windows of a pair that the predictor looks at.
+    """Process every window: say a line about it and write ``outputs``.
 
-    Raises BlinkGLError: no events, or fewer than two windows of them."""
+    reads : the windows of a pair that the predictor uses.
+    Raises BlinkGLError: the file has no events, or is shorter than its windows."""
     stream, span, factor = _windows(file, predictor, reads, asked, say)
     count = began = 0
     with contextlib.ExitStack() as opened:
@@ -90,7 +93,7 @@ def show_flows(
                 writer.add(window, flow, tensor, outputs.truth)
             if shown:
                 began = window.new.t0 if count == 1 else began
-                # Recordings may count from 1970: the video begins at 0.
+                # Times may be Unix times; captions count from the first window.
                 caption = f"{(window.new.t1 - window.new.t0) / 1000:g} ms at {(window.t_us - began) / 1e6:.3f} s"
                 shown.add(caption, events_of(tensor), flow)
         if not count:
@@ -104,7 +107,7 @@ def show_flows(
 
 
 def _windows(file, predictor, reads, asked, say):
-    """(windows, their length in us, what a flow is multiplied with)."""
+    """Return (windows, their length in µs, factor to multiply the flow with)."""
     if asked.whole:
         window, factor = infer.whole_file(file, reads)
         return [window], window.new.t1 - window.old.t0, factor
@@ -115,7 +118,7 @@ def _windows(file, predictor, reads, asked, say):
         span, longest = infer.likely_span(file, predictor, reads)
         say(f"windows of {span / 1000:g} ms")
         if span == longest:
-            say(f"  as long as the recording allows: things move by less than {infer.LIKELY_PX:g} px in it")
+            say(f"  the longest window of this recording: motion in it is below {infer.LIKELY_PX:g} px")
         _second_opinion(file, predictor, span, first + (longest - span) * len(reads) // 2, reads, say)
     else:
         span = round(asked.milliseconds * 1000)
@@ -124,14 +127,14 @@ def _windows(file, predictor, reads, asked, say):
 
 
 def _second_opinion(file, predictor, span: int, start: int, reads: Sequence[str], say: Callable[[str], None]) -> None:
-    """Say where contrast maximisation, a translation, finds another motion in the window (or pair) of ``span`` µs that
-    begins at ``start``, the middle of the recording, and where the flow makes its events no sharper."""
+    """Check the flow of one window, or pair, of ``span`` µs from ``start`` on, in the middle of the recording: say if
+    it does not make the events sharper, and if contrast maximisation (a translation) finds another motion."""
     window = next(infer.windows(file, span, start_us=start, reads=reads), None)
     if window is None or len(window.new) < LEAST_EVENTS:
         return
     flow, _ = predictor(window)
     if flow_warp_loss(window.new, flow) < 1:
-        say("  the flow makes the events in the middle no sharper: nothing moves there, or too much does at once")
+        say("  the flow makes the events in the middle no sharper: nothing moves there, or many things move at once")
     mine = np.median(flow[window.new.y, window.new.x], axis=0)
     nothing = (getattr(window.new, k)[:0] for k in "xytp")
     old = window.old if len(window.old) else Window(*nothing, window.new.t0 - span, window.new.t0)
@@ -141,13 +144,13 @@ def _second_opinion(file, predictor, span: int, start: int, reads: Sequence[str]
         return
     if np.hypot(*(mine - other)) > max(0.5 * np.hypot(*other), 1.0):
         say(
-            f"  contrast maximisation moves the middle by ({other[0]:.1f}, {other[1]:.1f}) px a window, this flow by "
-            f"({mine[0]:.1f}, {mine[1]:.1f}): where things move their own ways that may be right; look at the pictures"
+            f"  contrast maximisation finds a motion of ({other[0]:.1f}, {other[1]:.1f}) px in the middle window, this "
+            f"flow ({mine[0]:.1f}, {mine[1]:.1f}): right if objects move independently; look at the pictures"
         )
 
 
 def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:
-    """Two lines: errors over all pixels with truth, and over those with events."""
+    """Return two lines: errors over all pixels with truth, and over those with events."""
     valid, hit, lines = np.isfinite(truth).all(-1), np.zeros(truth.shape[:2], bool), ""
     for part in (window.new, window.old):
         hit[part.y, part.x] = True
@@ -159,5 +162,5 @@ def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> 
 
 
 def _fps(span_us: int) -> float:
-    """Windows a second of video: as fast as it happened, but no more than 20."""
+    """Return the windows per second of video: real time, but at most 20."""
     return min(20.0, 1e6 / span_us)

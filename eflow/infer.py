@@ -1,4 +1,4 @@
-"""Flow from events with a trained network: padding, windows of a stream, warm start, files."""
+"""Inference: padding, windows of a stream, warm start, ground truth and output files."""
 
 from __future__ import annotations
 
@@ -28,13 +28,16 @@ from eflow.ops.warp import forward_warp
 from eflow.pictures import comparison, events_of, write_picture
 
 PICTURED = VoxelGrid(bins=2, normalise="none")
-"""Of a method's windows: it sees the events themselves."""
+"""Grid for the pictures of a method, which reads events and no grid."""
 
 
 def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
-    """old and new padded with empty pixels to sizes that the network takes, and the (left, top) pixel of what was
-    there: at the right and bottom to multiples of its stride, so that less than one low-resolution token is added on a
-    side and none is of padding alone; or as the network asks (``pad_to``, ``pad_start``)."""
+    """Return the batch with old and new padded by zeros to a size that the network accepts, and the (left, top) of the
+    original image in it.
+
+    Padding is at the right and bottom, to multiples of the network's stride: less than one low-resolution token is
+    added on a side, and no token is padding alone. A network can ask for another padding (``pad_to``,
+    ``pad_start``)."""
     height, width = batch["new"].shape[-2:]
     multiple = model.pad_to or model.divisor
     right, down = -width % multiple, -height % multiple
@@ -45,9 +48,9 @@ def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
 
 @torch.inference_mode()
 def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPrediction:
-    """The model's prediction in evaluation mode at the batch's own size; any height and width >= the model's least.
+    """Return the prediction of the model in evaluation mode, at the size of the batch.
 
-    batch : old, new (N, C, H, W), optional flow_init. Raises EventDataError: too small."""
+    batch : old, new (N, C, H, W), optional flow_init. Raises EventDataError: smaller than ``model.least``."""
     height, width = batch["new"].shape[-2:]
     if min(height, width) < model.least:
         raise EventDataError(
@@ -76,7 +79,7 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
 
 @dataclass(frozen=True)
 class StreamWindow:
-    """Reference time and the two windows round it."""
+    """A reference time, the window before it and the window after it."""
 
     t_us: int
     old: Window
@@ -91,11 +94,12 @@ def windows(
     end_us: int | None = None,
     reads: Sequence[str] = ("old", "new"),
 ) -> Iterator[StreamWindow]:
-    """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while
-    both windows lie inside [start, end); from start on where only the new one is read.
+    """Yield the successive windows of an event file, at reference times start + Δ, start + 2Δ, … while both windows are
+    inside [start, end). If only the new window is read, the first reference time is start.
 
-    start_us, end_us : default the first event's time and the last's + 1. Streams; holds two windows and a chunk.
-    Raises EventDataError: no event in :data:`JUMP` windows, since a clock that was set anew would give billions."""
+    start_us, end_us : default: the time of the first event, and that of the last + 1.
+    The file is streamed: two windows and a chunk are in memory.
+    Raises EventDataError: :data:`JUMP` windows in a row have no event; a clock that jumps would give billions."""
     pending, t, skipped = Events.empty(), None, span_us if "old" in reads else 0
     last = None
     for chunk in file.chunks():
@@ -109,7 +113,7 @@ def windows(
                 raise EventDataError(
                     f"event times jump by {(int(pending.t[0]) - t) * 1e-6:.6g} s",
                     where=f"{file.path}, {(t - start_us) / 1000:g} ms after the first",
-                    accepted="--end-ms before the jump or --start-ms behind it",
+                    accepted="--end-ms before the jump or --start-ms after it",
                 )
             yield _pair(pending, t, span_us)
             pending = pending.window(t, last + 1)
@@ -121,9 +125,9 @@ def windows(
 
 
 JUMP = 10_000
-"""Windows without an event from which on a recording's clock is taken to have jumped."""
+"""Number of empty windows in a row from which the clock of a recording is considered to have jumped."""
 LIKELY_PX = 5.0
-"""Displacement in a window that :func:`likely_span` looks for: networks are trained on 2 to 8 px."""
+"""Displacement in a window that :func:`likely_span` aims at, px: networks are trained on 2 to 8 px."""
 
 
 def likely_span(
@@ -131,10 +135,11 @@ def likely_span(
     predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]],
     reads: Sequence[str] = ("old", "new"),
 ) -> tuple[int, int]:
-    """(Δ, the longest that there is), µs: how long things in the recording take to move by about :data:`LIKELY_PX`.
-    ``predictor``'s own flow where there are events, at three places of the recording, tells how fast they are; tried
-    with shorter and longer windows until it stands. From 1 ms to half of the recording, or all of it for a predictor
-    that ``reads`` the new window alone. Raises EventDataError: no events, or none at those places."""
+    """Return (Δ, longest possible Δ) in µs, where Δ is the time in which motion is about :data:`LIKELY_PX`.
+
+    The speed is the median of the predictor's own flow at pixels with events, at three places of the recording; Δ is
+    changed until that speed fits it. Δ is at least 1 ms and at most half of the recording, or all of it if the
+    predictor ``reads`` only the new window. Raises EventDataError: no events, or none at those places."""
     ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
     if not ends:
         raise EventDataError("holds no events", where=str(file.path))
@@ -153,7 +158,9 @@ def likely_span(
             speeds.append(float(np.median(np.hypot(*flow[window.new.y, window.new.x].T))))
         if not speeds:
             raise EventDataError(
-                "no events where they are looked for", where=str(file.path), accepted="a length instead of auto"
+                "no events at a quarter, half and three quarters of the recording",
+                where=str(file.path),
+                accepted="--window-ms in milliseconds instead of auto",
             )
         factor = min(max(LIKELY_PX / max(float(np.median(speeds)), 1e-3), 0.4), 2.5)
         span = int(min(max(span * factor, 1000), longest))
@@ -163,9 +170,11 @@ def likely_span(
 
 
 def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tuple[StreamWindow, float]:
-    """The file as one pair: its first half is the old window, its second the new; for a network that ``reads`` the new
-    one alone, all of it is that. Also gives the factor from the flow over the new window to the flow over the whole
-    file at constant image velocity."""
+    """Return the whole file as one pair, and the factor from the flow of its new window to that of the whole file at
+    constant velocity.
+
+    The first half is the old window, the second half the new one. If a network ``reads`` only the new window, that is
+    the whole file. Raises EventDataError: fewer than two events."""
     events = file.read()
     if len(events) < 2:
         raise EventDataError("fewer than two events", where=str(file.path))
@@ -183,14 +192,15 @@ def _pair(events: Events, t: int, span: int) -> StreamWindow:
 
 
 class MethodPredictor:
-    """A method without training over a stream of windows, as :class:`Predictor` takes them.
-    empty : "error", or "zero" flow for a pair of windows in which it finds nothing to go by."""
+    """A method without training, called like a :class:`Predictor`.
+
+    empty : "error", or "zero" flow for a pair of windows in which the method finds no motion."""
 
     def __init__(self, method: Method, height: int, width: int, *, empty: str = "error"):
         self.method, self.height, self.width, self.empty = method, height, width, empty
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
-        """flow (H, W, 2) float32 px t -> t + Δ, and the new window's events (2, H, W) for a picture."""
+        """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's events (2, H, W) for a picture."""
         seen = PICTURED(window.new, self.height, self.width)
         try:
             return self.method(window.old, window.new, self.height, self.width), seen
@@ -206,9 +216,11 @@ class MethodPredictor:
 
 
 class Predictor:
-    """A model over a stream of windows. ``warm_start`` carries each flow along itself to the next reference time
-    (networks with an iterated low-resolution flow only). empty : "error", or "zero" flow for
-    a window without events.   sharpen : multiply each flow by the factor that makes the events of its windows sharpest
+    """A model that is called with the windows of a stream, one after the other.
+
+    warm_start : start from the previous flow, moved along itself (networks with an iterated low-resolution flow only).
+    empty : "error", or "zero" flow for a window without events.
+    sharpen : multiply each flow by the factor that makes the events of its windows sharpest
     (:func:`eflow.methods.contrast.sharpest_length`)."""
 
     def __init__(
@@ -227,7 +239,9 @@ class Predictor:
         self._low: torch.Tensor | None = None
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
-        """flow (H, W, 2) float32 px t -> t + Δ, and the new window's event tensor (C, H, W)."""
+        """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's event tensor (C, H, W).
+
+        Raises EventDataError: a window has no events (unless ``empty`` is "zero")."""
         read = {name: getattr(window, name) for name in self.model.reads}
         for name, w in read.items():
             if not len(w) and self.empty == "error":
@@ -254,7 +268,7 @@ class Predictor:
 
 
 def open_sized(path: str | os.PathLike, size: tuple[int, int] | None = None) -> EventFile:
-    """The event file with its sensor size: given, stored, or the smallest known sensor that holds its events."""
+    """Open an event file with its sensor size: given, stored, or the smallest known sensor that contains its events."""
     from dataclasses import replace
 
     file = open_events(path)
@@ -262,8 +276,9 @@ def open_sized(path: str | os.PathLike, size: tuple[int, int] | None = None) -> 
 
 
 def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
-    """Ground truth of one window: .npy (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC), .flo. Returns (H, W, 2) with
-    NaN where there is none. Raises AssetError."""
+    """Return the ground truth of one window, (H, W, 2) px, NaN where there is none.
+
+    path : .npy of shape (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC) or .flo. Raises AssetError."""
     path = Path(path)
     if path.suffix == ".npy":
         from blinkgl.io.images import read_npy
@@ -290,10 +305,10 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
 
 
 class FlowWriter:
-    """A folder of flow that appears whole or not at all: ``%06d.png`` (DSEC's 16 bits), ``pictures/%06d.png``, and
-    ``timestamps.txt`` (from_us, to_us). Existing folders are refused.
+    """Writes a new folder of flow, completely or not at all: ``%06d.png`` (DSEC's 16 bits), ``pictures/%06d.png`` and
+    ``timestamps.txt`` (from_us, to_us).
 
-    npy : besides, exact, ``npy/%06d.npy`` (H, W, 2) float32."""
+    npy : also write exact flow to ``npy/%06d.npy``, (H, W, 2) float32. Raises OutputError: the folder exists."""
 
     def __init__(self, final: str | os.PathLike, *, npy: bool = False, pictures: bool = True):
         self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
@@ -315,7 +330,7 @@ class FlowWriter:
         tensor: np.ndarray,
         truth: np.ndarray | None = None,
     ) -> None:
-        """flow (H, W, 2) px; tensor : the new window's events, as a predictor gives them."""
+        """Write one window.   flow : (H, W, 2) px.   tensor : the new window's events, as a predictor returns them."""
         name, valid, flow = f"{self.count:06d}", np.isfinite(flow).all(-1), flow.astype(np.float32, copy=False)
         write_flow_png(self._tmp / f"{name}.png", flow, valid)
         with output_errors(self.final):
@@ -340,26 +355,26 @@ class FlowWriter:
                     refuse_existing(self.final)
                     os.rename(self._tmp, self.final)
         except BaseException:
-            if kind is None:  # else the first error is what is told
+            if kind is None:  # otherwise the first error is reported
                 raise
         finally:
             shutil.rmtree(self._tmp, ignore_errors=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What makes one doubt a recording before a network is asked: clock ticks in place of µs, pixels that drown the rest.
+# Warnings about a recording: clock ticks instead of µs, a few pixels with most of the events.
 #
-# Neither is an error: a network answers all the same, and the answer is worth nothing.
+# They are not errors, since a network still returns a flow; but that flow is useless.
 
 SLOWEST, FASTEST = 1e-3, 1e4
-"""Events per second and pixel that cameras give: a dark still scene has 0.05; a dead time of 100 µs allows 10,000."""
+"""Plausible events per second and pixel: a dark still scene has 0.05; a refractory period of 100 µs allows 10,000."""
 FLOOD, FEW = 0.5, 0.005
-"""Share of the events in that share of the pixels, from which on they are said to be hot."""
+"""Pixels are called hot if the share ``FEW`` of all pixels has more than the share ``FLOOD`` of all events."""
 _ENOUGH = 1000
 
 
 def doubts(events: Events, height: int, width: int) -> list[str]:
-    """Lines about the first events of a recording of (height, width) px; empty where all is as it should be."""
+    """Return warnings, one line each, about the first events of a recording of (height, width) px."""
     if len(events) < _ENOUGH:
         return []
     found = []
@@ -368,15 +383,14 @@ def doubts(events: Events, height: int, width: int) -> list[str]:
     if not SLOWEST <= rate <= FASTEST:
         other = "ns, or ticks of the camera's clock" if rate < SLOWEST else "ms, or ticks of a slower clock"
         found.append(
-            f"{rate:.2g} events per second and pixel are not a camera's (0.05 to 1000): are its times {other}, "
-            "instead of µs?"
+            f"{rate:.2g} events per second and pixel; cameras give 0.05 to 1000. Are the times {other}, instead of µs?"
         )
     counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=height * width)
     few = max(round(FEW * counts.size), 1)
     share = np.partition(counts, -few)[-few:].sum() / len(events)
     if share > FLOOD:
         found.append(
-            f"{few} pixels ({100 * FEW:g} %) have {100 * share:.0f} % of the events: hot pixels, or a light that "
-            "flickers; flow there is not motion"
+            f"{few} pixels ({100 * FEW:g} %) have {100 * share:.0f} % of the events: hot pixels or a flickering light; "
+            "flow there is not motion"
         )
     return found

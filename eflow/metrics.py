@@ -1,7 +1,7 @@
-"""Error measures, defined once. NumPy, float64 sums.
+"""Error metrics of flow (NumPy, float64) and the training loss (torch).
 
-Averages follow BlinkFlow: over the valid pixels of a frame, over the frames of a scene, over scenes. A frame without a
-valid pixel is left out and counted.
+Averages follow BlinkFlow: over the valid pixels of a frame, then over the frames of a scene, then over scenes. A frame
+without a valid pixel is skipped and counted.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ MAX_FLOW = 400.0
 
 
 def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float] | None:
-    """All of :data:`NAMES` of one frame.
+    """Return all metrics of :data:`NAMES` for one frame, or None if it has no valid pixel.
 
-    predicted, truth : (H, W, 2) px. valid : (H, W) bool; pixels with |gt| >= 400 are left
-    out too, occluded ones are not.
-    Returns None when no pixel is left. A NaN prediction gives NaN, not a better mean.
+    predicted, truth : (H, W, 2) px. valid : (H, W) bool. Pixels with |gt| >= 400 are excluded, too; occluded pixels are
+    included. A NaN in the prediction makes the metrics NaN.
     """
     gt = np.asarray(truth, np.float64)[valid]
     pr = np.asarray(predicted, np.float64)[valid]
@@ -56,8 +55,10 @@ def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -
 
 
 def angle_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle in radians between vectors (..., 2), by atan2(|cross|, dot): exact where arccos of a rounded cosine is not.
-    Where one is zero no direction is right: 90 degrees; where both are, 0."""
+    """Return the angle in radians between vectors (..., 2).
+
+    It is atan2(|cross|, dot), which is accurate at 0 and 180 degrees where arccos is not. If one vector is zero the
+    angle is 90 degrees; if both are, it is 0."""
     cross, dot = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1)
     angle = np.arctan2(np.abs(cross), dot)
     zero_a, zero_b = (a == 0).all(-1), (b == 0).all(-1)
@@ -65,14 +66,14 @@ def angle_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def angle_3d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle in radians between (u, v, 1) and (u', v', 1)."""
+    """Return the angle in radians between (u, v, 1) and (u', v', 1)."""
     a3, b3 = (np.concatenate([f, np.ones_like(f[..., :1])], -1) for f in (a, b))
     return np.arctan2(np.linalg.norm(np.cross(a3, b3), axis=-1), (a3 * b3).sum(-1))
 
 
 @dataclass
 class Tally:
-    """Collects frames; ``table()`` averages."""
+    """Collects the metrics of frames and averages them."""
 
     frames: dict[str, list[dict[str, float]]] = field(default_factory=dict)
     skipped: int = 0
@@ -84,14 +85,14 @@ class Tally:
             self.frames.setdefault(scene, []).append(metrics)
 
     def scenes(self) -> dict[str, dict[str, float]]:
-        """Per scene, the mean over its frames, and their number."""
+        """Return the mean over the frames of each scene, and their number."""
         return {
             scene: {**{k: float(np.mean([f[k] for f in rows])) for k in rows[0]}, "frames": len(rows)}
             for scene, rows in sorted(self.frames.items())
         }
 
     def total(self) -> dict[str, float]:
-        """Mean over scenes; empty when nothing was scored."""
+        """Return the mean over scenes; empty if nothing was scored."""
         scenes = list(self.scenes().values())
         if not scenes:
             return {}
@@ -117,15 +118,16 @@ def sequence_loss(
     match_weight: float = 0.5,
     count: Tensor | None = None,
 ) -> Tensor:
-    """sum over i of w_i · mean over valid pixels of the error of V_i (:func:`pixel_error`).
+    """Return the sum over i of w_i · mean over valid pixels of the error of V_i (:func:`pixel_error`).
 
-    flow : (N, 2, H, W) px. valid : (N, H, W) bool; what lies outside (|gt| >= 400 included) may hold anything, NaN too.
-    w_i = gamma^(N - i) for refinements 1 … N of one field, and ``match_weight`` for the matching layer's, which would
-    have gamma^N in the BlinkFlow paper (whose exponent N - 1 is a misprint), 1.45 % of the whole at N = 12.
-    Decoder scales weigh the same, sum 1.
+    flow : (N, 2, H, W) px. valid : (N, H, W) bool; invalid pixels may have any value, NaN included.
+    w_i is gamma^(N - i) for the refinements 1 … N of a field and ``match_weight`` for the flow of the matching layer.
+    (The BlinkFlow paper gives it gamma^N, with a misprint in the exponent: 1.45 % of the total at N = 12.) The scales
+    of a decoder have equal weights that sum to 1.
     count : number to divide by instead of the batch's valid pixels (data-parallel training: the mean over ranks).
 
-    The mean is over *valid* pixels, so that sparse ground truth has the gradient scale of dense. No valid pixel: 0.
+    The mean is over *valid* pixels, so that gradients do not depend on how sparse the ground truth is. Without a valid
+    pixel the loss is 0.
     """
     target = torch.where(valid[:, None], flow, 0)
     total = (valid.sum() if count is None else count).clamp(min=1)
@@ -142,20 +144,23 @@ def sequence_loss(
 
 
 def pixel_error(predicted: Tensor, target: Tensor, loss: LossConfig) -> Tensor:
-    """(N, 2, H, W) px, twice -> (N, H, W): the sum of ``loss``'s terms, each times its weight. With e the end-point
-    error and k = ``loss.knee`` px:
+    """Return the weighted sum of the terms of ``loss`` at each pixel, (N, H, W), of two flows (N, 2, H, W) px.
 
+    With the end-point error e and k = ``loss.knee`` px:
     l1: |du| + |dv|.   epe: e.
-    length: |log((|flow| + k) / (|true flow| + k))|. What is uncertain is best left short by the other terms (their
-    minimum is the median of each component); this one is smallest at the median of the length, whatever the direction.
+    length: |log((|flow| + k) / (|true flow| + k))|. Under uncertainty the other terms favour short flow, since the
+    median of each component minimises them; this term is minimal at the median of the length.
     """
     difference = predicted - target
     total = predicted.new_zeros(predicted.shape[0], *predicted.shape[2:])
     if loss.l1:
         total = total + loss.l1 * difference.abs().sum(1)
     if loss.epe:
-        total = total + loss.epe * ((difference**2).sum(1) + 1e-6).sqrt()  # a root whose slope is finite at 0
+        total = total + loss.epe * ((difference**2).sum(1) + 1e-6).sqrt()  # finite slope at 0
     if loss.length:
         length = ((predicted**2).sum(1) + 1e-6).sqrt()
-        total = total + loss.length * (torch.log(length + loss.knee) - torch.log(target.norm(dim=1) + loss.knee)).abs()
+        total = (
+            total
+            + loss.length * (torch.log(length + loss.knee) - torch.log(target.norm(dim=1) + loss.knee)).abs()
+        )
     return total

@@ -1,4 +1,4 @@
-"""Events, ground truth, prediction and error side by side, with what their colours mean; pictures and a video."""
+"""Pictures and videos of events, ground truth, prediction and error, side by side with captions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from blinkgl.io.images import encode_image
 from blinkgl.io.video import VideoWriter
 
 _GAP, BAR = 4, 18
-"""Pixels between panels, and of the captions' bar above them."""
+"""Gap between panels and height of the bar of captions above them, px."""
 _STEADY = 0.95
 _HEAT = np.array([[0, 0, 0], [70, 0, 90], [190, 40, 60], [250, 150, 30], [255, 250, 190]], np.float32)
 
 
 def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.ndarray:
-    """(H, W) px error to (H, W, 3) uint8: black none, through red, to pale yellow at
-    ``largest`` and beyond; invalid grey."""
+    """Return a picture (H, W, 3) uint8 of an error (H, W) px: black for 0, then red, pale yellow from ``largest`` on,
+    grey where invalid."""
     at = np.clip(np.nan_to_num(error, nan=largest) / max(largest, 1e-9), 0, 1) * (len(_HEAT) - 1)
     low = np.minimum(at.astype(int), len(_HEAT) - 2)
     rgb = _HEAT[low] + (_HEAT[low + 1] - _HEAT[low]) * (at - low)[..., None]
@@ -30,7 +30,7 @@ def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.nda
 
 
 def events_of(tensor: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 picture of an event tensor (C, H, W): where it is positive (blue) and negative (red)."""
+    """Return a picture (H, W, 3) uint8 of an event tensor (C, H, W): positive values blue, negative red."""
     strength = np.abs(tensor)
     top = np.percentile(strength[strength > 0], 95) if (strength > 0).any() else 1.0
     level = lambda t: np.minimum(8, np.ceil(3 * np.clip(t, 0, None).sum(0) / top)).astype(np.uint16)
@@ -46,9 +46,10 @@ def comparison(
     largest: float | None = None,
     caption: str = "events",
 ) -> np.ndarray:
-    """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction), with a bar of
-    :data:`BAR` px above that says what is shown and at what length a colour is full. Flow panels share
-    one scale: ``largest`` px, or the 99th percentile of the true speed (of the predicted one without truth).
+    """Return one RGB strip: events | ground truth | prediction | error; without truth events | prediction.
+
+    A bar of :data:`BAR` px above names each panel and the length of flow at full colour. Flow panels share one scale:
+    ``largest`` px, or the 99th percentile of the true speed (without truth, of the predicted speed).
     events : (H, W, 3) uint8; flows (H, W, 2) px. caption : of the events."""
     panels = [(caption, events)]
     if truth is None or valid is None or not valid.any():
@@ -74,17 +75,17 @@ def comparison(
 
 
 def full_colour(flow: np.ndarray) -> float:
-    """The speed, px, that flow (..., 2) has full colour at: its 99th percentile."""
+    """Return the length of flow (..., 2) at full colour, px: its 99th percentile."""
     speed = np.hypot(flow[..., 0], flow[..., 1])
     speed = speed[np.isfinite(speed)]
     return (float(np.percentile(speed, 99)) if speed.size else 0.0) or 1.0
 
 
 class FlowVideo:
-    """Events and flow of successive windows as a video that appears whole or not at all. Its scale grows at once and
-    falls slowly, so that colours do not flicker; each panel is captioned. Small sensors are shown twice as large.
+    """Writes a video of the events and flow of successive windows, completely or not at all.
 
-    fps : windows a second of video.   Raises OutputError: it cannot be written."""
+    The colour scale grows at once and falls slowly, so that colours do not flicker. Small sensors are enlarged twice.
+    fps : windows per second of video. Raises OutputError: the video cannot be written."""
 
     def __init__(self, path: str | os.PathLike, height: int, width: int, fps: float):
         self._path, self._fps, self._factor, self._largest = path, fps, 2 if height < 200 else 1, 0.0
@@ -100,12 +101,13 @@ class FlowVideo:
         return self
 
     def add(self, caption: str, events: np.ndarray, flow: np.ndarray) -> None:
-        """caption : above the events, e.g. their time. events (H, W, 3) uint8; flow (H, W, 2) px."""
+        """Add one window.   caption : text above the events, e.g. their time.   events : (H, W, 3) uint8; flow (H, W,
+        2) px."""
         self._largest = max(_STEADY * self._largest, full_colour(flow))
         self._video.write(self._fit(comparison(events, flow, largest=self._largest, caption=caption)))
 
     def _fit(self, strip: np.ndarray) -> np.ndarray:
-        """Enlarged, and of even height and width as the codec wants."""
+        """Return the strip enlarged and padded to an even height and width, which the codec needs."""
         strip = strip.repeat(self._factor, 0).repeat(self._factor, 1)
         return np.pad(strip, ((0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)), constant_values=255)
 
@@ -114,6 +116,6 @@ class FlowVideo:
 
 
 def write_picture(path: str | os.PathLike, image: np.ndarray) -> None:
-    """PNG, whole or not at all."""
+    """Write a PNG, completely or not at all."""
     with atomic_file(path) as temporary:
         Path(temporary).write_bytes(encode_image(image))

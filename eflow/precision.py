@@ -1,4 +1,4 @@
-"""The precision that a device computes in, and islands of float32 where bfloat16 is not good enough."""
+"""Precision of computations, and islands of float32 where bfloat16 is not accurate enough."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from blinkgl.machine.cpu import bf16_instructions
 
 
 def lacks_bf16(device: torch.device) -> str:
-    """Why bf16 makes no sense on the device, in words; "" where it does. By the instruction set, not by a timed probe:
-    two probes on a busy machine may differ, and a run that is resumed should compute as it did."""
+    """Return the reason why bf16 is of no use on the device, as text; "" if it is of use.
+
+    The instruction set decides, not a timed probe: probes on a busy machine may differ, and a resumed run should
+    compute as before."""
     if device.type == "cuda":
         if torch.cuda.is_bf16_supported(including_emulation=False):
             return ""
@@ -25,7 +27,7 @@ def lacks_bf16(device: torch.device) -> str:
 
 
 def precision_on(device: torch.device, wanted: str, quiet: bool = False) -> str:
-    """``wanted`` ("fp32" or "bf16"), or "fp32" where the device cannot; one line on stderr says so."""
+    """Return ``wanted`` ("fp32" or "bf16"), or "fp32" and a line on stderr if the device has no bf16."""
     reason = lacks_bf16(device) if wanted == "bf16" else ""
     if reason and not quiet:
         print(f"precision: fp32 instead of bf16: {reason}", file=sys.stderr, flush=True)  # noqa: T201
@@ -33,22 +35,23 @@ def precision_on(device: torch.device, wanted: str, quiet: bool = False) -> str:
 
 
 def use_tf32(device: torch.device, wanted: bool = True) -> bool:
-    """Whether fp32 products on a card are made of TF32 ones from here on, which have ten bits instead of 23 and are
-    several times faster: where it is wanted and the card has them (capability 8.0 and above). Fp32 islands
-    (:func:`eflow.precision.fp32`) stay exact."""
+    """Switch TF32 for fp32 products on or off, and return whether it is on.
+
+    TF32 is several times faster and has ten bits of fraction instead of 23. It needs a GPU of capability 8.0 or above.
+    Fp32 islands (:func:`eflow.precision.fp32`) do not use it."""
     able = wanted and device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = able
     return able
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where bf16 is not good enough: softmax and expectation, coordinates, flow accumulation, upsampling (errors of px
-# otherwise).
+# Parts that bf16 would compute with errors of pixels: softmax and expectation, coordinates, accumulation of flow,
+# upsampling.
 
 
 @contextmanager
 def fp32(x: Tensor) -> Iterator[None]:
-    """Context in which autocast, and on a card TF32, are off: an fp32 island. Cast the inputs with ``.float()``."""
+    """Context without autocast and TF32, an fp32 island. Cast the inputs with ``.float()``."""
     with torch.autocast(x.device.type if x.device.type in ("cpu", "cuda") else "cpu", enabled=False):
         # TF32 keeps 10 bits of a float32's fraction.
         tf32 = x.device.type == "cuda" and torch.backends.cuda.matmul.allow_tf32

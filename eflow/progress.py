@@ -1,4 +1,4 @@
-"""Progress of training on the terminal, a live line on a TTY, one now and then otherwise; and its log in files."""
+"""Progress of a training: a live line on a terminal or a line every ten seconds, and log files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from blinkgl.machine.terminal import plain_column, plain_console
 
 T = TypeVar("T")
 _QUIET_S = 10.0
-"""Seconds between lines where there is no terminal."""
+"""Seconds between lines if the output is not a terminal."""
 
 
 class TrainProgress:
-    """Shows step, loss, EPE (smoothed), samples/s and time left: until the last step or, where that comes first, the
-    time limit. The first line comes before the first step, the next after it.
+    """Shows step, smoothed loss and EPE, samples/s and the time left until the last step or the time limit.
 
-    where : device and precision, in words.   minutes : time limit, counted from ``began`` (s on ``clock``).
+    The first line appears before the first step, the second after it.
+    where : device and precision, as text.   minutes : time limit, counted from ``began`` (s of ``clock``).
     rate : samples/s over the last steps."""
 
     def __init__(
@@ -69,7 +69,8 @@ class TrainProgress:
         return self
 
     def update(self, step: int, values: Iterable[tuple[float, float]] = ()) -> None:
-        """After ``step`` steps. values : (loss, end-point error) of those that have been read since the last call."""
+        """Show the state after ``step`` steps. values : (loss, end-point error) of the steps read since the last
+        call."""
         now = self._clock()
         speed = (step - self._step) * self.batch / max(now - self._time, 1e-9)
         self.rate = speed if self.rate == 0 else 0.9 * self.rate + 0.1 * speed
@@ -91,19 +92,21 @@ class TrainProgress:
         if self._deadline is None or now + left <= self._deadline:
             return f"{_hms(left)} left"
         left = max(self._deadline - now, 0.0)
-        return f"{_hms(left)} left, the time limit, at about step {self._step + int(left * self.rate / self.batch)}"
+        return (
+            f"{_hms(left)} left until the time limit, at about step {self._step + int(left * self.rate / self.batch)}"
+        )
 
     def _print(self, line: str) -> None:
         print(line, file=sys.stderr, flush=True)  # noqa: T201
 
     def say(self, line: str) -> None:
-        """A line of its own."""
+        """Print a separate line."""
         if self.enabled:
             self._live.console.print(line) if self._live is not None else self._print(line)
 
     def note(self, step: int, scores: dict[str, float]) -> None:
-        """A validation result."""
-        self._time = self._clock()  # validation is not training time
+        """Print the scores of a validation."""
+        self._time = self._clock()  # validation does not count as training time
         self.say(f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items()))
 
     def __exit__(self, *_) -> None:
@@ -112,7 +115,7 @@ class TrainProgress:
 
 
 class Waiting(Generic[T]):
-    """An iteration, and the share of the wall time that was spent on waiting for what comes next (``share``)."""
+    """Iterates over items; ``share`` is the share of the wall time spent waiting for the next one."""
 
     def __init__(self, items: Iterable[T], clock: Callable[[], float] = time.monotonic):
         self._items, self._clock, self._waited, self._began = items, clock, 0.0, clock()
@@ -135,7 +138,7 @@ class Waiting(Generic[T]):
 
 
 class Counting:
-    """So many of so many things, with the time left: at once, every ten seconds, and at the end."""
+    """Prints a count and the time left: at the start, every ten seconds, and at the end."""
 
     def __init__(self, total: int, what: str, enabled: bool, clock: Callable[[], float] = time.monotonic):
         self.total, self.what, self.enabled, self._clock = total, what, enabled, clock
@@ -155,10 +158,10 @@ class Counting:
 
 
 def told(rendering: dict[str, float], waited: float) -> str:
-    """What online rendering cost, in words."""
+    """Return a line about the cost of online rendering."""
     line = (
         f"{rendering['rendered']} samples rendered, {rendering['render_ms']:.1f} processor ms each; training waited "
-        f"{100 * waited:.0f} % of the time"
+        f"for them {100 * waited:.0f} % of the time"
     )
     if rendering["failed_sequences"]:
         line += f"; {rendering['failed_sequences']} sequences failed and were replaced"
@@ -173,31 +176,32 @@ def _hms(seconds: float) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a training says of itself while it goes on: readings of its steps, log.jsonl, and what makes it stop.
+# State of a running training: loss of its steps, signals, log files.
 
 
 class TrainingError(BlinkGLError):
-    """Training cannot go on (loss not finite)."""
+    """Training cannot continue (loss not finite)."""
 
 
 class Readings:
-    """Loss, end-point error and gradient norm of the steps, which stay on the device until they are asked for: to read
-    a number is to wait for all that was computed before it. The latest ones that were read are ``loss``, ``epe`` and
-    ``norm``."""
+    """Loss, end-point error and gradient norm of the steps, kept on the device until they are read.
+
+    Reading a number from a GPU waits for everything computed before it. ``loss``, ``epe`` and ``norm`` are the last
+    values read."""
 
     def __init__(self, out: Path):
         self._out, self._pending = out, []
         self.loss = self.epe = self.norm = float("nan")
 
     def add(self, step: int, names: list[str], loss: Tensor, epe: Tensor, norm: Tensor) -> None:
-        """After ``step`` steps, on the samples of these names."""
+        """Add the values of step ``step``.   names : of its samples."""
         self._pending.append((step, names, torch.stack([v.detach().float() for v in (loss, epe, norm)])))
 
     def values(self) -> list[tuple[float, float]]:
-        """(loss, end-point error) of each step since the last call, in one copy.
+        """Return (loss, end-point error) of each step since the last call, in one copy.
 
-        Raises TrainingError at the first that is not finite, having named its samples in ``nan_batch.json``. Steps
-        after it were made with what it left, so whoever saves asks before."""
+        Raises TrainingError at the first value that is not finite, after writing the names of its samples to
+        ``nan_batch.json``. Call this before saving a checkpoint: later steps are spoilt, too."""
         read = torch.stack([v for _, _, v in self._pending]).tolist() if self._pending else []
         for (step, names, _), (loss, _, norm) in zip(self._pending, read, strict=True):
             if not np.isfinite([loss, norm]).all():
@@ -223,13 +227,13 @@ def _stop_on_nan(out: Path, step: int, names: list[str], loss: float, norm: floa
 
 
 class Signals:
-    """SIGINT and SIGTERM become a flag that the loop reads between steps; a second SIGINT interrupts at once."""
+    """Turns SIGINT and SIGTERM into a flag that the loop reads between steps; a second SIGINT interrupts at once."""
 
     reason: str | None = None
 
     def __enter__(self) -> Signals:
         self._old = {}
-        with contextlib.suppress(ValueError):  # not the main thread: the caller's business
+        with contextlib.suppress(ValueError):  # not in the main thread: the caller handles signals
             for s in (signal.SIGINT, signal.SIGTERM):
                 self._old[s] = signal.signal(s, self._note)
         return self
@@ -245,10 +249,10 @@ class Signals:
 
 
 class Log:
-    """log.jsonl, one object per line, tensorboard, and log.csv, a row for each line with the columns that a plot wants.
-    On resuming, lines past the checkpoint are dropped: those steps run again, and seconds go on from the last row.
+    """Writes log.jsonl (one object per line), log.csv (one row per line, for plots) and tensorboard files.
 
-    batch : samples of a step.   validated : columns of the validation's scores."""
+    A resumed run drops the lines after its checkpoint, since those steps run again; seconds continue from the last row.
+    batch : samples per step.   validated : names of the columns of validation scores."""
 
     COLUMNS = ("step", "samples", "processor_s", "wall_s", "loss", "epe", "lr")
 
@@ -282,10 +286,10 @@ class Log:
         return self
 
     def _kept_rows(self) -> list[dict[str, str]]:
-        """Rows of an earlier part of the run, up to the checkpoint; its columns are kept: a resumed run may validate on
+        """Return the rows of log.csv up to the checkpoint. Their columns stay, since a resumed run may validate on
         other sets."""
         lines = self.table.read_text(encoding="utf-8").splitlines(keepends=True) if self.table.is_file() else []
-        # A power cut can leave half a line; a table of another program is not gone on with.
+        # A power cut can leave half a line. A table of another program is replaced.
         ours = lines[:1] and lines[0].startswith(",".join(self.COLUMNS))
         rows = list(csv.DictReader(line for line in lines if line.endswith("\n"))) if ours else []
         self.columns = list(dict.fromkeys([*self.COLUMNS, *(rows[0] if rows else ()), *self.columns]))

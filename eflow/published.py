@@ -1,10 +1,9 @@
-"""Weights that others have published: checkpoints of E-RAFT (``dsec.tar``, ``mvsec_20.tar``, …) as safetensors files of
+"""Conversion of the published checkpoints of E-RAFT (``dsec.tar``, ``mvsec_20.tar``, …) to safetensors files of
 :class:`~eflow.models.eraft.Eraft`.
 
-Such files are pickles. Tensors and plain containers are all that is taken from them, by torch's restricted reader,
-which executes nothing. Names are others here, the gates of the GRU are joined, and the taps of a look-up stand in
-another order; the numbers are the same, and so is the flow, with E-RAFT's own padding and border, which the file is
-marked with.
+Those files are pickles. torch's restricted reader takes only tensors and plain containers from them and executes no
+code. Names differ here, the gates of the GRU are one convolution, and the taps of a look-up have another order; the
+numbers are the same. So is the flow, with E-RAFT's own padding and border, which the new file stores.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from eflow.models import FlowModel, build_model, model_config
 
 COLOURS = 3
 _IGNORED = ("norm3.", "num_batches_tracked")
-"""Parts of published names that say nothing new: a shortcut's norm stands there twice, and counters of batches."""
+"""Parts of published names to skip: the norm of a shortcut is stored twice, and counters of batches are not used."""
 
 
 def import_published(path: str | os.PathLike, out: str | os.PathLike) -> FlowModel:
-    """Writes the weights in ``path`` to the new safetensors file ``out``; returns the network.
+    """Write the weights in ``path`` to the new safetensors file ``out`` and return the network.
 
-    Raises AssetError: not a checkpoint of this layout, truncated, anything but tensors.
+    Raises AssetError: not a checkpoint of this layout, truncated, or with anything but tensors.
     OutputError: ``out`` exists or cannot be written."""
     path = Path(path)
     model = from_published(read_published(path), str(path))
@@ -40,14 +39,14 @@ def import_published(path: str | os.PathLike, out: str | os.PathLike) -> FlowMod
 
 
 def read_published(path: Path) -> dict[str, Tensor]:
-    """Tensors by name of a checkpoint of torch's: the whole of it, or its entry ``model`` or ``state_dict``.
-    Raises AssetError."""
+    """Return the named tensors of a torch checkpoint, or of its entry ``model`` or ``state_dict``. Raises
+    AssetError."""
     try:
         tree = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
     except pickle.UnpicklingError as error:
-        if "GLOBAL" in str(error):  # a class or function that it would have to call; torch says at length how
+        if "GLOBAL" in str(error):  # the file names a class or function to call
             raise AssetError(
                 "holds more than tensors, which could run any code when loaded; refused",
                 where=str(path),
@@ -57,7 +56,7 @@ def read_published(path: Path) -> dict[str, Tensor]:
     except OSError as error:
         reason = os.strerror(error.errno).lower() if error.errno else str(error)
         raise AssetError(f"cannot be read: {reason}", where=str(path)) from error
-    except Exception as error:  # what torch raises on damaged bytes has no common kind, AssertionError among it
+    except Exception as error:  # damaged bytes raise errors of many types, AssertionError too
         raise AssetError("truncated or not a checkpoint of PyTorch", where=str(path)) from error
     for key in ("model", "state_dict"):
         if isinstance(tree, dict) and isinstance(tree.get(key), dict):
@@ -67,16 +66,16 @@ def read_published(path: Path) -> dict[str, Tensor]:
     tensors = {k.removeprefix("module."): v for k, v in tree.items()}
     for name, value in tensors.items():
         if not isinstance(value, Tensor):
-            raise AssetError(f"'{name}' is no tensor", where=str(path), value=type(value).__name__)
+            raise AssetError(f"'{name}' is not a tensor", where=str(path), value=type(value).__name__)
     return tensors
 
 
 def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
-    """The network that published tensors are of. Raises AssetError, as :func:`import_published`."""
+    """Return the network with published tensors. Raises AssetError, as :func:`import_published`."""
     first = _tensor(tensors, "fnet.conv1.weight", where)
     channels = first.shape[1] if first.ndim == 4 else 0
     if channels == COLOURS:
-        raise AssetError("RAFT's own weights see images and no events", where=where, accepted="E-RAFT's checkpoint")
+        raise AssetError("weights of RAFT are for images, not events", where=where, accepted="E-RAFT's checkpoint")
     if not 2 <= channels <= 64:
         raise AssetError("tensor 'fnet.conv1.weight' has another shape", where=where, value=tuple(first.shape))
     events = {"bins": channels, "normalise": "nonzero", "bounds": "events"}
@@ -102,14 +101,16 @@ def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
     used = {source for name in ours for source in published_names(name)}
     left = [k for k in sorted(set(tensors) - used) if not any(part in k for part in _IGNORED)]
     if left:
-        raise AssetError(f"holds a tensor '{left[0]}' that E-RAFT has not", where=where, accepted="E-RAFT's checkpoint")
+        raise AssetError(
+            f"holds a tensor '{left[0]}' that E-RAFT does not have", where=where, accepted="E-RAFT's checkpoint"
+        )
     load_weights(model, found, where)
     return model.eval()
 
 
 def published_names(name: str) -> tuple[str, ...]:
-    """Where E-RAFT's code keeps what is ``name`` here: ``features.3.conv1.weight`` is ``fnet.layer1.0.conv1.weight``;
-    the update and the reset gate are one convolution here and two there."""
+    """Return the published names of the parameter ``name``: that of ``features.3.conv1.weight`` is
+    ``fnet.layer1.0.conv1.weight``. The update and reset gates are one convolution here and two there."""
     part, _, rest = name.partition(".")
     if part in ("features", "context"):
         index, _, rest = rest.partition(".")
@@ -135,7 +136,7 @@ def published_names(name: str) -> tuple[str, ...]:
 
 
 def _reordered(weight: Tensor) -> Tensor:
-    """(C, taps, 1, 1) over taps of which the column goes slower than the row, to rows slower than columns."""
+    """Return a weight (C, taps, 1, 1) with its taps in row-major order; published ones are in column-major order."""
     levels, side = 4, 9
     grid = weight.view(weight.shape[0], levels, side, side, 1, 1)
     return grid.transpose(2, 3).reshape(weight.shape)

@@ -1,4 +1,4 @@
-"""How far a training is, by steps or by the clock, and the learning rate there."""
+"""Progress of a training, by steps or by time, and its learning rate."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from eflow.config import OptimConfig
 
 
 def learning_rate(done: float, peak: float, warmup: float, cooldown: float) -> float:
-    """The rate when a share ``done`` (0 … 1) of the training is over: linear from peak / 25 up to ``peak`` over its
-    first ``warmup``, then ``peak``, and linear down to peak / 25e4 over its last ``cooldown``."""
+    """Return the learning rate after a share ``done`` (0 … 1) of the training.
+
+    It rises linearly from peak / 25 to ``peak`` over the first share ``warmup``, stays, and falls linearly to
+    peak / 25e4 over the last share ``cooldown``."""
     start, end = peak / 25, peak / 25e4
     if done < warmup:
         return start + (peak - start) * done / warmup
@@ -24,7 +26,7 @@ def learning_rate(done: float, peak: float, warmup: float, cooldown: float) -> f
 
 @dataclass
 class Course:
-    """How far a training is, by steps and, where ``optim.minutes`` says so, by the clock of all its parts together.
+    """Progress of a training, by steps and, if ``optim.minutes`` is set, by the time of all its parts.
 
     before : seconds of the parts before this one."""
 
@@ -38,7 +40,7 @@ class Course:
         return self.before + self.clock() - self.began
 
     def done(self, step: int, device: torch.device, world: int) -> float:
-        """Share of the training that is over after ``step`` steps; the same on all ranks."""
+        """Return the share of the training that is done after ``step`` steps; the same on all ranks."""
         share = step / self.optim.steps
         if self.optim.minutes is None:
             return share
@@ -49,7 +51,7 @@ class Course:
         return max(share, float(seconds) / (60 * self.optim.minutes))
 
     def minutes_left(self, time_limit: float | None) -> float | None:
-        """Until the end or this call's ``time_limit``; None where there is no clock."""
+        """Return the minutes until the end or the ``time_limit`` of this call; None if there is no limit."""
         ends = [] if time_limit is None else [time_limit]
         ends += [] if self.optim.minutes is None else [self.optim.minutes - self.before / 60]
         return min(ends, default=None)

@@ -1,10 +1,10 @@
-"""Trained networks that come with the package, each a folder of ``eflow/weights``:
+"""Trained networks that come with the package. Each is a folder of ``eflow/weights``:
 
     real_small/model.safetensors    weights and buffers; the metadata holds the model configuration
-               card.yaml            what it is, what it was trained on, its scores and limits, how it is made again
+               card.yaml            purpose, training data, scores, limits, and commands that make it again
 
-``eflow models`` lists them, and their names stand where a checkpoint may stand; ``eflow pack`` makes such a folder of a
-training. Nothing here imports torch but packing.
+``eflow models`` lists them, and their names can be used in place of a checkpoint; ``eflow pack`` makes such a folder
+from a checkpoint. Only packing imports torch.
 """
 
 from __future__ import annotations
@@ -29,62 +29,63 @@ from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow.methods.table import METHODS
 
 FOLDER = Path(__file__).parent / "weights"
-"""Where the networks lie; empty or missing: none is shipped."""
+"""Folder of the networks; if it is empty or missing, none is shipped."""
 WEIGHTS, CARD = "model.safetensors", "card.yaml"
 LARGEST = 5_000_000
-"""Bytes of weights: everybody who clones the repository gets them."""
+"""Maximum size of the weights, bytes: every clone of the repository contains them."""
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 
 
 class CardText(Config):
-    """What a person says of a network."""
+    """The part of a card that a person writes."""
 
-    about: str = Field(min_length=1, max_length=200, description="what it is for, in one line")
-    data: str = Field(min_length=1, description="what it was trained on")
-    training: str = Field(min_length=1, description="how long, on which machine, from which seeds")
-    scores: dict[str, float | str] = Field(min_length=1, description="what was measured: its value")
-    limits: tuple[str, ...] = Field(min_length=1, description="what it is not good at, and was not tried on")
-    commands: tuple[str, ...] = Field(min_length=1, description="what makes it again, in order")
+    about: str = Field(min_length=1, max_length=200, description="purpose, in one line")
+    data: str = Field(min_length=1, description="training data")
+    training: str = Field(min_length=1, description="duration, machine and seeds of the training")
+    scores: dict[str, float | str] = Field(min_length=1, description="name of a measurement: its value")
+    limits: tuple[str, ...] = Field(min_length=1, description="where it fails, and what was not tried")
+    commands: tuple[str, ...] = Field(min_length=1, description="commands that make it again, in order")
 
 
 class Card(CardText):
-    """That, and what is known of the file."""
+    """The whole card: the text, and facts about the file of weights."""
 
-    name: str = Field(description="as it is called by")
+    name: str = Field(description="name of the network")
     network: str = Field(description="model.name")
     size: str = Field(description="model.size")
-    parameters: int = Field(ge=1, description="trainable ones")
-    stored: Literal["fp32", "fp16"] = Field(description="numbers in the file; it computes in fp32")
-    rounding_px: float = Field(ge=0, description="largest change of a flow by storing it so, on random events")
-    bytes: int = Field(ge=1, description="of the weights")
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="of the weights")
-    version: str = Field(description="of the package that packed it")
+    parameters: int = Field(ge=1, description="number of trainable parameters")
+    stored: Literal["fp32", "fp16"] = Field(description="precision of the file; computations are in fp32")
+    rounding_px: float = Field(ge=0, description="largest change of flow by this precision, on random events")
+    bytes: int = Field(ge=1, description="size of the weights")
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum of the weights")
+    version: str = Field(description="version of the package that packed it")
 
 
 def names() -> list[str]:
-    """The shipped networks, sorted."""
+    """Return the names of the shipped networks, sorted."""
     return sorted(p.name for p in FOLDER.iterdir() if (p / CARD).is_file()) if FOLDER.is_dir() else []
 
 
 def is_shipped(name: str | os.PathLike) -> bool:
-    """Whether a network is called so, and no file or folder: what lies in the working folder goes first."""
+    """Whether ``name`` is a shipped network; files and folders of that name have priority."""
     return str(name) in names() and not Path(name).exists()
 
 
 def known() -> str:
-    """The shipped networks as an error message says them; "" without any."""
+    """Return the list of shipped networks for an error message; "" if there are none."""
     return f"; or a network that comes with the package: {', '.join(names())}" if names() else ""
 
 
 def suggestion(name: str) -> str:
-    """The shipped network that was probably meant, as an error message says it; or ""."""
+    """Return a hint to the shipped network that was probably meant, for an error message; or ""."""
     near = difflib.get_close_matches(name, names(), 1, 0.75)
     return f" (did you mean {near[0]}?)" if near else ""
 
 
 def weights_of(folder: Path) -> Path:
-    """The weights in the folder of a shipped network. Raises AssetError: missing, or not those of the card (a clone
-    that was cut off, a file that an editor touched)."""
+    """Return the file of weights in the folder of a shipped network.
+
+    Raises AssetError: it is missing, or its checksum is not that of the card (an incomplete clone, an edited file)."""
     card, path = read_card(folder), folder / WEIGHTS
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -92,29 +93,32 @@ def weights_of(folder: Path) -> Path:
         raise AssetError(f"cannot be read: {(error.strerror or str(error)).lower()}", where=str(path)) from error
     if digest != card.sha256:
         raise AssetError(
-            "not the weights that the card is of", where=str(path), value=digest, accepted=f"sha256 {card.sha256}"
+            "checksum of the weights differs from that of the card",
+            where=str(path),
+            value=digest,
+            accepted=f"sha256 {card.sha256}",
         )
     return path
 
 
 def read_card(folder: Path) -> Card:
-    """The card in the folder of a shipped network. Raises ConfigError."""
+    """Return the card in the folder of a shipped network. Raises ConfigError."""
     return validate(Card, read_table(folder / CARD), where=str(folder / CARD))
 
 
 def card_of(name: str) -> Card:
-    """The card of a shipped network. Raises ConfigError: there is none of that name; damaged."""
+    """Return the card of a shipped network. Raises ConfigError: unknown name, or a damaged card."""
     if name not in names():
         raise ConfigError(
             f"no such network{suggestion(name)}",
             value=name,
-            accepted=", ".join(names()) or "nothing yet: none comes with this version",
+            accepted=", ".join(names()) or "none: no network comes with this version",
         )
     return read_card(FOLDER / name)
 
 
 def lines(card: Card, whole: bool = True) -> Iterator[str]:
-    """A card for people, line by line; not ``whole``: what a list needs of it."""
+    """Yield the lines of a card as text; if not ``whole``, only those for a list."""
     yield card.name
     yield f"  {card.about}"
     yield (
@@ -141,21 +145,20 @@ def pack(
     *,
     averaged: bool = True,
 ) -> tuple[Path, Card]:
-    """Writes the new folder ``out/name`` of a checkpoint's weights and a person's card (a YAML file of
-    :class:`CardText`); returns it with its card. The folder appears whole or not at all, after its weights have been
-    read back.
+    """Write the new folder ``out/name`` with the weights of a checkpoint and a card (a YAML file of
+    :class:`CardText`); return the folder and its card. It appears after its weights were read back, or not at all.
 
-    averaged : the averaged weights, where there are any.
-    Raises ConfigError: name, card. AssetError: checkpoint; weights that are too large. OutputError."""
+    averaged : use the averaged weights if there are any.
+    Raises ConfigError: bad name or card. AssetError: bad checkpoint, or weights above 5 MB. OutputError."""
     from eflow.checkpoint import load_model, metadata_of, write_tensors
     from eflow.models import NETWORKS, parameters_of
 
     if not _NAME.fullmatch(name) or name in METHODS or name in NETWORKS:
         raise ConfigError(
-            "not a name for a network",
+            "not a valid name of a network",
             where="--name",
             value=name,
-            accepted="small letters, digits, _ and -; not that of a method or of an architecture",
+            accepted="small letters, digits, _ and -; not the name of a method or an architecture",
         )
     text = validate(CardText, read_table(card), where=str(card))
     final = Path(out) / name
@@ -172,8 +175,8 @@ def pack(
         )
     with atomic_folder(final) as folder:
         write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
-        (folder / WEIGHTS).chmod(0o644)  # of an installation that others use
-        load_model(folder / WEIGHTS, expected=model.config)  # it can be read
+        (folder / WEIGHTS).chmod(0o644)  # other users of an installation must be able to read it
+        load_model(folder / WEIGHTS, expected=model.config)  # raises if it cannot be read
         read = (folder / WEIGHTS).read_bytes()
         full = Card(
             **text.model_dump(),

@@ -1,4 +1,4 @@
-"""Submission files of the DSEC and BlinkFlow benchmarks, checked before they get their name."""
+"""Submission files of the DSEC and BlinkFlow benchmarks; a file appears only after it was checked."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def submit_dsec(
     precision: str = "fp32",
     progress: Progress | None = None,
 ) -> int:
-    """Zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's
-    CSV. Returns the number of files.
+    """Write a zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's CSV; return the number
+    of files.
 
-    Raises AssetError: a test sequence is missing, or there are others. OutputError: the file exists, or the check of
-    what was written failed (then nothing is left)."""
+    Raises AssetError: a test sequence is missing, or there are others. OutputError: the file exists, or its check
+    failed (then nothing is written)."""
     source = open_source(root, "dsec")
     assert isinstance(source, FolderSource)
     found = {s.name for s in source.sequences}
@@ -76,7 +76,7 @@ def submit_dsec(
 
 
 def _dsec_png(flow: np.ndarray, name: str) -> bytes:
-    """16-bit PNG with the third channel 0, as the benchmark asks."""
+    """Return a 16-bit PNG with the third channel 0, as the benchmark requires."""
     png, lost = encode_flow_png(flow, np.ones(flow.shape[:2], bool))
     if lost:
         raise OutputError(
@@ -91,7 +91,8 @@ def _dsec_png(flow: np.ndarray, name: str) -> bytes:
 
 
 def check_dsec(path: str | os.PathLike, wanted: set[str], shape: tuple[int, int] = (480, 640)) -> None:
-    """OutputError unless the zip holds exactly ``wanted``, each 16-bit RGB of ``shape`` with the third channel 0."""
+    """Raise OutputError unless the zip has exactly the files ``wanted``, each 16-bit RGB of ``shape`` with third
+    channel 0."""
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         if sorted(names) != sorted(wanted):
@@ -119,9 +120,8 @@ def submit_blinkflow(
     precision: str = "fp32",
     progress: Progress | None = None,
 ) -> int:
-    """Zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the benchmark's own format, one
-    sampled pixel per 4x4 cell unless ``full``.
-    Raises as :func:`submit_dsec`."""
+    """Write a zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the format of the benchmark, with one pixel per 4x4 cell
+    unless ``full``; return the number of files. Raises as :func:`submit_dsec`."""
     source = open_source(root, "blinkflow")
     assert isinstance(source, FolderSource)
     name = lambda i: (
@@ -152,24 +152,24 @@ def submit_blinkflow(
 
 
 def cells(height: int, width: int) -> int:
-    """Number of 4x4 cells."""
+    """Return the number of 4x4 cells of an image."""
     return -(-height // CELL) * -(-width // CELL)
 
 
 def encode_full(flow: np.ndarray) -> bytes:
-    """int32 tag 2502001, int32 width, height, then (H, W, 2) float32, little-endian."""
+    """Return int32 tag 2502001, int32 width and height, then (H, W, 2) float32, little-endian."""
     return struct.pack("<iii", FULL, flow.shape[1], flow.shape[0]) + np.ascontiguousarray(flow, "<f4").tobytes()
 
 
 def encode_sampled(flow: np.ndarray) -> bytes:
-    """int32 tag 2502002, int32 contains_vis = 0, int32 n, then n (u, v) float32: the top-left
-    pixel of every 4x4 cell, row-major."""
+    """Return int32 tag 2502002, int32 contains_vis = 0, int32 n, then n pairs (u, v) float32: the top-left pixel of
+    every 4x4 cell, row-major."""
     picked = np.ascontiguousarray(flow[::CELL, ::CELL], "<f4").reshape(-1, 2)
     return struct.pack("<iii", SAMPLED, 0, len(picked)) + picked.tobytes()
 
 
 def decode(data: bytes) -> np.ndarray:
-    """(H, W, 2) or (n, 2) float32 of either form. Raises AssetError."""
+    """Return the flow of a file of either form, (H, W, 2) or (n, 2) float32. Raises AssetError."""
     try:
         tag, a, b = struct.unpack_from("<iii", data)
         shape = (b, a, 2) if tag == FULL else (b, 2)

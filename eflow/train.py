@@ -1,16 +1,16 @@
-"""The training loop, top to bottom: :func:`train`, what a run is made of, its loop, one step, what is written.
+"""The training loop. From top to bottom: :func:`train`, the parts of a run, its loop, one step, its output.
 
-On the CPU or one GPU (``run.device``; auto takes a GPU where there is one), and on several:
+It runs on the CPU or a GPU (``run.device``; auto uses a GPU if there is one), or on several:
 
     eflow train configs/eflow/smoke.yaml --out out/smoke
     eflow train configs/eflow/smoke.yaml --out out/smoke --resume
     torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
 
 A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and
-SIGTERM end the current step, write a checkpoint and exit 0. ``--resume`` goes on from the newest checkpoint and is, on
-the CPU, bit for bit what the uninterrupted run would have been: data order and augmentation are functions of (seed,
-step), the rate of the step alone. (With ``optim.minutes`` the rate goes by the clock, which checkpoints keep; such a
-run does not repeat bit for bit.)
+SIGTERM end the current step, write a checkpoint and exit 0. ``--resume`` continues from the newest checkpoint. On the
+CPU the result is bit for bit that of an uninterrupted run: data order and augmentation depend on (seed, step) alone,
+and the learning rate on the step. With ``optim.minutes`` the learning rate depends on the time, which checkpoints
+store; such a run does not repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -69,17 +69,17 @@ def train(
 ) -> TrainResult:
     """Train to the end of ``config.optim.steps`` or ``minutes`` and return how it ended.
 
-    stop_after : leave after this many steps of this call, as a signal would. clock : seconds, of ``optim.minutes``.
+    stop_after : stop after this many steps, as a signal would. clock : seconds, for ``optim.minutes``.
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
-    with contextlib.ExitStack() as stack:  # ends the processes that render while it is trained on
+    with contextlib.ExitStack() as stack:  # ends the rendering processes
         training = Training(config, Path(out), stack, resume=resume, stop_after=stop_after, clock=clock, quiet=quiet)
         return training.run()
 
 
 class Training:
-    """One call's part of a run: everything is made ready by the constructor, :meth:`run` goes through it once."""
+    """One call's part of a run: the constructor prepares everything, :meth:`run` trains."""
 
     def __init__(
         self,
@@ -93,12 +93,12 @@ class Training:
         quiet: bool,
     ):
         self.rank, self.world, self.device = setup(config)
-        # One process writes and speaks for all of them.
+        # Only the first process writes files and messages.
         self.lead, self.out, self.quiet = self.rank == 0, out, quiet
         precision = precision_on(self.device, config.run.precision, quiet=not self.lead)
         self.config = config.model_copy(update={"run": config.run.model_copy(update={"precision": precision})})
         if self.lead:
-            importlib.import_module("torch.utils.tensorboard")  # where it is missing, nothing has been written yet
+            importlib.import_module("torch.utils.tensorboard")  # fail before anything is written
         if self.lead and not resume:
             refuse_existing(out)
         spent = self._make_network(resume)
@@ -112,11 +112,11 @@ class Training:
         self.course = Course(config.optim, clock(), spent, clock)
         self.done = self.course.done(self.start, self.device, self.world)
         self.path = out
-        """The newest checkpoint; the run's folder on ranks that write none."""
+        """The newest checkpoint, or the run folder on ranks that do not write."""
 
     def _make_network(self, resume: bool) -> float:
-        """Make network, optimiser and averaged weights, as a checkpoint left them or new; return the seconds that the
-        run has had."""
+        """Make network, optimiser and averaged weights, new or from a checkpoint; return the seconds of training so
+        far."""
         config = self.config
         torch.manual_seed(config.seed)
         self.model = build_model(config.model)
@@ -132,7 +132,7 @@ class Training:
         return spent
 
     def _make_data(self, stack: contextlib.ExitStack) -> None:
-        """Open the sets to train and validate on; refuse what the network cannot take before anything is written."""
+        """Open the training and validation sets, and check that they fit the network before anything is written."""
         config = self.config
         if config.data.batch % self.world:
             raise ConfigError(
@@ -155,7 +155,8 @@ class Training:
         self.validation = validation_sets(config, self.model) if self.lead else []
 
     def _parallel(self) -> torch.nn.Module:
-        """Return the network as steps call it: compiled, or wrapped to average gradients over processes."""
+        """Return the network, compiled or wrapped to average gradients over processes if the configuration asks for
+        it."""
         if self.config.run.compile and hasattr(self.model, "update"):
             self.model.update.compile()
         if self.world == 1:
@@ -167,7 +168,7 @@ class Training:
     # ---- the loop ----------------------------------------------------------------------------------------------------
 
     def run(self) -> TrainResult:
-        """Go through the steps that are left, and end the process group."""
+        """Run the remaining steps and end the process group."""
         config, device = self.config, self.device
         stop = self.start if self.done >= 1 else self.stop
         sampler = StepSampler(self.mixture, config.data.batch, self.start, stop, self.rank, self.world)
@@ -189,8 +190,7 @@ class Training:
             for batch in waiting:
                 batch = to_device(batch, device, config.run.channels_last)
                 rate, flow = self._take(batch)
-                # What passes between processes, or between device and host, makes everybody wait: now and then is
-                # enough.
+                # Communication between processes, or between device and host, waits for all work: not at every step.
                 looking = self.step == self.start + 1 or self._every("log", "validate", "checkpoint")
                 reason = self._reason(signals, looking)
                 progress.update(self.step, self.read.values() if looking or self._last or reason else ())
@@ -198,7 +198,7 @@ class Training:
                     self._log(log, rate, progress, waiting)
                     if self._every("picture"):
                         _picture(self.out / "pictures" / f"{self.step:09d}.png", batch, flow)
-                    # The clock ends a training as its last step does; a signal is in a hurry.
+                    # A time limit validates as the last step does; a signal should end soon.
                     if self.validation and (self._every("validate") or reason in ("finished", "time limit")):
                         self._validate(log, progress)
                     if self._every("checkpoint") or reason is not None:
@@ -206,7 +206,7 @@ class Training:
                 if reason is not None:
                     break
             else:
-                if self.lead:  # nothing was left to do
+                if self.lead:  # no step was left
                     self.path = ckpt.newest(self.out) or self._save()
             if self.lead and any(is_endless(s) for s in self.sources):
                 progress.say("online: " + told(_rendering(self.sources), waiting.share))
@@ -216,7 +216,7 @@ class Training:
         return TrainResult(self.step, reason or "finished", self.path, self.read.loss)
 
     def _take(self, batch: dict) -> tuple[float, Tensor]:
-        """Take one step; return the rate that it was taken at and the flow it saw, (N, 2, H, W) px."""
+        """Take one step; return its learning rate and the predicted flow, (N, 2, H, W) px."""
         optim = self.config.optim
         rate = learning_rate(self.done, optim.lr, optim.warmup, optim.cooldown)
         for group in self.optimizer.param_groups:
@@ -229,12 +229,12 @@ class Training:
         self.optimizer.step()
         self.step += 1
         if self.ema is not None:
-            # The first steps average over few weights, so that the random start is soon forgotten.
+            # The first steps average over few weights, so that the random initial weights lose their influence.
             _average(self.ema, self.model, min(optim.ema, self.step / (self.step + 10)))
         return rate, flow
 
     def _every(self, *whats: str) -> bool:
-        """Whether this step is one of those at which one of these things is done."""
+        """Whether one of these actions is due at this step."""
         return any(self.step % getattr(self.config.run, f"{what}_every") == 0 for what in whats)
 
     @property
@@ -242,7 +242,7 @@ class Training:
         return self.step == self.stop or self.done >= 1
 
     def _reason(self, signals: Signals, looking: bool) -> str | None:
-        """Why the training ends after this step; None: it goes on. The same on all ranks."""
+        """Return why the training ends after this step, or None; the same on all ranks."""
         if self.world == 1 or looking:
             self.done = self.course.done(self.step, self.device, self.world)
         if self.done >= 1:
@@ -273,7 +273,7 @@ class Training:
             )
 
     def _validate(self, log: Log, progress: TrainProgress) -> None:
-        # Batches of what one process trains on: more might not fit its card.
+        # The batch of one process: a larger one might not fit the memory of its GPU.
         size = -(-self.config.data.batch // self.world)
         scores = validate(self.model, self.ema, self.validation, self.config.run.precision, size)
         log.write(self.step, "validation", **scores)
@@ -287,7 +287,7 @@ class Training:
 
 
 def _optimizer(model: FlowModel, optim: OptimConfig, device: torch.device) -> torch.optim.Optimizer:
-    """AdamW, whose weight decay leaves biases and norms alone."""
+    """Return AdamW without weight decay on biases and norms."""
     decay = [p for p in model.parameters() if p.ndim > 1]
     no_decay = [p for p in model.parameters() if p.ndim <= 1]
     return torch.optim.AdamW(
@@ -299,7 +299,7 @@ def _optimizer(model: FlowModel, optim: OptimConfig, device: torch.device) -> to
 
 
 def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, Tensor, Tensor]:
-    """loss, end-point error of the last field, and that field; nothing is read back from the device."""
+    """Return loss, end-point error of the last field, and that field, all still on the device."""
     kind = batch["new"].device.type
     with (
         compile_errors(config.run.compile),
@@ -329,7 +329,7 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
 
 
 def _rendering(sources: list[Source]) -> dict[str, float]:
-    """What the online sources say of themselves, for the log; nothing of folders."""
+    """Return statistics of the online sources for the log; empty if there are none."""
     stats = [s.stats for s in sources if is_endless(s)]
     if not stats:
         return {}
@@ -362,7 +362,7 @@ def _picture(path: Path, batch: dict, flow: Tensor) -> None:
 
 
 def as_yaml(config: TrainConfig) -> str:
-    """All keys with their values, as a run folder's ``config.yaml`` has them."""
+    """Return all keys with their values as YAML, the text of ``config.yaml`` in a run folder."""
     return to_yaml(json.loads(config.model_dump_json()))
 
 

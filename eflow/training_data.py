@@ -1,4 +1,4 @@
-"""What a training reads: the sets that it draws its samples from, and those that it is judged on meanwhile."""
+"""The training and validation sets of a training."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from eflow.models import FlowModel
 def training_sets(
     config: TrainConfig, start: int, rank: int, world: int, stack: contextlib.ExitStack
 ) -> tuple[Mixture, list[Source]]:
-    """The order of the samples, and the open sets; what renders is ended by ``stack``. Each rank renders for itself,
-    sequences that no other has."""
+    """Return the order of the samples and the open sets.
+
+    ``stack`` ends the rendering processes. Each rank renders its own sequences, different from those of other ranks."""
     data = config.data
     sources = {k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if not s.online}
     sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
     mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
     for k, s in enumerate(data.train):
         if s.online:
-            from eflow.data.online import open_online  # brings the renderer
+            from eflow.data.online import open_online  # imports the renderer
 
             first = mixture.first(k, start * data.batch, rank, world)
             seed = derived_seed(config.seed, f"rank {rank}") if rank else config.seed
@@ -41,7 +42,7 @@ def training_sets(
 
 
 def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
-    """Refuses, before anything is written, what the network would refuse at the first step."""
+    """Raise ConfigError, before anything is written, if the network cannot be trained on samples of this size."""
     sources = [source for source in dataset.sources if crop is None or is_endless(source)]
     firsts = [source.first() if is_endless(source) else source[0] for source in sources]
     if crop is not None:
@@ -59,7 +60,7 @@ def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | 
 
 
 def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:
-    """(name, set, the samples of it that are looked at) of every set that ``data.validate_on`` names."""
+    """Return (name, set, indices of the samples to score) for every set of ``data.validate_on``."""
     sets = []
     for s in config.data.validate_on:
         if s.online:
@@ -86,8 +87,9 @@ def validate(
     precision: str,
     size: int = 1,
 ) -> dict[str, float]:
-    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples.
-    size : at most so many samples at once."""
+    """Return the AEE of each validation set with the averaged weights, and as ``zero`` that of zero flow.
+
+    size : largest number of samples in a batch."""
     own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
     if ema is not None:
         model.load_state_dict(ema)
@@ -112,7 +114,7 @@ def validate(
 
 
 def _alike(samples: Iterable[dict], size: int) -> Iterator[dict]:
-    """Batches, in order, of up to ``size`` samples of one height and width."""
+    """Yield batches, in order, of up to ``size`` samples with the same height and width."""
     for _, group in itertools.groupby(samples, key=lambda sample: sample["new"].shape):
         while part := list(itertools.islice(group, size)):
             yield collate(part)

@@ -1,8 +1,8 @@
-"""From sources to batches: augmentation, grids, cropping, mixing; every sample a pure
-function of (seed, epoch, position).
+"""From sources to batches: augmentation, grids, cropping, mixing. Every sample is a pure function of (seed, epoch,
+position).
 
-Nothing here keeps a state that a checkpoint would have to hold: training step s of any run takes the same samples with
-the same augmentation, whatever the number of workers and however often the run was interrupted.
+So checkpoints need not store any state of the data: step s of a run takes the same samples with the same augmentation,
+whatever the number of workers and interruptions.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from eflow.data.sources import Source
 from eflow.data.window import RawSample
 
 ENDLESS = 4096
-"""Samples that an endless source adds to an epoch."""
+"""Number of samples of an endless source in an epoch."""
 MAX_FLOW = 400.0
-"""Ground truth at or beyond this many px is not supervised and not scored (BlinkFlow's rule)."""
+"""Ground truth of this length or more, px, is neither trained on nor scored (BlinkFlow's rule)."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """One draw: which sample of which source, and the numbers that seed its augmentation."""
+    """One draw: the source, the index of the sample in it, and the numbers that seed its augmentation."""
 
     epoch: int
     position: int
@@ -40,11 +40,11 @@ class Key:
 class Mixture:
     """The order of an endless training run over several sources.
 
-    sizes : samples of each; None: it has no end (:class:`~eflow.data.online.OnlineSource`), its samples come once, in
-    its own order, and :data:`ENDLESS` of them count as an epoch.
-    weights : share of each source in an epoch. An epoch has as many samples as the sources together; each source
-    contributes in proportion to its weight, going through its own samples in an order
-    that is new for every pass over it.
+    sizes : number of samples of each source. None: the source is endless
+    (:class:`~eflow.data.online.OnlineSource`); its samples are used once, in order, and :data:`ENDLESS` of them count
+    as an epoch.
+    weights : relative share of each source in an epoch. An epoch has as many samples as all sources together. Every
+    pass over a source has a new random order.
     """
 
     def __init__(self, sizes: list[int | None], weights: list[float], seed: int):
@@ -56,12 +56,12 @@ class Mixture:
         share = np.array(weights, float) / sum(weights) * self.epoch_length
         counts = np.floor(share).astype(int)
         for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
-            counts[i] += 1  # largest remainders, so that the counts add up
+            counts[i] += 1  # largest remainders: the counts add up to the total
         self.counts = [int(c) for c in counts]
         self._cache: tuple[int, list[Key]] | None = None
 
     def epoch(self, epoch: int) -> list[Key]:
-        """The samples of one epoch, in order."""
+        """Return the samples of one epoch, in order."""
         if self._cache is None or self._cache[0] != epoch:
             picks = []
             for source, (size, count) in enumerate(zip(self.sizes, self.counts, strict=True)):
@@ -80,8 +80,9 @@ class Mixture:
         return self._cache[1]
 
     def first(self, source: int, n: int, rank: int = 0, world: int = 1) -> int:
-        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken,
-        every ``world``-th of them, beginning with ``rank``, by the process that asks."""
+        """Return the number of the next sample of an endless ``source`` after n samples of the run.
+
+        Each of ``world`` processes takes every ``world``-th sample of the run, from ``rank`` on."""
         epoch, position = divmod(n, self.epoch_length)
         if world == 1:
             return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])
@@ -93,7 +94,7 @@ class Mixture:
         )
 
     def key(self, n: int) -> Key:
-        """The n-th sample of the run."""
+        """Return the n-th sample of the run."""
         epoch, position = divmod(n, self.epoch_length)
         return self.epoch(epoch)[position]
 
@@ -112,12 +113,12 @@ class FlowDataset(Dataset):
     """Samples as tensors. ``dataset[key]`` for training (a :class:`Key`), ``dataset[i]`` for
     evaluation (no augmentation, no crop).
 
-    Gives a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400), mask
-    (H, W) bool, name, scene; without ground truth flow and valid are left out.
+    A sample is a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400),
+    mask (H, W) bool, name, scene. Without ground truth it has no flow, valid and mask.
 
-    raw : the RawSample itself besides, as "raw".   reads : windows that are made tensors of
-    (:attr:`eflow.models.FlowModel.reads`).
-    empty : "error" refuses a sample without an event in a window that is read; "skip" takes the next that has some.
+    raw : also return the RawSample, as "raw".
+    reads : windows to convert to tensors (:attr:`eflow.models.FlowModel.reads`).
+    empty : "error" raises for a sample with an empty window among these; "skip" takes the next one with events.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class FlowDataset(Dataset):
                 raise EventDataError(
                     f"no events in the {which} window [{w.t0}, {w.t1}) µs",
                     where=sample.name,
-                    accepted="use data.empty=skip to leave such samples out",
+                    accepted="use data.empty=skip to skip such samples",
                 )
         raise EventDataError("no sample has events", where=sample.name)
 
@@ -187,8 +188,8 @@ class FlowDataset(Dataset):
             if not np.isfinite(s.flow[s.valid]).all():
                 raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
             out["flow"] = torch.from_numpy(np.ascontiguousarray(s.flow.transpose(2, 0, 1), dtype=np.float32))
-            with np.errstate(over="ignore", invalid="ignore"):  # where it is not valid there may be anything
-                moves = np.square(s.flow[..., 0]) + np.square(s.flow[..., 1])  # torch would call in all its threads
+            with np.errstate(over="ignore", invalid="ignore"):  # invalid pixels may have any value
+                moves = np.square(s.flow[..., 0]) + np.square(s.flow[..., 1])  # torch would use all threads
             out["valid"] = torch.from_numpy(s.valid & (moves < MAX_FLOW**2))
             out["mask"] = (
                 torch.from_numpy(np.ascontiguousarray(s.mask)) if s.mask is not None else torch.ones_like(out["valid"])
@@ -202,15 +203,17 @@ class FlowDataset(Dataset):
 
 
 def is_endless(source: Source) -> bool:
-    """Whether its samples come once, in order (:class:`~eflow.data.online.OnlineSource`)."""
+    """Whether a source is endless: its samples can be taken once, in order
+    (:class:`~eflow.data.online.OnlineSource`)."""
     return getattr(source, "endless", False)
 
 
 def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> RawSample:
-    """The event-level augmentations, each with its own probability; all draws happen, so that
-    switching one off moves no other."""
+    """Return a sample with the event-level augmentations, each applied with its own probability.
+
+    All random numbers are always drawn, so that switching one augmentation off does not change the others."""
     u = rng.random(7)
-    # Children are numbered: the first three stay the same when there is one more.
+    # A further child generator does not change the first ones.
     noise_rng, hot_rng, drop_rng, view_rng = rng.spawn(4)
     if u[0] < a.horizontal_flip:
         sample = sample.flip("x")
@@ -232,8 +235,10 @@ def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> 
 
 
 def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) -> dict:
-    """Image scaled by ``factor`` (at least so that ``least`` = (H, W) fits), grids bilinear, flow bilinear times the
-    true factor of each axis, validity only where all four contributing pixels are valid."""
+    """Return a sample scaled by ``factor``, but not below the size ``least`` = (H, W).
+
+    Grids and flow are bilinear; flow is multiplied by the exact factor of each axis. A pixel is valid only if all four
+    contributing pixels are."""
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
@@ -247,7 +252,7 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
 
 
 def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name: str) -> dict:
-    """Random crop (H, W). Raises EventDataError when the sample is smaller."""
+    """Return a random crop (H, W) of a sample. Raises EventDataError: the sample is smaller."""
     height, width = sample["new"].shape[-2:]
     if height < size[0] or width < size[1]:
         raise EventDataError(
@@ -264,9 +269,10 @@ def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name:
 
 
 class StepSampler(Sampler):
-    """Batches of keys from training step ``start`` on, for one rank of ``world``: step s takes samples s·B … (s+1)·B -
-    1 of the mixture, rank r every world-th of them. Each rank renders an endless source of its own, whose samples it
-    takes one after the other."""
+    """Yields batches of keys from training step ``start`` on, for one rank of ``world``.
+
+    Step s takes samples s·B … (s+1)·B - 1 of the mixture, and rank r every world-th of them. Each rank renders its own
+    endless sources and takes their samples in order."""
 
     def __init__(self, mixture: Mixture, batch: int, start: int, stop: int, rank: int = 0, world: int = 1):
         self.mixture, self.batch, self.start, self.stop, self.rank, self.world = (
@@ -293,7 +299,7 @@ class StepSampler(Sampler):
 
 
 def collate(samples: list[dict]) -> dict:
-    """Stacks tensors, lists the rest."""
+    """Return a batch: tensors are stacked, other values become lists. Raises EventDataError: sizes differ."""
     if len({tuple(s["new"].shape) for s in samples}) > 1:
         raise EventDataError(
             "samples of a batch differ in size",
@@ -308,8 +314,8 @@ def collate(samples: list[dict]) -> dict:
 
 
 class _Carrying(Dataset):
-    """A data set whose errors travel as values: raised in a loader process, torch would hand
-    them on as pages of traceback."""
+    """A data set that returns errors as values, since torch reports an error of a loader process as pages of
+    traceback."""
 
     def __init__(self, dataset: FlowDataset):
         self.dataset = dataset
@@ -332,8 +338,8 @@ def _collate_or_carry(samples: list) -> dict | BlinkGLError:
 
 
 def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> Iterator[dict]:
-    """Batches in the sampler's order; the same ones for any number of workers. Raises what
-    ``dataset`` and :func:`collate` raise."""
+    """Yield batches in the order of the sampler, the same for any number of workers. Raises what ``dataset`` and
+    :func:`collate` raise."""
     loader = DataLoader(
         _Carrying(dataset),
         batch_sampler=sampler,
@@ -342,7 +348,7 @@ def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool 
         pin_memory=pin,
         persistent_workers=workers > 0,
         prefetch_factor=4 if workers else None,
-        generator=torch.Generator(),  # else each start would draw from torch's global one
+        generator=torch.Generator(),  # otherwise it would draw from torch's global generator
         multiprocessing_context="forkserver" if workers else None,
     )
     for batch in loader:

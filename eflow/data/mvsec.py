@@ -1,5 +1,5 @@
-"""MVSEC as samples: image pairs dt = 1 or 4 apart, ground truth propagated through the 20 Hz flow (Zhu et al., RSS
-2018); or the pairs, rows and ground truth of published tables (:data:`PROTOCOLS`)."""
+"""MVSEC as samples: pairs of images, dt = 1 or 4 apart, with ground truth propagated through the 20 Hz flow (Zhu et
+al., RSS 2018), or with the pairs, rows and ground truth of published tables (:data:`PROTOCOLS`)."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from eflow.data.window import RawSample, Window
 HEIGHT, WIDTH = 260, 346
 CROP = 256
 HOOD_ROW = 193
-"""Outdoors the car's hood fills the rows from here down."""
+"""First row that shows the hood of the car, outdoors."""
 TRUTHS = ("propagated", "scaled")
-"""Ground truth over a time that is no interval of the 20 Hz flow: pixels followed through field after field; or, as the
-code of the published tables has it for a time shorter than an interval, the field that it begins in times the share of
-its interval, even where the time goes on into the next one (0.10 to 0.23 px apart)."""
+"""Ground truth over a time that is not an interval of the 20 Hz flow. "propagated": pixels are followed through the
+successive fields. "scaled", for a time shorter than an interval, as in the code of the published tables: the field at
+its start, times the share of its interval, even if the time extends into the next interval. They differ by 0.10 to
+0.23 px."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What a table is made of.
+    """The samples and rows that a published table scores.
 
-    at : samples at "images", dt apart, or at the stamps of the "flow" (20 Hz). frames : of a sequence, the ranges
-    [first, end) of image or flow numbers that are scored; other sequences whole. hood : first row that is not scored
-    outdoors. truth : of :data:`TRUTHS`."""
+    at : samples at "images", dt apart, or at the time stamps of the "flow" (20 Hz).
+    frames : for a sequence, the ranges [first, end) of scored images or flow fields; other sequences are scored whole.
+    hood : first row that is not scored outdoors.   truth : of :data:`TRUTHS`."""
 
     at: str = "images"
     frames: dict[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
@@ -48,14 +49,14 @@ PROTOCOLS = {
     "ste-flownet": Protocol(frames={"outdoor_day1": ((9200, 9600), (10500, 10900))}, hood=192, truth="scaled"),
     "e-raft": Protocol(at="flow", frames={"outdoor_day1": ((4356, 4706),)}),
 }
-"""``all``: every pair that has ground truth. ``ste-flownet``: images of outdoor_day1 as in the tables of Spike-FlowNet
-and STE-FlowNet, whose centre crop ends above row 192. ``e-raft``: 20 Hz, as E-RAFT's table."""
+"""``all``: every pair with ground truth. ``ste-flownet``: the images of outdoor_day1 in the tables of Spike-FlowNet and
+STE-FlowNet, whose centre crop ends above row 192. ``e-raft``: 20 Hz, as in E-RAFT's table."""
 
 
 class NpzRows:
-    """Rows of arrays in an .npz without loading the arrays: MVSEC's flow is gigabytes. Never unpickles.
+    """Reads rows of arrays in an .npz without loading the arrays: MVSEC's flow has gigabytes. Never unpickles.
 
-    Raises AssetError: not an .npz, the array is missing, or of objects."""
+    Raises AssetError: not an .npz, or an array is missing or holds objects."""
 
     def __init__(self, path: Path, names: tuple[str, ...]):
         self.path, self._layout = path, {}
@@ -79,7 +80,7 @@ class NpzRows:
         return self._layout[name][0]
 
     def read(self, name: str, row: int | None = None) -> np.ndarray:
-        """One row, or the whole array."""
+        """Return one row, or the whole array."""
         shape, dtype, start = self._layout[name]
         shape = shape if row is None else shape[1:]
         count = math.prod(shape)
@@ -95,10 +96,10 @@ class MvsecSource:
     time. ``mask``: pixels with an event in the new window, inside the 256x256 centre crop, above the hood outdoors.
     Times: µs since the sequence's first image.
 
-    protocol : of :data:`PROTOCOLS`; at "flow" a sample's windows lie between stamps i - 1, i, i + 1 of the flow.
-    truth : of :data:`TRUTHS`; None: the protocol's.
-    Raises AssetError: no sequence, or one without the frames that the protocol scores. EventDataError: dt.
-    ConfigError: protocol, truth."""
+    protocol : of :data:`PROTOCOLS`; at "flow" the windows of a sample are between time stamps i - 1, i, i + 1 of the
+    flow.   truth : of :data:`TRUTHS`; None: that of the protocol.
+    Raises AssetError: no sequence, or one without the frames that the protocol scores. EventDataError: bad dt.
+    ConfigError: unknown protocol or truth."""
 
     has_backward = False
 
@@ -120,13 +121,13 @@ class MvsecSource:
             stamps = self._stamps(s)
             # Flow must cover [stamp i, stamp i + dt], and events [stamp i - dt, stamp i].
             i0, i1 = np.searchsorted(stamps, (s.flow_us[0], s.flow_us[-1]))
-            end = i1 + 1 if self.protocol.at == "flow" else i1  # its last stamp is a sample's end
+            end = i1 + 1 if self.protocol.at == "flow" else i1  # the last stamp is the end of a sample
             found = range(max(int(i0), dt), min(int(end), len(stamps)) - dt)
             ranges = self.protocol.frames.get(s.name)
             scored = [i for i in found if ranges is None or any(a <= i < b for a, b in ranges)]
             if not scored and ranges is not None:
                 raise AssetError(
-                    f"has none of the frames that {protocol} scores",
+                    f"has no frame that {protocol} scores",
                     where=str(path),
                     value=f"{found.start} to {found.stop - 1}",
                     accepted=" and ".join(f"{a} to {b - 1}" for a, b in ranges),
@@ -166,7 +167,7 @@ class _MvsecSequence:
                 ()
             ].astype(np.int64)
         if not len(stamps):
-            raise AssetError("no images, so no times to take samples between", where=str(path))
+            raise AssetError("has no images, so samples have no times", where=str(path))
         flow = path.with_name(f"{self.name}_gt_flow_dist.npz")
         if not flow.is_file():
             raise AssetError("no such file", where=str(flow), accepted="ground truth beside the events")
@@ -189,7 +190,7 @@ class _MvsecSequence:
         return {**self.__dict__, "_file": None, "_pid": None}
 
     def window(self, t0: int, t1: int) -> Window:
-        """Events of [t0, t1) µs; the images' event indices say where to look, the times decide."""
+        """Return the events of [t0, t1) µs. The event indices of the images are hints; times decide."""
         if self._pid != os.getpid():  # HDF5 handles do not survive a fork
             self._file, self._pid = open_hdf5(self.path), os.getpid()
         with hdf5_errors(self.path):
@@ -212,7 +213,8 @@ class _MvsecSequence:
         return Window(e.x, e.y, e.t, e.p, t0, t1)
 
     def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[np.ndarray, np.ndarray]:
-        """flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`. truth : of :data:`TRUTHS`."""
+        """Return flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`. truth : of
+        :data:`TRUTHS`."""
         k = int(np.clip(np.searchsorted(self.flow_us, t0, side="right") - 1, 0, len(self.flow_us) - 2))
         interval = int(self.flow_us[k + 1] - self.flow_us[k])
         if truth == "scaled" and t1 - t0 < interval:
@@ -235,13 +237,13 @@ class _MvsecSequence:
 
 
 def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
-    """int64 µs; AssetError when they are no list of increasing times."""
+    """Return times as int64 µs. Raises AssetError: not a list of increasing times."""
     if seconds.ndim != 1 or len(seconds) < 2:
         raise AssetError("not a list of times", where=where, value=seconds.shape, accepted="(N,) with N >= 2")
     t = microseconds(seconds, where)
     if (back := np.flatnonzero(t[1:] <= t[:-1])).size:
         raise AssetError(
-            f"time {int(back[0]) + 1} does not come after the one before",
+            f"time {int(back[0]) + 1} is not after the previous one",
             where=where,
             value=tuple(seconds[back[0] : back[0] + 2].tolist()),
         )
@@ -249,11 +251,11 @@ def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
 
 
 def propagate(pieces: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of every pixel followed through successive flow fields, each over a fraction of its interval.
+    """Return the displacement of every pixel through successive flow fields, each over a fraction of its interval.
 
-    pieces : (flow (H, W, 2) px over the field's whole interval, fraction in (0, 1]); 0, 0 means invalid. The field is
-    read at the pixel nearest to where the point has got to. Returns flow (H, W, 2) float32 and valid (H, W): False
-    where any piece was invalid or NaN, or the point left the image before the last piece."""
+    pieces : (flow (H, W, 2) px over the whole interval of the field, fraction in (0, 1]); (0, 0) is invalid. A field is
+    read at the pixel nearest to the position reached. Returns flow (H, W, 2) float32 and valid (H, W): False if a piece
+    was invalid or NaN, or the point left the image before the last piece."""
     height, width = pieces[0][0].shape[:2]
     start = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     at, valid = start.copy(), np.ones((height, width), bool)

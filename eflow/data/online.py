@@ -1,7 +1,7 @@
-"""Samples that are rendered while they are trained on: :class:`blinkgl.online.SampleStream` as a source.
+"""Samples rendered during training: a :class:`blinkgl.online.SampleStream` as a source.
 
 with open_online(SourceConfig(recipe="configs/eflow/real_data.yaml", online=True, workers=2), seed=0) as source:
-    sample = source[0]              # waits until it is there
+    sample = source[0]              # waits until it is rendered
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from eflow.data.window import RawSample, raw_sample
 
 
 class OnlineSource:
-    """A :class:`~eflow.data.sources.Source` without an end. ``source[n]`` gives sample n once (a copy in a loader
-    process, too); :meth:`first` may be looked at before.
+    """An endless :class:`~eflow.data.sources.Source`. ``source[n]`` returns sample n once, in a loader process, too;
+    :meth:`first` does not consume it.
 
     stats : :class:`blinkgl.online.StreamStats`."""
 
@@ -28,17 +28,17 @@ class OnlineSource:
         self.stream, self.stats, self.has_backward = stream, stream.stats, stream.has_backward
 
     def __len__(self) -> int:
-        raise TypeError("an online source has no end")
+        raise TypeError("an online source is endless")
 
     def __getitem__(self, n: int) -> RawSample:
         return raw_sample(self.stream.take(n))
 
     def first(self) -> RawSample:
-        """The sample that a training begins with; it stays."""
+        """Return the first sample of a training without consuming it."""
         return raw_sample(self.stream.peek(self.stream.first))
 
     def move(self, n: int, to: Path) -> None:
-        """Sample n as a file (:func:`blinkgl.online.samples.read_sample`)."""
+        """Move sample n to a file (read it by :func:`blinkgl.online.samples.read_sample`)."""
         self.stream.move(n, to)
 
     def close(self) -> None:
@@ -52,10 +52,10 @@ class OnlineSource:
 
 
 def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int = 0, batch: int = 1) -> OnlineSource:
-    """The source that ``{recipe: FILE, online: true, …}`` of an eflow configuration asks for.
+    """Open the source of ``{recipe: FILE, online: true, …}`` in an eflow configuration.
 
-    first : sample that is asked for first.   batch : samples that are asked for together.
-    Raises BlinkGLError: a recipe that is bad, or cannot be rendered here."""
+    first : the first sample to take.   batch : samples taken together.
+    Raises BlinkGLError: the recipe is bad, or cannot be rendered here."""
     template = load_run(s.recipe, s.set)
     template = load_run(s.recipe, s.set, seed=stream_seed(template.seed, seed))
     job = StreamJob(
@@ -80,7 +80,7 @@ def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int 
 
 
 class Held:
-    """A few samples in memory, as a :class:`~eflow.data.sources.Source`."""
+    """Samples in memory, as a :class:`~eflow.data.sources.Source`."""
 
     def __init__(self, samples: list[RawSample]):
         self._samples = samples
@@ -94,6 +94,6 @@ class Held:
 
 
 def held(s: SourceConfig, count: int, seed: int = 0) -> Held:
-    """``count`` samples of an online source's split "test", rendered now. Raises as :func:`open_online`."""
+    """Render ``count`` samples of a recipe's test groups into memory. Raises as :func:`open_online`."""
     with open_online(s, seed, split="test") as source:
         return Held([source[n] for n in range(count)])

@@ -1,9 +1,9 @@
-"""Samples as files: what :mod:`eflow.data.online` renders, kept in a folder, so that several networks can be trained
-on the same windows, or one more than once, without rendering them again.
+"""Rendered samples as files in a folder, so that several trainings can use the same windows without rendering them
+again.
 
     eflow render configs/eflow/real_data.yaml --samples 20000 --window-ms 5-100 --out out/real_windows
 
-The folder holds ``windows.json`` (how many, and of what) and one ``%07d.npz`` for each sample.
+The folder holds ``windows.json`` (their number and origin) and one ``%07d.npz`` per sample.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _VERSION = 1
 
 
 class PoolSource:
-    """A folder of :func:`render_pool`'s as a :class:`~eflow.data.sources.Source`.
+    """A folder written by :func:`render_pool`, as a :class:`~eflow.data.sources.Source`.
 
-    Raises AssetError: not such a folder, files missing; a damaged sample when it is asked for."""
+    Raises AssetError: not such a folder, missing files; for a damaged sample, when it is read."""
 
     def __init__(self, root: Path):
         self.root = root
@@ -37,7 +37,9 @@ class PoolSource:
         self.count, self.has_backward = about["samples"], about["backward"]
         there = sum(1 for _ in root.glob("*.npz"))
         if there != self.count:
-            raise AssetError("windows are missing", where=str(root), value=there, accepted=f"{self.count} .npz files")
+            raise AssetError(
+                "some windows are missing", where=str(root), value=there, accepted=f"{self.count} .npz files"
+            )
 
     def __len__(self) -> int:
         return self.count
@@ -48,7 +50,7 @@ class PoolSource:
             return raw_sample(read_sample(path))
         except (OSError, ValueError, KeyError, TypeError, EOFError, EventDataError) as error:
             raise AssetError(f"not a window of eflow render: {error}", where=str(path)) from None
-        except Exception as error:  # zipfile and zlib have errors of their own
+        except Exception as error:  # zipfile and zlib raise their own errors
             if type(error).__module__ not in ("zipfile", "zlib"):
                 raise
             raise AssetError(f"a damaged window: {error}", where=str(path)) from None
@@ -60,12 +62,14 @@ def _about(root: Path) -> dict[str, Any]:
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise AssetError(f"not readable: {error}", where=str(path)) from None
+        raise AssetError(f"cannot be read: {error}", where=str(path)) from None
     if not isinstance(about, dict) or about.get("version") != _VERSION:
-        raise AssetError("of another version", where=str(path), accepted=f"version {_VERSION}")
+        raise AssetError("unknown version", where=str(path), accepted=f"version {_VERSION}")
     samples, backward = about.get("samples"), about.get("backward")
     if not isinstance(samples, int) or isinstance(samples, bool) or samples < 1 or not isinstance(backward, bool):
-        raise AssetError("not a list of windows", where=str(path), value=(samples, backward), accepted=wanted)
+        raise AssetError(
+            "not the description of a folder of windows", where=str(path), value=(samples, backward), accepted=wanted
+        )
     return about
 
 
@@ -77,11 +81,11 @@ def render_pool(
     about: dict[str, Any] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> int:
-    """The first ``count`` samples of an online source as the folder ``out``, which appears when it is whole. An
-    interruption keeps what is there by then. Returns the number of samples.
+    """Write the first ``count`` samples of an online source to the new folder ``out``; return their number.
 
-    about : further entries of windows.json.   Raises OutputError (the folder exists, no space), ConfigError (a recipe
-    that gives no samples)."""
+    The folder appears when it is complete. After an interruption it holds the samples finished by then.
+    about : further entries of windows.json. Raises OutputError: the folder exists, no space. ConfigError: the recipe
+    gives no samples."""
     done = 0
     with atomic_folder(out) as folder:
         try:

@@ -1,5 +1,5 @@
-"""Events to the tensor a network eats. A representation is a frozen value:
-``representation(window, height, width)``."""
+"""Representations: the tensors that networks read, computed from events. A representation is a frozen value that is
+called as ``representation(window, height, width)``."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from eflow.ops import voxel
 
 
 class Representation(Protocol):
-    """Events of a window as a tensor."""
+    """Converts the events of a window to a tensor."""
 
     @property
     def channels(self) -> int: ...
 
     def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
-        """(channels, height, width) float32. Raises EventDataError: events outside the window or the sensor."""
+        """Return (channels, height, width) float32. Raises EventDataError: events outside the window or the sensor."""
         ...
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """See :func:`eflow.ops.voxel.voxel_grid`. bounds "window": bins span [t0, t1]; "events":
-    first to last event (E-RAFT's)."""
+    """A voxel grid, see :func:`eflow.ops.voxel.voxel_grid`.
+
+    bounds : "window": bins span [t0, t1]; "events": from the first to the last event (E-RAFT)."""
 
     bins: int = 15
     normalise: str = "nonzero"
@@ -59,7 +60,7 @@ class VoxelGrid:
 
 @dataclass(frozen=True)
 class CountSlices:
-    """Per-polarity counts in slices of equal duration: channel 2 s + p of slice s and polarity p (0 OFF, 1 ON)."""
+    """Counts per polarity in slices of equal duration: channel 2 s + p has slice s and polarity p (0 OFF, 1 ON)."""
 
     slices: int
 
@@ -75,7 +76,7 @@ class CountSlices:
 
 @dataclass(frozen=True)
 class CountsAndTimes:
-    """EV-FlowNet's four channels."""
+    """The four channels of EV-FlowNet: counts and latest times of both polarities."""
 
     channels: int = 4
 
@@ -85,7 +86,7 @@ class CountsAndTimes:
 
 
 def _on_pixels(window: Window, height: int, width: int) -> Window:
-    """Rectified coordinates rounded to the nearest pixel; those outside the sensor are left out, as the splat does."""
+    """Return a window with rectified coordinates rounded to the nearest pixel, without events outside the sensor."""
     if window.x.dtype.kind == "u":
         return window
     x, y = np.rint(window.x), np.rint(window.y)

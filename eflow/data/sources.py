@@ -1,8 +1,7 @@
-"""Data sets on disk as lists of samples: BlinkGL's sequence directories, DSEC, BlinkFlow. (MVSEC:
-:mod:`eflow.data.mvsec`; windows that were rendered one by one: :mod:`eflow.data.pool`.)
+"""Data sets on disk as lists of samples: BlinkGL's sequence directories, DSEC and BlinkFlow. (For MVSEC see
+:mod:`eflow.data.mvsec`, for single rendered windows :mod:`eflow.data.pool`.)
 
-All three are an event file beside one flow file per label, so one reader serves them;
-what differs is where the files lie.
+All three have an event file and one flow file per label, so they share one reader; only the places of the files differ.
 
 | layout | events | flow | times |
 |---|---|---|---|
@@ -35,14 +34,14 @@ from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where the parts of a data set lie below a folder.
+# Layouts of data sets.
 
 
 def below(root: Path, pattern: str) -> Iterator[Path]:
-    """Files and folders below ``root`` whose name matches ``pattern`` (`*` and `?`), those of a folder in order.
+    """Yield the files and folders below ``root`` whose name matches ``pattern`` (`*` and `?`), sorted in each folder.
 
-    Links to folders are followed, for subsets are often made of links; each folder is visited once, so that links in
-    a circle end."""
+    Links to folders are followed, since subsets are often made of links. Each folder is visited once, so circles of
+    links end."""
     visited = set()
     for folder, folders, files in os.walk(root, followlinks=True):
         real = os.path.realpath(folder)
@@ -60,7 +59,7 @@ _OPEN_FILES = 16
 
 
 class Source(Protocol):
-    """A finite list of samples. ``has_backward``: samples carry backward flow, so time reversal is possible."""
+    """A finite list of samples. ``has_backward``: samples have backward flow, so time reversal is possible."""
 
     has_backward: bool
 
@@ -70,8 +69,8 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Entry:
-    """One label: flow from ``from_us`` to ``to_us`` (image clock). ``index``: the file's
-    number, kept for submissions."""
+    """One label: flow from ``from_us`` to ``to_us`` (clock of the images). ``index``: number of the file, needed for
+    submissions."""
 
     index: int
     from_us: int
@@ -82,7 +81,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Sequence:
-    """One recording. ``scene``: what averages are taken over first."""
+    """One recording. ``scene``: the group over which metrics are averaged first."""
 
     name: str
     scene: str
@@ -92,8 +91,8 @@ class Sequence:
 
 
 class FolderSource:
-    """Samples of :class:`Sequence` objects, in order. Files are opened on first use in each process (HDF5 handles
-    survive neither a fork nor a pickle) and at most 16 stay open."""
+    """The samples of :class:`Sequence` objects, in order. Files are opened on first use in each process, since HDF5
+    handles survive neither a fork nor pickling; at most 16 stay open."""
 
     def __init__(self, sequences: list[Sequence]):
         self.sequences = sequences
@@ -104,7 +103,7 @@ class FolderSource:
         self._pid = os.getpid()
 
     def __getstate__(self) -> dict:
-        return {**self.__dict__, "_readers": OrderedDict()}  # handles stay in their process
+        return {**self.__dict__, "_readers": OrderedDict()}  # handles cannot be sent to another process
 
     def __len__(self) -> int:
         return len(self._index)
@@ -134,7 +133,7 @@ class FolderSource:
         )
 
     def entry(self, index: int) -> tuple[Sequence, Entry]:
-        """The sequence and label of sample ``index``."""
+        """Return the sequence and the label of sample ``index``."""
         return self._index[index]
 
     def _reader(self, path: Path) -> DsecEventReader:
@@ -188,11 +187,11 @@ class FolderSource:
             raise AssetError(
                 "event file, flow and rectification map differ in size", where=str(sequence.events), value=sorted(sizes)
             )
-        return sizes.pop() if sizes else (480, 640)  # DSEC's and BlinkFlow's sensor; their files do not say
+        return sizes.pop() if sizes else (480, 640)  # the sensor of DSEC and BlinkFlow, whose files do not store it
 
 
 def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px, valid (H, W) bool, of a DSEC PNG or a BlinkFlow .npy (u, v, validity).
+    """Return flow (H, W, 2) float32 px and valid (H, W) bool of a DSEC PNG or a BlinkFlow .npy (u, v, validity).
 
     Raises AssetError: missing, corrupt, wrong shape, or NaN / infinity in a valid pixel."""
     if path.suffix != ".npy":
@@ -209,8 +208,9 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_blinkgl(root: Path) -> list[Sequence]:
-    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds; those
-    without forward flow are passed over. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
+    """Return the sequence directories of ``index.jsonl`` in ``root``, or else all at or below ``root``.
+
+    Sequences without forward flow are skipped. Flow is read from the 16-bit PNG (quantum 1/128 px)."""
     found = []
     indexed = (root / INDEX).is_file()
     folders = (
@@ -228,13 +228,13 @@ def find_blinkgl(root: Path) -> list[Sequence]:
 
 
 def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
-    """A sequence directory; None where it has no events, or no forward flow. Raises AssetError: files are missing."""
+    """Return a sequence directory, or None if it has no events or no forward flow. Raises AssetError: missing files."""
     if not (folder / "events.h5").is_file():
         return None
     there, back = LABELS["flow_forward"], LABELS["flow_backward"]
     stamps = folder / there.stamps
     forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
-    # Made without flow: there is nothing to learn from it, and nothing wrong with it.
+    # Generated without flow: nothing to learn from, but not an error.
     if not forward and not stamps.exists():
         return None
     times = read_times(stamps)
@@ -249,9 +249,10 @@ def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
 
 
 def find_dsec(root: Path) -> list[Sequence]:
-    """DSEC sequences at or below ``root``; events and flow may lie in one tree, or in the archives' own
-    ``train_events`` and ``train_optical_flow``. A ``test_forward_flow_timestamps.csv`` or
-    ``<sequence>.csv`` gives a test sequence its times."""
+    """Return the DSEC sequences at or below ``root``.
+
+    Events and flow are in one tree, or in the folders of the archives, ``train_events`` and ``train_optical_flow``.
+    The times of a test sequence are in ``test_forward_flow_timestamps.csv`` or ``<sequence>.csv``."""
     found = []
     for events in sorted(below(root, "events.h5")):
         if events.parent.name not in ("left", "events_left") or "forward_flow" in {
@@ -293,8 +294,10 @@ def find_dsec(root: Path) -> list[Sequence]:
 
 
 def find_blinkflow(root: Path) -> list[Sequence]:
-    """BlinkFlow's published layout: ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``.
-    Label 0 has no events before it and is left out."""
+    """Return the sequences in the published layout of BlinkFlow,
+    ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``.
+
+    Label 0 is skipped, since it has no events before it."""
     found = []
     for folder in sorted(p.parent for p in below(root, "forward_flow") if p.is_dir()):
         fps = _fps(folder / "config.yaml")
@@ -325,7 +328,8 @@ def _fps(path: Path) -> float:
 
 
 def read_times(path: Path) -> list[tuple[int, int]]:
-    """``from_us, to_us`` lines under ``#`` headers. Raises AssetError: missing, not numbers, or not forward in time."""
+    """Return the lines ``from_us, to_us`` of a file, without ``#`` headers. Raises AssetError: not a list of
+    intervals."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         times = [tuple(int(v) for v in line.split(",")) for line in lines if line.strip() and not line.startswith("#")]
@@ -340,7 +344,7 @@ def read_times(path: Path) -> list[tuple[int, int]]:
 
 
 def read_submission_times(path: Path) -> list[tuple[int, int, int]]:
-    """DSEC's test CSV: (from_us, to_us, file_index) rows. Raises AssetError."""
+    """Return the rows (from_us, to_us, file_index) of a test CSV of DSEC. Raises AssetError."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             rows = [
@@ -367,7 +371,7 @@ def _same_count(folder: Path, files: list, times: list) -> None:
 
 
 def detect_format(root: Path) -> str:
-    """Which layout ``root`` holds. Raises AssetError when it is none."""
+    """Return the name of the layout at ``root``. Raises AssetError: no known layout."""
     if root.is_file() and root.name.endswith("_data.hdf5"):
         return "mvsec"
     if not root.is_dir():
@@ -385,18 +389,18 @@ def detect_format(root: Path) -> str:
     raise AssetError(
         "no data set found",
         where=str(root),
-        accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of eflow render's windows",
+        accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences, or of windows of eflow render",
     )
 
 
 def open_source(
     path: str | os.PathLike, format: str = "auto", *, dt: int = 1, protocol: str = "all", truth: str | None = None
 ) -> Source:
-    """The data set at ``path``; of MVSEC alone ``dt``, its interval in images, 1 or 4, and ``protocol`` and ``truth``,
-    see :class:`~eflow.data.mvsec.MvsecSource`.
+    """Open the data set at ``path``.
 
-    Raises ConfigError: those two, of another set. AssetError: nothing there, or a damaged index; files of single
-    samples are only looked at when they are asked for."""
+    dt, protocol, truth : for MVSEC only, see :class:`~eflow.data.mvsec.MvsecSource`.
+    Raises ConfigError: protocol or truth for another data set. AssetError: no data set, or a damaged index. Files of
+    single samples are opened when they are read."""
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
@@ -405,7 +409,7 @@ def open_source(
         return MvsecSource(root, dt, protocol, truth)
     for name, value in (("protocol", protocol), ("truth", truth)):
         if value not in ("all", None):
-            raise ConfigError("only of MVSEC", where=name, value=value, accepted="a set of MVSEC's layout")
+            raise ConfigError("only for MVSEC", where=name, value=value, accepted="a data set in the layout of MVSEC")
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
     if kind == "windows":

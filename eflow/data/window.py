@@ -1,7 +1,7 @@
-"""One window of events, and the transforms of a (old window, new window, flow) sample that are exact.
+"""Windows of events, samples of two windows and their flow, and exact transforms of them.
 
-Everything acts on the events themselves, before any grid exists, so that each transform is right for every
-representation; that it equals the transform of the voxel grid is what the tests show.
+Transforms act on the events, before any grid, so that they are right for every representation. Tests compare them with
+the transforms of voxel grids.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ class Window:
         return len(self.t)
 
     def take(self, keep: np.ndarray) -> Window:
-        """Events chosen by mask or index, in order."""
+        """Return a window with the events of a mask or an index, in order."""
         return replace(self, x=self.x[keep], y=self.y[keep], t=self.t[keep], p=self.p[keep])
 
     def flipped(self, axis: str, size: int) -> Window:
-        """Mirrored: axis "x" or "y", ``size`` the sensor's width or height."""
+        """Return the window mirrored along axis "x" or "y"; ``size`` is the width or height of the sensor."""
         column = getattr(self, axis)
         return replace(self, **{axis: (column.dtype.type(size - 1) - column).astype(column.dtype)})
 
     def transposed(self) -> Window:
-        """Rows and columns exchanged."""
+        """Return the window with rows and columns exchanged."""
         return replace(self, x=self.y, y=self.x)
 
     def inverted(self) -> Window:
-        """Polarity swapped (a copy: windows may be shared)."""
+        """Return the window with all polarities swapped."""
         return replace(self, p=1 - self.p)
 
     def reversed(self) -> Window:
-        """The film backwards: t -> t0 + t1 - t, order and polarity turned (what brightened now darkens). Times then lie
-        in (t0, t1]; voxel(reversed) = -flip(bins) of voxel exactly."""
+        """Return the window with time reversed: t -> t0 + t1 - t, order reversed, polarity swapped.
+
+        Times are then in (t0, t1]. The voxel grid of the result is exactly -flip(bins) of the original one."""
         return replace(self, x=self.x[::-1], y=self.y[::-1], t=(self.t0 + self.t1) - self.t[::-1], p=(1 - self.p)[::-1])
 
     def with_events(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> Window:
-        """Further events merged in, time order kept; of equal times those that were there come first."""
+        """Return the window with further events merged in by time; at equal times the original ones come first."""
         order = np.argsort(t, kind="stable")
-        # Only what is new is sorted: there are 500,000 of the others.
+        # Only the new events are sorted: the window may have 500,000.
         at = np.searchsorted(self.t, t[order], side="right") + np.arange(len(t))
         there = np.ones(len(self.t) + len(t), bool)
         there[at] = False
@@ -67,13 +68,13 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class RawSample:
-    """What a source gives, before augmentation and grids.
+    """A sample as a source returns it, before augmentation and grids.
 
     old, new : events of [t - Δ, t) and [t, t + Δ). height, width : sensor, px.
-    flow : (H, W, 2) float32 px t -> t + Δ at reference t; valid : (H, W) bool. None where there is no ground truth.
-    backward, backward_valid : the same for t -> t - Δ, where the source has it.
-    mask : (H, W) bool further restriction for evaluation (MVSEC: event pixels inside the crop), else None.
-    name : "sequence/000012", unique in the data set. scene : what evaluation averages over.
+    flow : (H, W, 2) float32 px, t -> t + Δ, at reference time t; valid : (H, W) bool. None: no ground truth.
+    backward, backward_valid : the same for t -> t - Δ, if the source has it.
+    mask : (H, W) bool, pixels to evaluate (MVSEC: pixels with events inside the crop); None: all.
+    name : "sequence/000012", unique in the data set. scene : group over which evaluation averages.
     """
 
     old: Window
@@ -90,7 +91,7 @@ class RawSample:
 
     @property
     def hit(self) -> np.ndarray:
-        """(H, W) bool: pixels that have an event in either window."""
+        """The pixels with an event in either window, (H, W) bool."""
         found = np.zeros((self.height, self.width), bool)
         for w in (self.old, self.new):
             x, y = (np.rint(c).astype(np.int64) for c in (w.x, w.y))
@@ -99,12 +100,12 @@ class RawSample:
         return found
 
     def flip(self, axis: str) -> RawSample:
-        """Mirror image: horizontal for axis "x", vertical for "y"."""
+        """Return the sample mirrored horizontally (axis "x") or vertically ("y")."""
         size, image_axis, component = (self.width, 1, 0) if axis == "x" else (self.height, 0, 1)
         turn = lambda a: None if a is None else np.flip(a, image_axis)
         sign = np.ones(2, np.float32)
         sign[component] = -1
-        signed = lambda f: None if f is None else turn(f) * sign  # a fresh array: sources may share theirs
+        signed = lambda f: None if f is None else turn(f) * sign  # a new array: sources may share theirs
         return replace(
             self,
             old=self.old.flipped(axis, size),
@@ -117,7 +118,7 @@ class RawSample:
         )
 
     def transpose(self) -> RawSample:
-        """Rows and columns exchanged, of the flow its components, too."""
+        """Return the sample with rows and columns, and components of flow, exchanged."""
         turn = lambda a: None if a is None else a.swapaxes(0, 1)
         swapped = lambda f: None if f is None else turn(f)[..., ::-1]
         return replace(
@@ -134,14 +135,14 @@ class RawSample:
         )
 
     def invert(self) -> RawSample:
-        """Contrast inverted: every polarity swapped, the flow unchanged."""
+        """Return the sample with all polarities swapped; flow does not change."""
         return replace(self, old=self.old.inverted(), new=self.new.inverted())
 
     def reverse(self) -> RawSample:
-        """Time reversed about the reference time: the windows swap places and run backwards, and the target becomes the
-        *backward* flow (not minus the forward flow: that would be right only for constant velocity).
+        """Return the sample with time reversed about the reference time.
 
-        Raises ValueError without backward flow."""
+        The windows exchange their places and run backwards. The target is the *backward* flow; minus the forward flow
+        would be right only for constant velocity. Raises ValueError: no backward flow."""
         if self.backward is None:
             raise ValueError("time reversal needs the backward flow")
         t = self.new.t0  # mirrored about the reference: [t, t + Δ) becomes (t - Δ, t]
@@ -157,12 +158,12 @@ class RawSample:
         )
 
     def drop(self, fraction: float, rng: np.random.Generator) -> RawSample:
-        """Each event lost with probability ``fraction``."""
+        """Return the sample with each event lost with probability ``fraction``."""
         thin = lambda w: w.take(rng.random(len(w)) >= fraction)
         return replace(self, old=thin(self.old), new=thin(self.new))
 
     def hot_pixels(self, count: int, rate_hz: float, rng: np.random.Generator) -> RawSample:
-        """``count`` pixels, the same in both windows, fire ON events at ``rate_hz`` (a Poisson process)."""
+        """Return the sample with ``count`` hot pixels, which fire ON events at ``rate_hz`` (a Poisson process)."""
         x, y = rng.integers(0, self.width, count), rng.integers(0, self.height, count)
 
         def burn(w: Window) -> Window:
@@ -173,7 +174,7 @@ class RawSample:
         return replace(self, old=burn(self.old), new=burn(self.new))
 
     def noise(self, rate_hz: float, rng: np.random.Generator) -> RawSample:
-        """Background activity: uniform Poisson events of either polarity, ``rate_hz`` per pixel."""
+        """Return the sample with background activity: Poisson events of both polarities, ``rate_hz`` per pixel."""
 
         def add(w: Window) -> Window:
             n = rng.poisson(rate_hz * (w.t1 - w.t0) * 1e-6 * self.height * self.width)
@@ -188,7 +189,7 @@ class RawSample:
 
 
 def raw_sample(s: WindowSample) -> RawSample:
-    """The same, as everything in eflow takes it."""
+    """Return a rendered sample as a RawSample."""
     t, span = s.t_us, s.span_us
     return RawSample(
         _of(s.old, t - span, t),

@@ -1,4 +1,4 @@
-"""Flow by optimisation: methods that were never trained, under the same commands as the networks.
+"""Flow by optimisation: methods without training, for the same commands as networks.
 
 In:    the events of two windows.
 Out:   flow.

@@ -1,8 +1,8 @@
-"""Contrast maximisation: the flow whose images of warped events are sharpest.
+"""Contrast maximisation: finds the flow with the sharpest images of warped events.
 
-Gallego, Rebecq and Scaramuzza (CVPR 2018); the objective is the squared gradient of the image (Gallego, Gehrig and
-Scaramuzza, CVPR 2019), taken at the first, the middle and the last time and divided by its value at zero flow (Shiba,
-Aoki and Gallego, ECCV 2022), which keeps a field that pulls all events into a point at one of the times from winning.
+Gallego, Rebecq and Scaramuzza (CVPR 2018). The objective is the squared gradient of the image (Gallego, Gehrig and
+Scaramuzza, CVPR 2019) at the first, middle and last time, divided by its value at zero flow (Shiba, Aoki and Gallego,
+ECCV 2022), which penalises flow that maps all events to one point at one of the times.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from eflow.methods.iwe import slope_at, vote
 
 LEAST_EVENTS = 50
 MOST_EVENTS = 60_000
-"""Of more, every n-th is taken: sharpness does not gain by them, time does."""
+"""Largest number of events; of more, every n-th is used, since further events cost time and hardly change the
+result."""
 HOT = 10.0
-"""A pixel with more than so many times the mean of those that fired is hot: it shines wherever nothing moves."""
+"""A pixel is hot if it has more than this many times the mean number of events of pixels with events."""
 BLURS_PX = (4.0, 2.0, 1.0)
-"""Gaussians the image is seen through, one optimisation after the other: the coarse ones have few false maxima."""
+"""Standard deviations of the blur of successive optimisations: a coarse image has few local maxima."""
 TIMES = ((0.0, 0.25), (0.5, 0.5), (1.0, 0.25))
-"""(time that events are carried to, as a share of the span; weight)."""
+"""(Reference time of the warp, as a share of the span; weight)."""
 _FINEST_PX = 1.5
-"""Blur at which an image's pixels are those of the sensor, or finer."""
+"""Largest blur, px, for which the image has the resolution of the sensor; above, its pixels are larger."""
 MARGIN = 0.15
-"""Of the larger side, round the image: events must not win by leaving it."""
+"""Border around the image, as a share of its larger side: flow must not gain by moving events out of the image."""
 FARTHEST = 0.4
 """Largest translation over both windows, as a share of the larger side."""
 MOST_GROWTH = 0.7
-"""Largest change of the flow per px over both windows. A field that grows by 2 carries all events of the last time into
-one point, the sharpest image that there is and no motion (event collapse)."""
+"""Largest change of flow per px over both windows. A field with a change of 2 maps all events to one point at the last
+time: the sharpest image, but not the motion (event collapse)."""
 
 
 @dataclass
@@ -80,11 +81,11 @@ class _Field:
         return self.basis[0] @ p, self.basis[1] @ p
 
     def first(self, count: int) -> _Field:
-        """Of the first parameters alone."""
+        """Return the field of the first ``count`` parameters."""
         return _Field(tuple(b[:, :count] for b in self.basis), self.limits[:count])
 
     def pulled(self, slope: np.ndarray) -> np.ndarray:
-        """(k,) derivative by the parameters, given (N, 2) by the points' flow."""
+        """Return the derivative (k,) by the parameters, given the derivative (N, 2) by the flow of the points."""
         return self.basis[0].T @ slope[:, 0] + self.basis[1].T @ slope[:, 1]
 
 
@@ -93,8 +94,8 @@ def _centred(x: np.ndarray, y: np.ndarray, height: int, width: int, unit: float)
 
 
 def affine_field(x: np.ndarray, y: np.ndarray, height: int, width: int) -> _Field:
-    """Six parameters, px at the border: a translation, then what grows with x, then with y. The first two alone: a
-    translation."""
+    """Return an affine field of six parameters, px at the border: a translation, then the change with x, then that with
+    y. The first two alone are a translation."""
     u, v = _centred(x, y, height, width, max(height, width) / 2)
     one, none = np.ones_like(u), np.zeros_like(u)
     most, growth = FARTHEST * max(height, width), MOST_GROWTH * max(height, width) / 2
@@ -105,8 +106,8 @@ def affine_field(x: np.ndarray, y: np.ndarray, height: int, width: int) -> _Fiel
 
 
 def rotation_field(x: np.ndarray, y: np.ndarray, height: int, width: int, focal: float) -> _Field:
-    """Three parameters, radians times the focal length: rotation of a pin-hole camera about its axes (Longuet-Higgins
-    and Prazdny 1980, the part that knows no depth)."""
+    """Return the field of a rotating pin-hole camera, with three parameters, radians times the focal length
+    (Longuet-Higgins and Prazdny 1980, the part that does not depend on depth)."""
     u, v = _centred(x, y, height, width, focal)
     most = FARTHEST * max(height, width)
     return _Field(
@@ -116,9 +117,9 @@ def rotation_field(x: np.ndarray, y: np.ndarray, height: int, width: int, focal:
 
 
 def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -> tuple[float, np.ndarray]:
-    """Mean squared gradient of the images of warped events over :data:`TIMES`, and its (N, 2) derivative by each
-    event's flow. flow : px over the span."""
-    unit = max(1.0, blur / _FINEST_PX)  # what is blurred needs no finer pixels
+    """Return the mean squared gradient of the images of warped events over :data:`TIMES`, and its derivative (N, 2) by
+    the flow of each event. flow : px over the span."""
+    unit = max(1.0, blur / _FINEST_PX)  # a blurred image does not need fine pixels
     blur, edge = blur / unit, MARGIN * max(cloud.height, cloud.width) / unit
     shape = (math.ceil(cloud.height / unit + 2 * edge), math.ceil(cloud.width / unit + 2 * edge))
     total, slope, point = 0.0, np.zeros((len(cloud.x), 2)), np.empty((len(cloud.x), 2))
@@ -130,7 +131,7 @@ def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -
         image = ndimage.gaussian_filter(votes, blur, mode="constant", truncate=3)
         down, right = np.diff(image, axis=0), np.diff(image, axis=1)
         total += weight * ((down**2).sum() + (right**2).sum())
-        back = np.zeros(shape)  # the derivative by the blurred image, then by the votes: a Gaussian is its own adjoint
+        back = np.zeros(shape)  # derivative by the blurred image, then by the votes: a Gaussian filter is self-adjoint
         back[1:] += down
         back[:-1] -= down
         back[:, 1:] += right
@@ -141,18 +142,18 @@ def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -
 
 
 LENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
-"""Factors that :func:`sharpest_length` tries. Networks make flow too long where it is short, hardly ever too short; and
-where things move their own ways a longer flow is always a little sharper (event collapse)."""
+"""Factors that :func:`sharpest_length` tries. Networks often return too long flow for short motion, and seldom too
+short flow; and with independent motion a longer flow is always a little sharper (event collapse)."""
 LENGTH_PRIOR = 0.03
-"""Weight of (ln factor)^2 beside the logarithm of the sharpness: where events hardly tell, the network is believed."""
+"""Weight of (ln factor)^2, subtracted from the logarithm of the sharpness: it favours the network's own length."""
 
 
 def sharpest_length(windows: list[Window], flow: np.ndarray) -> float:
-    """Return the factor by which a flow has to be multiplied so that its events are sharpest: a network knows the
-    direction of motion from few events, and its length less well.
+    """Return the factor of a flow with which the warped events are sharpest. Networks estimate the direction of motion
+    better than its length.
 
-    windows : one, or two that follow each other.   flow : (H, W, 2) px over the last of them.
-    1.0 where there are too few events to tell (:data:`LEAST_EVENTS`) or nothing moves."""
+    windows : one, or two successive ones.   flow : (H, W, 2) px over the last of them.
+    The factor is 1.0 if there are fewer than :data:`LEAST_EVENTS` events, or nothing moves."""
     height, width = flow.shape[:2]
     try:
         cloud = _Cloud.of(windows, height, width)
@@ -167,7 +168,7 @@ def sharpest_length(windows: list[Window], flow: np.ndarray) -> float:
     best = int(scores.argmax())
     if best in (0, len(LENGTHS) - 1):
         return LENGTHS[best]
-    # The top of the parabola through three equally spaced factors.
+    # Maximum of the parabola through three equally spaced factors.
     low, middle, high = scores[best - 1 : best + 2]
     step = LENGTHS[best + 1] - LENGTHS[best]
     return LENGTHS[best] + 0.5 * step * (low - high) / (low - 2 * middle + high)
@@ -180,7 +181,7 @@ def _climb(
     blur: float,
     steps: int,
 ) -> tuple[np.ndarray, float]:
-    """(parameters, relative sharpness) at the top reached from ``start``."""
+    """Return (parameters, relative sharpness) of the local maximum near ``start``."""
     none = (np.zeros_like(cloud.x),) * 2
     scale = sharpness(cloud, none, blur)[0] or 1.0
 
@@ -195,8 +196,8 @@ def _climb(
 
 
 def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarray:
-    """(2,) px over the span: the best of a fan of translations up to ``most``, by the variance of an image of pixels
-    four times as coarse."""
+    """Return the best of a grid of translations up to ``most``, (2,) px over the span, by the variance of an image with
+    pixels four times as large."""
     coarse = 4.0
     x, y, s = cloud.x[keep] / coarse, cloud.y[keep] / coarse, cloud.s[keep] - 0.5
     shape = (math.ceil(cloud.height / coarse) + 2, math.ceil(cloud.width / coarse) + 2)
@@ -204,7 +205,7 @@ def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarra
     lengths = np.concatenate([[0.0], np.geomspace(0.5, max(reach, 0.6), max(2, math.ceil(3 * math.log2(2 + reach))))])
     best, top = np.zeros(2), -1.0
     for length in lengths:
-        ways = max(1, math.ceil(4 * math.pi * min(length, 4)))  # half a coarse pixel apart, where they are near
+        ways = max(1, math.ceil(4 * math.pi * min(length, 4)))  # half a coarse pixel apart for short translations
         for turn in 2 * math.pi * np.arange(ways) / ways:
             shift = length * np.array([math.cos(turn), math.sin(turn)])
             image = np.zeros(shape)
@@ -216,22 +217,23 @@ def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarra
 
 
 class ContrastMaximisation:
-    """field : "translation" | "affine" | "rotation".   focal : px, for rotation.
+    """A method (:class:`eflow.methods.Method`) that fits one flow field to both windows.
 
-    The field stands still over both windows, so a motion that changes within them is averaged."""
+    field : "translation" | "affine" | "rotation".   focal : px, for rotation.
+    The field is constant over both windows: a motion that changes within them is averaged."""
 
     def __init__(self, field: str, focal: float | None = None):
         self.field, self.focal = field, focal
         self.name, self.about = f"contrast-{field}", f"contrast maximisation, {field}"
 
     def __call__(self, old: Window, new: Window, height: int, width: int) -> np.ndarray:
-        """As :class:`eflow.methods.Method`."""
+        """Return the flow over the new window, see :class:`eflow.methods.Method`."""
         cloud = _Cloud.of([old, new], height, width)
-        span = 2.0  # windows: the search is over the flow of both, the answer over the new one
+        span = 2.0  # windows: the search is for the flow over both, the result is that over the new one
         make = self._family(height, width)
         field = make(cloud.x, cloud.y)
         found = [self._from(cloud, field, start) for start in self._starts(cloud, field)]
-        # What is best through a blur may be worse than no motion at all without it.
+        # The maximum of the blurred images may be worse than zero flow without blur.
         found.append(_climb(cloud, field, np.zeros(field.basis[0].shape[1]), BLURS_PX[-1], 30))
         p = max(found, key=lambda one: one[1])[0]
         grid = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
@@ -247,7 +249,7 @@ class ContrastMaximisation:
         return lambda x, y: affine_field(x, y, height, width)
 
     def _starts(self, cloud: _Cloud, field: _Field) -> list[np.ndarray]:
-        """Parameters to climb from: no motion, the best translation, and the field that fits the best translations of
+        """Return initial parameters: zero flow, the best translation, and the field nearest to the best translations of
         nine parts of the image."""
         most = FARTHEST * max(cloud.height, cloud.width)
         everywhere = np.ones(len(cloud.x), bool)

@@ -1,7 +1,7 @@
-"""Images of warped events: where the events of a window fall when each is carried along a flow to one time.
+"""Images of warped events: all events of a window, moved along a flow to one time.
 
-Events of one edge then fall on one line, so that a right flow makes the image sharp (Gallego, Rebecq and Scaramuzza,
-CVPR 2018; Stoffregen et al., ECCV 2020).
+With the right flow, the events of an edge fall on one line, so the image is sharp (Gallego, Rebecq and Scaramuzza, CVPR
+2018; Stoffregen et al., ECCV 2020).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from eflow.data.window import Window
 
 @kernel
 def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
-    """Adds 1 for every point (x, y), float64 px, to the four pixels round it, bilinearly; what is outside is lost."""
+    """Add 1 for every point (x, y), float64 px, to its four pixels, bilinearly; points outside are ignored."""
     height, width = image.shape
     for i in range(len(x)):
         fx, fy = np.floor(x[i]), np.floor(y[i])
@@ -30,7 +30,8 @@ def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
 
 @kernel
 def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
-    """out (N, 2): derivative of sum(image * votes) by each point's x and y; the adjoint of :func:`vote`."""
+    """Write the derivative of sum(image * votes) by x and y of each point to out (N, 2): the adjoint of
+    :func:`vote`."""
     height, width = image.shape
     for i in range(len(x)):
         fx, fy = np.floor(x[i]), np.floor(y[i])
@@ -46,7 +47,7 @@ def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -
 
 
 def warped(window: Window, flow: np.ndarray, span_us: int | None = None) -> np.ndarray:
-    """(H, W) float64 image of the window's events carried back along ``flow`` to its first time.
+    """Return the image (H, W) float64 of the events of a window, moved back along ``flow`` to its start.
 
     flow : (H, W, 2) px per ``span_us`` (default: the window's length), read at each event's pixel."""
     height, width = flow.shape[:2]
@@ -60,8 +61,10 @@ def warped(window: Window, flow: np.ndarray, span_us: int | None = None) -> np.n
 
 
 def flow_warp_loss(window: Window, flow: np.ndarray) -> float:
-    """FWL of Stoffregen et al. (ECCV 2020), eq. 6: variance of the image of the events warped by the flow over that of
-    the events as they are. Above 1 the flow sharpens; 1 is zero flow's; NaN without events. flow : (H, W, 2) px over
-    the window."""
+    """Return the flow warp loss (Stoffregen et al., ECCV 2020, eq. 6): the variance of the image of warped events over
+    that of the events themselves.
+
+    Above 1 the flow makes the image sharper; zero flow has 1; without events it is NaN. flow : (H, W, 2) px over the
+    window."""
     before = warped(window, np.zeros_like(flow)).var()
     return float(warped(window, flow).var() / before) if before > 0 else float("nan")

@@ -1,4 +1,4 @@
-"""The methods by name, as `eflow predict` and `eflow evaluate` take them in a checkpoint's place."""
+"""The methods by name; `eflow predict` and `eflow evaluate` take these names in place of a checkpoint."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from eflow.data.window import Window
 
 
 class Method(Protocol):
-    """Events of [t - Δ, t) and [t, t + Δ) to the flow t -> t + Δ.
+    """Computes the flow t -> t + Δ from the events of [t - Δ, t) and [t, t + Δ).
 
     name : as in :data:`METHODS`.   about : one line."""
 
@@ -19,7 +19,7 @@ class Method(Protocol):
     about: str
 
     def __call__(self, old: Window, new: Window, height: int, width: int) -> np.ndarray:
-        """(H, W, 2) float32 px, +x right, +y down. Raises EventDataError: too few events to say anything."""
+        """Return flow (H, W, 2) float32 px, +x right, +y down. Raises EventDataError: too few events."""
         ...
 
 
@@ -37,11 +37,12 @@ METHODS = {
     "contrast-affine": _contrast("affine"),
     "contrast-rotation": _contrast("rotation"),
 }
-"""name -> what makes it, given the focal length in px (only rotation needs it)."""
+"""Name -> function that makes the method, given the focal length in px (only rotation needs it)."""
 
 
 def make_method(name: str, focal: float | None = None) -> Method:
-    """A method of :data:`METHODS`. focal : px, of an ideal pin-hole camera whose axis meets the middle of the image.
+    """Return a method of :data:`METHODS`. focal : px, of a pin-hole camera with its principal point in the image
+    centre.
 
     Raises ConfigError: rotation without a focal length."""
     if name == "contrast-rotation" and not focal:

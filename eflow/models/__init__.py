@@ -1,4 +1,4 @@
-"""The networks behind one contract (:mod:`eflow.models.contract`).
+"""The networks, all with one interface (:mod:`eflow.models.contract`).
 
 In:    a model configuration; tensors of events.
 Out:   flow.
@@ -23,7 +23,7 @@ from eflow.models.ste_flownet import SteFlowNet
 NETWORKS: dict[str, type[FlowModel]] = {
     tag_of(model.Config)[1]: model for model in (EFlowFormer, Eraft, SteFlowNet, EvFlowNet, SpikeFlowNet)
 }
-"""By the key ``name`` of their configuration; nothing else lists networks."""
+"""The networks by the key ``name`` of their configuration: the only list of networks."""
 SIZES = ("base", "small", "tiny")
 
 _QUICK = {"size": "tiny", "quick": True, "trunk": (16, 32, 64), "levels": 2, "iterations": 1, "train_iterations": 1}
@@ -34,7 +34,7 @@ PRESETS: dict[str, dict] = {
     "eflowformer-twins": {"name": "eflowformer", "layers": 2, "attention": "twins"},
     "eflowformer-quick": {"name": "eflowformer", **_QUICK},
 }
-"""Names that ``eflow train --model`` takes: every network in every size."""
+"""Configurations by the names of ``eflow train --model``: every network in every size."""
 
 __all__ = [
     "NETWORKS",
@@ -50,15 +50,14 @@ __all__ = [
 
 
 def preset(name: str) -> dict:
-    """Plain data of a model by its name in :data:`PRESETS`. Raises ConfigError."""
+    """Return the configuration of a name in :data:`PRESETS`, as plain data. Raises ConfigError."""
     if name not in PRESETS:
         raise ConfigError("unknown model", where="--model", value=name, accepted="one of " + ", ".join(PRESETS))
     return PRESETS[name]
 
 
 def build_model(config: Any) -> FlowModel:
-    """The network a model configuration (:mod:`eflow.config`) describes, freshly
-    initialised from torch's current seed."""
+    """Return the network of a model configuration (:mod:`eflow.config`), initialised from torch's current seed."""
     return NETWORKS[config.name](config)
 
 
@@ -67,5 +66,5 @@ class _Holder(Config):
 
 
 def model_config(tree: dict) -> Any:
-    """Plain data, e.g. ``{"name": "eraft"}``, to a validated model configuration. Raises ConfigError."""
+    """Return the validated model configuration of plain data, e.g. ``{"name": "eraft"}``. Raises ConfigError."""
     return validate(_Holder, {"model": tree}).model

@@ -1,7 +1,7 @@
-"""What every model takes and gives.
+"""The interface of all networks.
 
 ``model(batch) -> FlowPrediction`` with ``batch["old"]`` and ``batch["new"]``, both (N, C, H, W) float32 as made by
-``model.representation``: the events of [t - Δ, t) and of [t, t + Δ). Models of one window ignore ``old``.
+``model.representation``: the events of [t - Δ, t) and of [t, t + Δ). Networks of one window ignore ``old``.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FlowPrediction:
-    """flows : list of (N, 2, H, W) float32 px at input resolution, t -> t + Δ at reference
-    t, +x right, +y down; coarse or early
-        first, the last is the answer. Evaluation mode gives only the last.
-    kind : "sequence" (refinements of one field) or "scales" (decoder scales); decides the weights of the loss.
-    has_match : flows[0] is the matching layer's field, not the refinement's.
-    low : (N, 2, H/8, W/8) final low-resolution flow in units of low-resolution px, for a
-    warm start; None where there is none.
+    """The output of a network.
+
+    flows : list of (N, 2, H, W) float32 px at input resolution, t -> t + Δ at reference time t, +x right, +y down.
+        Coarse or early flow comes first, the result last. In evaluation mode there is only the result.
+    kind : "sequence" (refinements of one field) or "scales" (of a decoder); it decides the weights of the loss.
+    has_match : flows[0] is the flow of the matching layer.
+    low : (N, 2, H/8, W/8) final low-resolution flow, in px of that resolution, for a warm start; None if the network
+        has none.
     """
 
     flows: list[Tensor]
@@ -40,16 +41,16 @@ class FlowPrediction:
 
 
 class FlowModel(nn.Module):
-    """Base: the input check. Subclasses name their ``Config`` and set ``divisor``, ``least`` and ``representation``."""
+    """Base class of networks. Subclasses set ``Config``, ``divisor``, ``least`` and ``representation``."""
 
     Config: ClassVar[type[BaseConfig]]
-    """What the network is made from; its key ``name`` is the network's in :data:`eflow.models.NETWORKS`."""
+    """Class of its configuration; the key ``name`` of that is the name in :data:`eflow.models.NETWORKS`."""
     divisor: int = 8
     """Height and width must be multiples of this; :mod:`eflow.infer` pads."""
     least: int = 32
     """Smallest accepted height and width, px."""
     reads: ClassVar[tuple[str, ...]] = ("old", "new")
-    """The windows that it looks at; a batch need not hold others."""
+    """The windows that the network reads; a batch need not have others."""
     pad_to: int | None = None
     """Multiple that :mod:`eflow.infer` pads to; None: ``divisor``."""
     pad_start: bool = False
@@ -58,12 +59,11 @@ class FlowModel(nn.Module):
     config: Any
 
     def check_input(self, batch: dict) -> None:
-        """Raises EventDataError for sizes and shapes the network cannot work on."""
+        """Raise EventDataError if the network cannot process the size or shape of the batch."""
         new = batch["new"]
         channels = self.representation.channels
         height, width = new.shape[-2:]
-        # The representation decides the channels; a tensor of another one would run through and mean
-        # nothing.
+        # A tensor of another representation with other channels would fail later, or give meaningless flow.
         if new.ndim != 4 or new.shape[1] != channels:
             raise EventDataError(
                 "event tensor of another representation",
@@ -88,10 +88,10 @@ class FlowModel(nn.Module):
 
 
 def initialise(module: nn.Module) -> None:
-    """Kaiming for convolutions (fan-out, ReLU), ones and zeros for norms, Xavier for linear layers; biases zero."""
+    """Initialise convolutions by Kaiming (fan-out, ReLU), linear layers by Xavier, norms by 1, biases by 0."""
     for m in module.modules():
-        # Fan-out keeps the size of gradients from layer to layer. Of a transposed convolution, whose
-        # weight has inputs and outputs exchanged, torch's fan_in is just that.
+        # Fan-out keeps the size of gradients from layer to layer. The weight of a transposed convolution has inputs
+        # and outputs exchanged, so its fan-out is torch's fan_in.
         if isinstance(m, nn.Conv2d):
             nn.init.kaiming_normal_(m.weight, mode="fan_out", nonlinearity="relu")
         elif isinstance(m, nn.ConvTranspose2d):
@@ -107,5 +107,5 @@ def initialise(module: nn.Module) -> None:
 
 
 def parameters_of(model: nn.Module) -> int:
-    """Number of trainable parameters."""
+    """Return the number of trainable parameters."""
     return sum(p.numel() for p in model.parameters() if p.requires_grad)

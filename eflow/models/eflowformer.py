@@ -1,5 +1,5 @@
-"""E-FlowFormer (Li et al., "BlinkFlow", IROS 2023): E-RAFT with transformer-enhanced
-features and a supervised matching layer."""
+"""E-FlowFormer (Li et al., "BlinkFlow", IROS 2023): E-RAFT with features enhanced by a transformer, and a supervised
+matching layer."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ WINDOW, REDUCTION, MLP_RATIO, PER_HEAD = 10, 4, 4, 32
 
 START_GAIN = 0.25
 RATE = 20.0
-"""Prior and gain change by this factor faster than an optimiser would change their logarithms."""
+"""Prior and gain learn faster by this factor than their logarithms would."""
 _TOKENS = 1024
 
 
 class Mlp(nn.Sequential):
-    """Norm, expand fourfold, GELU, contract. Without gradients in blocks of tokens, whose
-    hidden layer then stays in the cache."""
+    """Norm, linear layer to four times the channels, GELU, linear layer. Without gradients it processes blocks of
+    tokens, whose hidden layer stays in the cache."""
 
     def __init__(self, dim: int):
         super().__init__(
@@ -40,7 +40,7 @@ class Mlp(nn.Sequential):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        # With gradients the hidden layers are needed anyway, and a card is faster in one piece.
+        # Gradients need the hidden layers anyway, and a GPU is faster without blocks.
         if torch.is_grad_enabled() or x.device.type != "cpu" or torch.compiler.is_compiling():
             return super().forward(x)
         blocks = x.reshape(-1, x.shape[-1]).split(_TOKENS)
@@ -48,8 +48,10 @@ class Mlp(nn.Sequential):
 
 
 class EnhancementLayer(nn.Module):
-    """Pre-norm: local self-attention, conditional position, global self-attention, MLP, global cross-attention, MLP.
-    ``twins`` puts an MLP after the local attention too and reduces keys by a dense convolution, as Twins-SVT does."""
+    """Local self-attention, conditional position, global self-attention, MLP, global cross-attention, MLP; with pre-
+    norm.
+
+    twins : an MLP after the local attention, too, and keys reduced by a dense convolution, as in Twins-SVT."""
 
     def __init__(self, dim: int, twins: bool):
         super().__init__()
@@ -63,8 +65,8 @@ class EnhancementLayer(nn.Module):
         self.mlp_cross = Mlp(dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x: (2N, h, w, C), the old windows' features, then the new ones'; each half's
-        cross-attention queries the other."""
+        """Return x (2N, h, w, C) enhanced: features of the old windows, then of the new ones. In cross-attention each
+        half queries the other."""
         x = x + self.local(self.norm_local(x))
         if self.mlp_local is not None:
             x = x + self.mlp_local(x)
@@ -73,15 +75,15 @@ class EnhancementLayer(nn.Module):
         x = x + self.globally(y, y)
         x = x + self.mlp_global(x)
         y = self.norm_cross(x)
-        # The other half's features, in the same order: old queries new, new queries old.
+        # The halves exchanged: old queries new, new queries old.
         x = x + self.cross(y, torch.cat(y.chunk(2)[::-1]))
         return x + self.mlp_cross(x)
 
 
 class QuickContext(nn.Module):
-    """A U-Net of one more scale over both windows' features at 1/8 and the correlation round zero flow: state and
-    context of the GRU, and a flow of its own. An affine field fitted at the coarsest scale carries motion to where no
-    events are (:class:`~eflow.models.unets.Consensus`)."""
+    """A U-Net with one more scale. It reads the features of both windows at 1/8 and the correlation around zero flow,
+    and returns state and context of the GRU and a first flow. An affine field fitted at the coarsest scale carries
+    motion to areas without events (:class:`~eflow.models.unets.Consensus`)."""
 
     def __init__(self, features: int, taps: int, hidden: int):
         super().__init__()
@@ -93,18 +95,21 @@ class QuickContext(nn.Module):
         self.context, self.flow = (nn.Conv2d(2 * hidden, c, 3, padding=1) for c in (2 * hidden, 2))
 
     def forward(self, old: Tensor, new: Tensor, taps: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (N, C, h, w) and taps (N, taps, h, w) -> (N, 2 hidden, h, w) and flow (N, 2, h, w), px of 1/8."""
+        """Return state and context (N, 2 hidden, h, w) and flow (N, 2, h, w), px of 1/8, of features and
+        correlation."""
         seen = torch.cat([new, old, F.relu(self.cost(taps))], 1)
         deep = self.deep(F.relu(self.down(seen)))
-        # Half of an odd size is rounded up: what is beyond is cut.
+        # Half of an odd size is rounded up, so the doubled map is cut.
         deep = double(deep)[..., : seen.shape[-2], : seen.shape[-1]]
         both = F.relu(self.up(torch.cat([deep, seen], 1)))
         return self.context(both), self.flow(both).float()
 
 
 class EFlowFormer(Eraft):
-    """With ``layers=0`` and ``init="zero"`` it is E-RAFT, parameter names included. With ``quick`` it keeps the
-    correlation, the layers (none unless ``layers`` says so) and the GRU, and has cheaper encoders and another start."""
+    """E-FlowFormer. With ``layers=0`` and ``init="zero"`` it is E-RAFT, with the same names of parameters.
+
+    With ``quick`` it has the same correlation, layers (none by default) and GRU, but cheaper encoders and another
+    initial flow."""
 
     Config = EFlowFormerConfig
 
@@ -123,8 +128,8 @@ class EFlowFormer(Eraft):
             initialise(self.project)
             nn.init.normal_(self.context.flow.weight, std=1e-3)  # its flow is near zero at the start
         elif config.init == "match" and config.match_prior is not None:
-            # Each displacement of match_prior cells costs half a unit of the logit: 1 / (2 sigma^2).
-            # Logits of features that know nothing yet differ by 1; the gain makes them small beside the prior.
+            # A displacement of match_prior cells lowers the logit by 1/2: the factor is 1 / (2 sigma^2).
+            # Logits of untrained features differ by about 1; the gain makes them small beside the prior.
             self.log_prior = nn.Parameter(torch.tensor(-math.log(2 * config.match_prior**2) / RATE))
             self.log_gain = nn.Parameter(torch.tensor(math.log(START_GAIN) / RATE))
         initialise(self.layers)

@@ -1,5 +1,5 @@
-"""E-RAFT (Gehrig et al., "E-RAFT: Dense Optical Flow from Event Cameras", 3DV 2021) on RAFT
-(Teed & Deng, ECCV 2020)."""
+"""E-RAFT (Gehrig et al., "E-RAFT: Dense Optical Flow from Event Cameras", 3DV 2021), based on RAFT (Teed & Deng, ECCV
+2020)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from eflow.precision import fp32
 
 @dataclass(frozen=True)
 class Widths:
-    """How wide the parts are. trunk : channels at 1/2, 1/4, 1/8. features : of the correlated maps. hidden : of the
-    GRU's state, of the context and of the motion it sees. levels, radius : of the correlation look-up."""
+    """Numbers of channels.
+
+    trunk : at 1/2, 1/4, 1/8. features : of the correlated maps. hidden : of the GRU's state, context and motion
+    features. levels, radius : of the correlation look-up."""
 
     trunk: tuple[int, int, int]
     features: int
@@ -38,13 +40,13 @@ SIZES = {
 
 
 def widths_of(config: EraftConfig) -> Widths:
-    """Those of the configuration's size, but for what it gives itself."""
+    """Return the widths of a configuration: those of its size, unless it sets them."""
     own = {f.name: getattr(config, f.name) for f in fields(Widths)}
     return replace(SIZES[config.size], **{k: v for k, v in own.items() if v is not None})
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions beside a shortcut (He et al., CVPR 2016)."""
+    """A residual block: two convolutions and a shortcut (He et al., CVPR 2016)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, norm: type[nn.Module]):
         super().__init__()
@@ -61,9 +63,9 @@ class ResidualBlock(nn.Module):
 
 
 class Trunk(nn.Sequential):
-    """(N, inputs, H, W) -> (N, outputs, H/8, W/8). widths : channels at 1/2, 1/4, 1/8."""
+    """The CNN of RAFT, (N, inputs, H, W) -> (N, outputs, H/8, W/8). widths : channels at 1/2, 1/4, 1/8."""
 
-    # RAFT: instance norm for the features that are compared, batch norm for the context.
+    # As RAFT: instance norm for the features to correlate, batch norm for the context.
     def __init__(self, inputs: int, widths: tuple[int, int, int], outputs: int, norm: str):
         make = {"instance": nn.InstanceNorm2d, "batch": nn.BatchNorm2d}[norm]
         half, quarter, eighth = widths
@@ -84,7 +86,7 @@ class Trunk(nn.Sequential):
 
 
 class MotionEncoder(nn.Module):
-    """Correlation taps and flow to ``hidden`` motion channels, the last two the flow itself."""
+    """Converts correlation taps and flow to ``hidden`` motion channels; the last two are the flow itself."""
 
     def __init__(self, taps: int, hidden: int):
         super().__init__()
@@ -99,19 +101,18 @@ class MotionEncoder(nn.Module):
         c = relu(self.corr2(relu(self.corr1(taps))))
         f = relu(self.flow2(relu(self.flow1(flow))))
         joined = relu(self.join(torch.cat([c, f], 1)))
-        # The flow itself goes along unchanged.
+        # The flow itself is appended unchanged.
         return torch.cat([joined, flow.to(joined.dtype)], 1)
 
 
 class SepConvGru(nn.Module):
-    """GRU with 1x5, then 5x1 convolutions over [hidden, context, motion]; update and reset gates share one convolution.
+    """GRU with 1x5, then 5x1 convolutions over [hidden, context, motion]; update and reset gates are one convolution.
 
-    The context does not change over the iterations, so its third of every convolution is computed
-    once (:meth:`prepare`)."""
+    The context is the same in all iterations, so its part of every convolution is computed once (:meth:`prepare`)."""
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.hidden = hidden  # as many as channels of context, and of motion
+        self.hidden = hidden  # also the channels of the context and of motion
         self.gates = nn.ModuleList(
             [nn.Conv2d(3 * hidden, 2 * hidden, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
         )
@@ -120,10 +121,10 @@ class SepConvGru(nn.Module):
         )
 
     def prepare(self, context: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """For each convolution, its weights over [hidden, motion] and the context's contribution (bias included)."""
+        """Return the weights over [hidden, motion] and the contribution of the context (with bias) of each
+        convolution."""
         ready, first, last = [], self.hidden, 2 * self.hidden
-        # Slices of each weight: [hidden | context | motion]. The context's product, with the bias, is
-        # the same in every turn.
+        # Slices of each weight: [hidden | context | motion].
         for conv in (c for pair in zip(self.gates, self.candidates, strict=True) for c in pair):
             weight = torch.cat([conv.weight[:, :first], conv.weight[:, last:]], 1)
             ready.append((weight, F.conv2d(context, conv.weight[:, first:last], conv.bias, padding=conv.padding)))
@@ -140,7 +141,7 @@ class SepConvGru(nn.Module):
         return h
 
     def forward_slow(self, h: Tensor, context: Tensor, motion: Tensor) -> Tensor:
-        """The twin: every convolution over everything."""
+        """Slow reference of :meth:`forward`: every convolution over all channels."""
         for gate, candidate in zip(self.gates, self.candidates, strict=True):
             z, r = torch.sigmoid(gate(torch.cat([h, context, motion], 1))).chunk(2, 1)
             q = torch.tanh(candidate(torch.cat([r * h, context, motion], 1)))
@@ -164,8 +165,10 @@ class Update(nn.Module):
     def forward(
         self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """h (N, hidden, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: slow twin), taps
-        (N, taps, h, w), flow (N, 2, h, w) -> hidden, Δflow, mask logits (None unless wanted)."""
+        """Return hidden state, Δflow and mask logits (None unless wanted).
+
+        h (N, hidden, h, w); context: the result of :meth:`SepConvGru.prepare`, or the context itself for the slow
+        reference; taps (N, taps, h, w); flow (N, 2, h, w)."""
         motion = self.motion(taps, flow)
         h = self.gru.forward_slow(h, context, motion) if isinstance(context, Tensor) else self.gru(h, context, motion)
         # 0.25 balances the gradients of the two heads, as RAFT does.
@@ -173,7 +176,7 @@ class Update(nn.Module):
 
 
 class Eraft(FlowModel):
-    """E-RAFT. ``plain = True`` switches to the RAFT-style slow twin of lookup, GRU, mask head and upsampling."""
+    """E-RAFT. ``plain = True`` uses the slow references, as in RAFT, of lookup, GRU, mask head and upsampling."""
 
     Config = EraftConfig
 
@@ -181,11 +184,11 @@ class Eraft(FlowModel):
         super().__init__()
         self.config, self.widths = config, widths_of(config)
         w = self.widths
-        # A look-up divides by the size of a level less one (lookup_slow), so the top one needs two cells.
+        # A look-up divides by the size of a level minus one (lookup_slow), so the top level needs two cells.
         self.divisor, self.least = 8, 8 * 2**w.levels
         if config.padding == "start":
             self.pad_to, self.pad_start = 32, True
-        # How many refinements beyond those trained on may happen in use.
+        # Number of iterations in evaluation beyond those of training.
         unseen = max(config.iterations - config.train_iterations, 0)
         self._most = unseen if config.burn_in is None else config.burn_in
         self.representation = VoxelGrid(config.input.bins, config.input.normalise, config.input.bounds)
@@ -193,14 +196,15 @@ class Eraft(FlowModel):
         self.update = Update(channels_of(w.levels, w.radius), w.hidden)
         self.plain = False
         initialise(self)
-        # The first Δflows are near zero, whatever the depth.
+        # The first Δflow is near zero.
         nn.init.normal_(self.update.flow_head[-1].weight, std=1e-3)
 
     def forward(self, batch: dict) -> FlowPrediction:
-        """Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution px."""
+        """Return the flow of a batch. Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution
+        px."""
         self.check_input(batch)
         correlation, seen, flow, first = self.encode(batch)
-        # One network gives the GRU's first state and its context.
+        # One CNN computes the initial state and the context of the GRU.
         h, c = seen.chunk(2, 1)
         h, c = torch.tanh(h), F.relu(c)
         flows = [] if first is None or not self.training else [first]
@@ -219,10 +223,10 @@ class Eraft(FlowModel):
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:
                 h, delta, mask = step(h, flow)
-            # Refinements beyond all that training has seen are damped.
+            # Iterations beyond those of training are damped.
             beyond = 0 if self.training else max(i + 1 - self._most - self.config.train_iterations, 0)
             with fp32(flow):
-                # Flow adds up in fp32: updates of a thousandth of a px would be lost in bf16.
+                # Flow is accumulated in fp32: bf16 would lose updates of a thousandth of a px.
                 flow = flow + self.config.damping**beyond * delta.float()
             if wanted:
                 flows.append(upsample(flow, mask, self.config.border))
@@ -234,10 +238,11 @@ class Eraft(FlowModel):
 
     @torch.no_grad()
     def _burn_in(self, h: Tensor, flow: Tensor, context, correlation, grid: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and flow after a number of refinements that nothing is learnt from, so that those that follow
-        learn to go on from any, and to stand still where nothing is left to do. (Half of the steps have none:
-        every answer begins with the first refinement.) The draw is of torch's generator, whose state checkpoints
-        hold."""
+        """Return state and flow after a random number of refinements without gradients.
+
+        The following refinements then learn to continue from any flow, and to stay at the right one. Half of the draws
+        are 0, since every prediction starts with the first refinement. The number comes from torch's generator, whose
+        state is in checkpoints."""
         most = self._most
         if not most:
             return h, flow
@@ -252,7 +257,7 @@ class Eraft(FlowModel):
     # ---- what E-FlowFormer changes -------------------------------------------------------------------------------
 
     def encoders(self) -> tuple[nn.Module, nn.Module]:
-        """Make what gives the features that are compared, and what gives state and context."""
+        """Return the CNN of the features to correlate, and that of state and context."""
         bins, w = self.config.input.bins, self.widths
         return (
             Trunk(bins, w.trunk, w.features, "instance"),
@@ -260,9 +265,9 @@ class Eraft(FlowModel):
         )
 
     def encode(self, batch: dict) -> tuple:
-        """Return the correlation, state and context (N, 2 hidden, h, w) before their activations, and :meth:`start`'s
-        two fields."""
-        # Shared weights: both windows go through in one batch.
+        """Return the correlation, state and context (N, 2 hidden, h, w) before their activations, and the two fields of
+        :meth:`start`."""
+        # Both windows share the weights, so they are one batch.
         f1, f2 = self.enhance(*self.features(torch.cat([batch["old"], batch["new"]])).chunk(2))
         correlation = self._correlation(f1, f2)
         return correlation, self.context(batch["new"]), *self.start(correlation, batch.get("flow_init"), f1)
@@ -271,7 +276,8 @@ class Eraft(FlowModel):
         return f1, f2
 
     def start(self, correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Low-resolution flow the GRU starts from, and the supervised full-resolution field it came from, if any."""
+        """Return the initial low-resolution flow of the GRU, and the supervised full-resolution flow it came from, if
+        any."""
         n, _, h, w = like.shape
         zero = torch.zeros(n, 2, h, w, device=like.device, dtype=torch.float32)
         return (zero if warm is None else zero + warm), None

@@ -16,8 +16,8 @@ from eflow.models.unets import Consensus, Residual, ScaledTanh, double, encoder_
 
 
 class EvFlowNet(FlowModel):
-    """U-Net on one window: four stride-2 convolutions, two residual blocks, four nearest-x2 decoders with skips and a
-    tanh flow head each; every decoder also sees the flow of the one before."""
+    """A U-Net on one window: four stride-2 convolutions, two residual blocks, and four decoders with nearest-neighbour
+    upsampling, skips and a tanh flow head. Every decoder also reads the flow of the previous one."""
 
     Config = EvFlowNetConfig
     divisor, least = 16, 32
@@ -27,7 +27,7 @@ class EvFlowNet(FlowModel):
         super().__init__()
         self.config = config
         self.representation = CountsAndTimes() if config.input == "counts" else VoxelGrid(config.bins)
-        # Channels in, then those of the four encoders, each twice the one before.
+        # Input channels, then those of the four encoders, each twice as many as before.
         widths = (self.representation.channels, *encoder_widths(config))
         w = widths[1]
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
@@ -56,9 +56,9 @@ class EvFlowNet(FlowModel):
         if self.consensus is not None:
             x = self.consensus(x)
         x = self.residuals[1](x)
-        # From coarse to fine; skips are taken from the last encoder back.
+        # From coarse to fine; skips are used from the last encoder to the first.
         for decoder, head in zip(self.decoders, self.heads, strict=True):
-            # Flow in parts of its largest value, so that it is of the size of the features.
+            # Flow divided by its largest value is as large as the features.
             parts = [x, skips.pop()] + ([flows[-1].to(x.dtype) / head.largest] if flows else [])
             x = F.relu(decoder(double(torch.cat(parts, 1))))
             flows.append(head(x))

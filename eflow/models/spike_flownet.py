@@ -15,7 +15,7 @@ from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initial
 
 
 class _Fire(torch.autograd.Function):
-    """Spike where the membrane exceeds the threshold; the gradient passes where it spiked, divided by the threshold."""
+    """Spikes where the membrane exceeds the threshold; gradients pass there, divided by the threshold."""
 
     @staticmethod
     def forward(ctx, membrane: Tensor, threshold: float) -> Tensor:
@@ -32,19 +32,18 @@ class _Fire(torch.autograd.Function):
 
 
 def integrate_and_fire(membrane: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
-    # Hard reset: what exceeded the threshold is lost.
-    """(spikes, membrane afterwards): neurons that spiked begin again at 0, whatever they exceeded the threshold by."""
+    """Return (spikes, membrane afterwards). Neurons that spiked are reset to 0 (hard reset)."""
     spikes = _Fire.apply(membrane, threshold)
     return spikes, membrane * (1 - spikes.detach())
 
 
 class SpikeFlowNet(FlowModel):
-    """Spiking encoder, ordinary residual blocks and decoders; no convolution has a bias.
+    """A spiking encoder with ordinary residual blocks and decoders; no convolution has a bias.
 
-    The window is halved into two groups of ``steps`` count frames; spike step s sees frame s of both groups (four
+    The window is divided into two groups of ``steps`` count frames; spike step s reads frame s of both groups (four
     channels). Each encoder layer is a stride-2 convolution into integrate-and-fire neurons with hard reset;
     its *accumulated input current* over all steps is the skip connection and, at the last
-    layer, the residual blocks' input. Flow comes at 1/8, 1/4, 1/2 and 1/1."""
+    layer, the input of the residual blocks. Flow is predicted at 1/8, 1/4, 1/2 and 1/1."""
 
     Config = SpikeFlowNetConfig
     divisor, least = 16, 32
@@ -60,7 +59,7 @@ class SpikeFlowNet(FlowModel):
         )
         self.residuals = nn.Sequential(LeakyResidual(w4, bias=False), LeakyResidual(w4, bias=False))
         ups = (w2, w1, 4)
-        # Skip, features of the decoder before, and two of flow.
+        # Skip, features of the previous decoder, and two channels of flow.
         inputs = (w4, *(skip + up + 2 for skip, up in zip((w3, w2, w1), ups, strict=True)))
         self.decoders = nn.ModuleList(
             [UpDecoder(c, up, bias=False) for c, up in zip(inputs, (*ups, None), strict=True)]
@@ -78,7 +77,7 @@ class SpikeFlowNet(FlowModel):
         for s in range(self.config.steps):
             x = groups[:, :, s].reshape(n, 4, height, width)
             for layer, encoder in enumerate(self.encoders):
-                # In float32: the sum over steps decides about spikes.
+                # In float32: spikes depend on the sum over steps.
                 current = encoder(x).float()
                 currents[layer] = currents[layer] + current
                 x, membranes[layer] = integrate_and_fire(membranes[layer] + current, self.config.threshold)

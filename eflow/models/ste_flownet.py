@@ -17,11 +17,11 @@ from eflow.ops.warp import backward_warp
 
 RADII = {"base": 4, "small": 3, "tiny": 2}
 TINY = 8
-"""Width of ``tiny``: the GRUs, whose states hold the correlations too, are most of this network."""
+"""Width of ``tiny``: most parameters are in the GRUs, whose states include the correlations."""
 
 
 class ConvGru(nn.Module):
-    """3x3 convolutional GRU, as many hidden channels as inputs."""
+    """A 3x3 convolutional GRU with as many hidden channels as inputs."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -36,11 +36,12 @@ class ConvGru(nn.Module):
 
 
 class SteFlowNet(FlowModel):
-    """The window's count slices go through the network one after the other, ``sweeps`` times; every slice has a flow of
-    its own at each of four scales, which each sweep adds to. For a slice, at each scale of the encoder: its features
-    (of a tower beside the encoder) are warped by its flow and correlated with those of slice 0; the ConvGRU of that
-    scale, whose state lives on through slices and sweeps, takes what came from the scale above beside the correlation.
-    Then the states are decoded, from coarse to fine. The last slice's flow is the window's."""
+    """STE-FlowNet: processes the count slices of the window one after the other, ``sweeps`` times.
+
+    Every slice has its own flow at four scales, and each sweep adds to it. At each scale of the encoder, features of
+    the slice (of a tower beside the encoder) are warped by its flow and correlated with those of slice 0. The ConvGRU
+    of that scale reads the correlation and the output of the scale above; its state persists over slices and sweeps.
+    Then the states are decoded from coarse to fine. The flow of the last slice is that of the window."""
 
     Config = SteFlowNetConfig
     divisor, least = 16, 32
@@ -80,12 +81,12 @@ class SteFlowNet(FlowModel):
         seen = [self._look(slices[:, i]) for i in range(self.config.slices)]
         for _ in range(self.config.sweeps):
             for i in range(self.config.slices):
-                # seen[0]: features of slice 0, which all others are compared with.
+                # seen[0]: features of slice 0, the reference of all correlations.
                 for scale, (there, here) in enumerate(zip(seen[0], seen[i], strict=True)):
                     x = leaky(self.encoders[scale](hidden[scale - 1])) if scale else here
-                    # The coarsest scale (1/16) has no flow of its own yet.
+                    # The coarsest scale (1/16) has no flow.
                     aligned = here if scale == 3 else backward_warp(here, flows[i][2 - scale], border="replicate")
-                    # The published code has the activation twice, in the correlation and after it.
+                    # The published code applies the activation twice, in the correlation and after it.
                     taps = leaky(leaky(local_correlation(there, aligned.to(here.dtype), self.radius)))
                     hidden[scale] = self.grus[scale](torch.cat([x, taps], 1), hidden[scale])
                 flows[i] = self._decode(hidden, flows[i])
@@ -102,7 +103,7 @@ class SteFlowNet(FlowModel):
 
     def _decode(self, hidden: list, before: list[Tensor]) -> list[Tensor]:
         """Return the decoders' flow from the states plus the slice's flow ``before``, coarse to fine."""
-        # The coarsest state, and what the residual blocks make of it.
+        # The coarsest state, and the output of the residual blocks.
         x = torch.cat([hidden[3], self.residuals(leaky(self.entry(hidden[3])))], 1)
         after = []
         for scale, decoder in enumerate(self.decoders):

@@ -1,4 +1,4 @@
-"""What the encoder-decoder baselines share."""
+"""Parts that the encoder-decoder networks share."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ WIDTHS = {"base": 64, "small": 32, "tiny": 16}
 
 
 def encoder_widths(config) -> tuple[int, int, int, int]:
-    """Channels at 1/2, 1/4, 1/8, 1/16: of the configuration's ``width``, or of its ``size``."""
+    """Return the channels at 1/2, 1/4, 1/8, 1/16, by the ``width`` of the configuration or its ``size``."""
     width = config.width or WIDTHS[config.size]
     return width, 2 * width, 4 * width, 8 * width
 
 
 class LeakyResidual(nn.Module):
-    """x + leaky-conv-leaky-conv of x, as Spike-FlowNet and STE-FlowNet have it: no activation after the sum."""
+    """x + leaky-conv-leaky-conv of x, without an activation after the sum, as in Spike-FlowNet and STE-FlowNet."""
 
     def __init__(self, channels: int, bias: bool):
         super().__init__()
@@ -30,13 +30,13 @@ class LeakyResidual(nn.Module):
 
 
 def leaky(x: Tensor) -> Tensor:
-    """Leaky ReLU with slope 0.1."""
+    """Return the leaky ReLU of x with slope 0.1."""
     return F.leaky_relu(x, 0.1)
 
 
 class UpDecoder(nn.Module):
-    """Transposed convolutions of Spike-FlowNet and STE-FlowNet, each to twice the size: one to 32 channels and from
-    there to flow in px *of that size*, one (but for the ``last``) to features for the next decoder."""
+    """A decoder of Spike-FlowNet and STE-FlowNet: transposed convolutions to twice the size, one to 32 channels and
+    then to flow in px *of that size*, the other to ``features`` for the next decoder (None: the last decoder)."""
 
     def __init__(self, inputs: int, features: int | None, bias: bool):
         super().__init__()
@@ -44,13 +44,13 @@ class UpDecoder(nn.Module):
         self.up = None if features is None else nn.ConvTranspose2d(inputs, features, 4, 2, 1, bias=bias)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        # Flow in float32 whatever autocast does.
+        # Flow is float32, with autocast, too.
         return self.flow(self.up_flow(x)).float(), None if self.up is None else leaky(self.up(x))
 
 
 def initialise_wide(module: nn.Module) -> None:
-    """Normal weights of variance 3 / (kernel area x inputs), biases zero, as Spike-FlowNet and STE-FlowNet start; flow
-    heads near zero flow."""
+    """Initialise weights by a normal distribution of variance 3 / (kernel area x inputs) and biases by 0, as in
+    Spike-FlowNet and STE-FlowNet, and flow heads near zero flow."""
     for m in module.modules():
         if isinstance(m, (nn.Conv2d, nn.ConvTranspose2d)):
             nn.init.normal_(m.weight, std=math.sqrt(3 / (m.kernel_size[0] * m.kernel_size[1] * m.in_channels)))
@@ -76,17 +76,19 @@ class Residual(nn.Module):
 
 
 class Consensus(nn.Module):
-    """x + a linear layer of the affine field that is nearest to x over the image, each channel by least squares with
-    weights that are learned, too: places where nothing happens have no say, and hear what the others agree on. A camera
-    that turns, slides along a wall or rolls moves the image by such a field, which convolutions cannot carry across.
+    """x + a linear layer of the affine field nearest to x over the image.
 
-    As many weights as ``groups``, each for its share of the channels. Places are counted in px of the input from where
-    the weights lie, so that images of any size are alike."""
+    Each channel is fitted by least squares with learned weights: cells without information get small weights and
+    receive the field of the others. A camera that rotates, or moves along a wall, moves the image by such a field,
+    which convolutions cannot transport over long distances.
+
+    There are ``groups`` maps of weights, each for its share of the channels. Coordinates are px of the input relative
+    to the weighted mean, so that the size of the image does not matter."""
 
     SPAN = 64.0
-    """px that are 1 in the coordinates."""
+    """Unit of the coordinates, px."""
     RIDGE = 0.02
-    """Added to the spread of the weights, SPAN squared: what lies on a point or a line has no slope across it."""
+    """Added to the variance of the coordinates, in SPAN²: a point or a line then has no slope across it."""
 
     def __init__(self, channels: int, groups: int = 4, stride: int = 16):
         super().__init__()
@@ -94,14 +96,14 @@ class Consensus(nn.Module):
         self.weight, self.mix = nn.Conv2d(channels, groups, 1), nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        # The weight of each place, 0 to 1.
+        # The weight of each cell, 0 to 1.
         weight = torch.sigmoid(self.weight(x).float())
         with torch.autocast(x.device.type, enabled=False):
             field = self.fitted(x.float(), weight)
         return F.relu(x + self.mix(field.to(x.dtype)))
 
     def fitted(self, x: Tensor, weight: Tensor) -> Tensor:
-        """The affine field nearest to x (N, C, h, w), where ``weight`` (N, groups, h, w) says; float32."""
+        """Return the affine field nearest to x (N, C, h, w), with weights (N, groups, h, w); float32."""
         n, channels, height, width = x.shape
         unit = self.stride / self.SPAN
         v, u = torch.meshgrid(
@@ -110,10 +112,10 @@ class Consensus(nn.Module):
             indexing="ij",
         )
         u, v = u.reshape(1, 1, -1), v.reshape(1, 1, -1)
-        # 1e-4 keeps the sum above 0 where all weights vanish.
+        # 1e-4 keeps the sum above 0 if all weights vanish.
         w = weight.flatten(2) + 1e-4
         w = w / w.sum(2, keepdim=True)  # (N, groups, h w)
-        # Coordinates from the weighted middle: the mean then separates from the slopes.
+        # Coordinates relative to the weighted mean: mean and slopes then separate.
         u, v = u - (w * u).sum(2, keepdim=True), v - (w * v).sum(2, keepdim=True)
         # Weighted second moments: the normal equations of the slopes, a 2x2 system.
         uu, vv, uv = (
@@ -132,17 +134,17 @@ class Consensus(nn.Module):
 
 
 def double(x: Tensor) -> Tensor:
-    """Nearest-neighbour upsampling by two."""
+    """Return x upsampled by two (nearest neighbour)."""
     return F.interpolate(x, scale_factor=2, mode="nearest")
 
 
 def to_size(flow: Tensor, height: int, width: int) -> Tensor:
-    """Flow resampled bilinearly to another size; its unit does not change."""
+    """Return flow resampled bilinearly to another size; its unit does not change."""
     return F.interpolate(flow.float(), (height, width), mode="bilinear", align_corners=False)
 
 
 class ScaledTanh(nn.Module):
-    """A bounded flow head: tanh of a 1x1 convolution times ``largest`` px; starts near zero flow."""
+    """A bounded flow head: tanh of a 1x1 convolution, times ``largest`` px."""
 
     def __init__(self, channels: int, largest: float = 256.0):
         super().__init__()
@@ -152,6 +154,6 @@ class ScaledTanh(nn.Module):
         return self.largest * torch.tanh(self.conv(x).float())
 
     def calm(self) -> None:
-        """Small initial weights: a saturated tanh would not learn."""
+        """Initialise with small weights: a saturated tanh would not learn."""
         nn.init.normal_(self.conv.weight, std=1e-4)
         nn.init.zeros_(self.conv.bias)

@@ -1,4 +1,4 @@
-"""Kernels of the networks, each fast path beside a slow, obvious twin it is tested against.
+"""Kernels of the networks. Each fast path has a slow, obvious reference, and tests compare the two.
 
 In:    tensors.
 Out:   tensors.

@@ -1,8 +1,8 @@
-"""Spatially separable attention (Twins-SVT, Chu et al., NeurIPS 2021): local windows, and
-all tokens to sub-sampled keys.
+"""Spatially separable attention (Twins-SVT, Chu et al., NeurIPS 2021): inside local windows, and from all tokens to
+sub-sampled keys.
 
-Maps are (N, h, w, C). Sizes that windows do not divide are padded, and padded tokens are masked as keys: a zero token
-that takes part in a softmax is a vote for nothing.
+Maps are (N, h, w, C). They are padded to multiples of the window, and padded tokens are masked as keys, since zero
+tokens in a softmax would weaken the others.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class WindowAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         n, h, w, c = x.shape
         s = self.window
-        # -h % s is what is missing up to the next multiple.
+        # -h % s is the padding up to the next multiple.
         down, right = -h % s, -w % s
         x = F.pad(x, (0, 0, 0, right, 0, down))
         rows, columns = (h + down) // s, (w + right) // s
-        # (n h w) tokens as windows of s x s: split both axes, bring the two window axes together.
+        # Tokens as windows of s x s: split both axes, then put the two window axes together.
         tokens = x.view(n, rows, s, columns, s, c).transpose(2, 3).reshape(n * rows * columns, s * s, c)
         q, k, v = self.qkv(tokens).view(len(tokens), s * s, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4)
         mask = None
@@ -47,7 +47,7 @@ class WindowAttention(nn.Module):
 
 
 class GlobalAttention(nn.Module):
-    """Every token of ``x`` attends to a sub-sampled map of ``source`` (itself, or the other window's features).
+    """Attention from every token of ``x`` to a sub-sampled map of ``source`` (itself, or the other window's features).
 
     The reduction is a strided convolution, depth-wise or dense, and a layer norm."""
 
@@ -60,7 +60,7 @@ class GlobalAttention(nn.Module):
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
         n, h, w, c = x.shape
-        # At a reduced resolution: as many keys as the map has blocks of r x r.
+        # One key for each block of r x r tokens.
         r = self.reduction
         # At most r - 1 rows are padded, so that every reduced cell holds a real token and no key needs masking.
         padded = F.pad(source, (0, 0, 0, -w % r, 0, -h % r))
@@ -83,14 +83,15 @@ class ConditionalPosition(nn.Module):
 
 
 def sine_position(h: int, w: int, dim: int, like: Tensor) -> Tensor:
-    """(1, dim, h, w) 2-D sine code (Parmar et al.; DETR's layout): dim/4 wavelengths 2π … 2π·10^4 of tokens, sine and
-    cosine of y, then of x. Not normalised by the size, so that a crop and the full frame see the same periods."""
+    """Return a 2-D sine code (1, dim, h, w) (Parmar et al.; layout of DETR): sine and cosine of y, then of x, at dim/4
+    wavelengths from 2π to 2π·10^4 tokens. It is not normalised by the size, so that a crop and the full frame have the
+    same periods."""
     k = torch.arange(dim // 4, device=like.device, dtype=torch.float32)
     # Wavelengths 2 pi 10^(4 k / K): the exponent falls linearly with k.
     rate = torch.exp(-math.log(1e4) * k / (dim // 4))
     y = torch.arange(h, device=like.device, dtype=torch.float32)[None] * rate[:, None]
     x = torch.arange(w, device=like.device, dtype=torch.float32)[None] * rate[:, None]
-    # Rows depend on y alone, columns on x alone; both are spread over the map.
+    # Rows depend on y alone, columns on x alone.
     rows = torch.cat([y.sin(), y.cos()])[:, :, None].expand(-1, -1, w)
     columns = torch.cat([x.sin(), x.cos()])[:, None, :].expand(-1, h, -1)
     return torch.cat([rows, columns])[None]

@@ -1,15 +1,14 @@
 """All-pairs correlation, its lookup, and the matching layer.
 
 The volume of feature maps f1, f2 (N, D, h, w) is C[i, j] = <f1_i, f2_j> / sqrt(D); its pyramid average-pools the target
-axis; a lookup reads (2r+1)^2 bilinear taps round a target coordinate on each level (RAFT,
-Teed & Deng, ECCV 2020, sec. 3.2).
+axis; a lookup reads (2r+1)^2 bilinear taps around a target coordinate on each level (RAFT, Teed & Deng, ECCV 2020,
+sec. 3.2).
 
 Three implementations give the same taps:
-- dense, one (2r+2)^2 integer gather per token and level: all taps share one sub-pixel fraction, so they are one 2-D
-  lerp of the patch. Differentiable, any device. On the CPU without gradients a numba kernel does the same.
-- on demand: the patch's correlations are computed from pooled features when they are
-  looked up; memory linear in tokens.
-- ``lookup_slow``: RAFT's 81 grid samples, the twin.
+- dense: one (2r+2)^2 integer gather per token and level. All taps share one sub-pixel fraction, so they are one 2-D
+  interpolation of the patch. It is differentiable on any device; on the CPU without gradients a numba kernel does it.
+- on demand: the correlations of the patch are computed from pooled features at look-up; memory is linear in tokens.
+- ``lookup_slow``: the 81 grid samples of RAFT, the slow reference.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from torch import Tensor
 from blinkgl.machine.kernels import kernel
 from eflow.precision import fp32
 
-# Up to so many tokens the whole volume is held: beyond, its memory grows with their square.
+# Largest number of tokens with a dense volume, whose memory grows with their square.
 DENSE_TOKENS = 8192
 # Tokens per block of an on-demand look-up, and rows per block of the matching layer.
 _CHUNK, _ROWS = 2048, 256
 
 
 def channels_of(levels: int, radius: int) -> int:
-    """Taps of a look-up."""
+    """Return the number of taps of a look-up."""
     return levels * (2 * radius + 1) ** 2
 
 
 def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
-    """(1, 2, h, w) float32 coordinates (x, y)."""
+    """Return coordinates (x, y), (1, 2, h, w) float32."""
     y, x = torch.meshgrid(
         torch.arange(h, device=like.device, dtype=torch.float32),
         torch.arange(w, device=like.device, dtype=torch.float32),
@@ -46,8 +45,8 @@ def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
 
 
 class DenseCorrelation:
-    """The whole volume in memory, (N h w, h, w) fp32, and its pooled levels. The product is fp32, under autocast as
-    well: in bf16 a match can be off by a quarter of a pixel."""
+    """The whole volume in memory, (N h w, h, w) fp32, and its pooled levels. The product is fp32 even under autocast:
+    in bf16 a match can be wrong by a quarter of a pixel."""
 
     def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4, *, slow: bool = False):
         n, d, h, w = f1.shape
@@ -63,8 +62,9 @@ class DenseCorrelation:
         self.levels = [v.squeeze(1) for v in self.levels]
 
     def lookup(self, coords: Tensor) -> Tensor:
-        """coords (N, 2, h, w) fp32 target coordinates -> (N, taps, h, w) fp32; channel
-        (level*side + dy)*side + dx with side = 2r+1, zero outside."""
+        """Return the taps (N, taps, h, w) fp32 around target coordinates (N, 2, h, w) fp32.
+
+        Channel (level*side + dy)*side + dx with side = 2r+1; zero outside the image."""
         if self.slow:
             return lookup_slow(self.levels, coords, self.radius)
         if coords.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
@@ -72,23 +72,23 @@ class DenseCorrelation:
         n, h, w = self.shape
         flat = coords.permute(0, 2, 3, 1).reshape(-1, 2)
         taps = []
-        # A level's coordinates are those of full resolution divided by its scale.
+        # Coordinates of a level are those of full resolution divided by its scale.
         for level, volume in enumerate(self.levels):
             index, inside, fraction = patch_index(flat / 2**level, *volume.shape[-2:], self.radius)
-            # Outside of the image the clamped index reads something, which ``inside`` sets to 0.
+            # ``inside`` sets taps outside the image to 0: their clamped index reads another pixel.
             patch = volume.flatten(1).gather(1, index.flatten(1)).view_as(inside) * inside
             taps.append(lerp_patch(patch, fraction))
         return torch.cat(taps, 1).view(n, h, w, -1).permute(0, 3, 1, 2)
 
     def match(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
-        """The matching layer, see :func:`expected_flow`."""
+        """Return the flow of the matching layer, see :func:`expected_flow`."""
         _, h, w = self.shape
         return expected_flow(self.volume, h, w, prior, gain)
 
 
 class OnDemandCorrelation:
-    """No volume: memory linear in the number of tokens, arithmetic per lookup (2r+2)^2 dot products per token and
-    level."""
+    """Correlation without a volume: memory is linear in the number of tokens; a look-up computes (2r+2)^2 dot products
+    per token and level."""
 
     def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4):
         n, d, h, w = f1.shape
@@ -102,7 +102,7 @@ class OnDemandCorrelation:
                 self.levels.append(pooled)
 
     def lookup(self, coords: Tensor) -> Tensor:
-        """As :meth:`DenseCorrelation.lookup`."""
+        """Return what :meth:`DenseCorrelation.lookup` returns."""
         n, h, w = self.shape
         flat = coords.permute(0, 2, 3, 1).reshape(n, h * w, 2)
         with fp32(coords):
@@ -128,7 +128,7 @@ class OnDemandCorrelation:
             return torch.cat(rows, 1).view(n, h, w, -1).permute(0, 3, 1, 2)
 
     def match(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
-        """As :meth:`DenseCorrelation.match`."""
+        """Return what :meth:`DenseCorrelation.match` returns."""
         source, target = self.f1, self.levels[0].flatten(2)
         n, h, w = self.shape
         with fp32(source):
@@ -140,8 +140,8 @@ class OnDemandCorrelation:
 
 
 def expected_flow(volume: Tensor, h: int, w: int, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
-    """Matching layer: V0 = E_P[coords] - grid, P = softmax of each row of ``volume`` (N, hw, hw) over the targets.
-    Returns (N, 2, h, w) low-resolution px, fp32. prior, gain : see :func:`expected_position`."""
+    """Return the flow of the matching layer, (N, 2, h, w) low-resolution px, fp32: V0 = E_P[coords] - grid, with P the
+    softmax of each row of ``volume`` (N, hw, hw) over the targets. prior, gain : see :func:`expected_position`."""
     with fp32(volume):
         return expected_position(volume, h, w, prior, gain).view(-1, 2, h, w) - pixel_grid(h, w, volume)
 
@@ -149,12 +149,12 @@ def expected_flow(volume: Tensor, h: int, w: int, prior: Tensor | None = None, g
 def expected_position(
     logits: Tensor, h: int, w: int, prior: Tensor | None = None, gain: Tensor | None = None, first: int = 0
 ) -> Tensor:
-    """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which
-    TF32 and bf16 products do not touch.
+    """Return the expected (x, y), (N, 2, rows), of logits (N, rows, h*w). It is computed from the marginals, by sums,
+    which do not use TF32 or bf16 products.
 
-    gain : () factor on the logits.   prior : () price of a displacement, 1/cells^2: ``prior`` times its squared length
-    is taken off a target's logit.   first : token that the first row is of."""
-    # Row blocks that stay in the cache.
+    gain : () factor of the logits.   prior : () cost of a displacement, 1/cells²: ``prior`` times its squared length is
+    subtracted from the logit of a target.   first : token of the first row."""
+    # Blocks of rows that fit the cache.
     if not torch.is_grad_enabled() and not torch.compiler.is_compiling() and logits.shape[1] > _ROWS:
         parts = [
             expected_position(logits[:, s : s + _ROWS], h, w, prior, gain, first + s)
@@ -176,13 +176,13 @@ def expected_position(
 
 
 def patch_index(coords: Tensor, h: int, w: int, radius: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    """coords (M, 2) -> flat indices (M, 2r+2, 2r+2) of the patch floor(c) - r … floor(c) + r + 1 clamped into h x w,
-    which of them are inside (M, 2r+2, 2r+2) bool, and the fraction (M, 2)."""
-    # Beyond this every tap is outside; also keeps the conversion to integer defined for diverging flow.
+    """Return flat indices (M, 2r+2, 2r+2) of the patches floor(c) - r … floor(c) + r + 1 around coords c (M, 2),
+    clamped into h x w; which of them are inside, (M, 2r+2, 2r+2) bool; and the fractions (M, 2)."""
+    # Beyond this every tap is outside; the clamp also keeps integers defined for diverging flow.
     x, y = (coords[:, k].clamp(-(radius + 2.0), size + radius + 1.0) for k, size in ((0, w), (1, h)))
     coords = torch.stack([x, y], 1)
     base = coords.floor()
-    # 2r + 2 integer taps hold all four neighbours of each of the 2r + 1 bilinear ones.
+    # 2r + 2 integer taps contain the neighbours of all 2r + 1 bilinear ones.
     offsets = torch.arange(-radius, radius + 2, device=coords.device)
     ix, iy = (base[:, k].long()[:, None] + offsets for k in (0, 1))
     inside = ((iy >= 0) & (iy < h))[:, :, None] & ((ix >= 0) & (ix < w))[:, None, :]
@@ -190,7 +190,7 @@ def patch_index(coords: Tensor, h: int, w: int, radius: int = 4) -> tuple[Tensor
 
 
 def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
-    """(M, 2r+2, 2r+2) integer taps and (M, 2) fractions -> (M, (2r+1)^2) bilinear taps."""
+    """Return bilinear taps (M, (2r+1)^2) of integer taps (M, 2r+2, 2r+2) and fractions (M, 2)."""
     fx, fy = fraction[:, 0, None, None], fraction[:, 1, None, None]
     # All taps share the fraction, so the patch is interpolated as a whole, first in y, then in x.
     rows = torch.lerp(patch[:, :-1], patch[:, 1:], fy)
@@ -198,8 +198,10 @@ def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
 
 
 def lookup_slow(levels: list[Tensor], coords: Tensor, radius: int = 4) -> Tensor:
-    """RAFT's lookup: (2r+1)^2 bilinear grid samples per token and level. (Its normalisation divides by the level's size
-    - 1: levels of one cell, inputs under 128 px where there are four, would be NaN; the models refuse those.)"""
+    """Return the taps as RAFT computes them: (2r+1)^2 bilinear grid samples per token and level.
+
+    The normalisation divides by the size of a level minus 1, so levels of one cell would be NaN (inputs below 128 px
+    with four levels); the models refuse such inputs."""
     n, _, h, w = coords.shape
     d = torch.arange(-radius, radius + 1, device=coords.device, dtype=coords.dtype)
     dy, dx = torch.meshgrid(d, d, indexing="ij")
@@ -231,14 +233,14 @@ def _taps(volume, coords, scale, radius, first, out):
     for m in range(len(coords)):
         x = min(max(coords[m, 0] * scale, np.float32(-radius - 2)), np.float32(w + radius + 1))
         y = min(max(coords[m, 1] * scale, np.float32(-radius - 2)), np.float32(h + radius + 1))
-        # NaN stays NaN, as in the other implementations.
+        # NaN gives NaN, as in the other implementations.
         if not (np.isfinite(x) and np.isfinite(y)):
             out[m, first : first + side * side] = np.nan
             continue
         bx, by = np.floor(x), np.floor(y)
         fx, fy = x - bx, y - by
         left, top = int(bx) - radius, int(by) - radius
-        # Wholly inside: no test per tap.
+        # The whole patch is inside: no test per tap.
         if left >= 0 and top >= 0 and left + side < w and top + side < h:
             for j in range(side + 1):
                 for i in range(side + 1):
@@ -257,10 +259,10 @@ def _taps(volume, coords, scale, radius, first, out):
 
 
 def local_correlation(f1: Tensor, f2: Tensor, radius: int = 4) -> Tensor:
-    """<f1(x), f2(x + d)> / D for |d| <= radius: (N, (2r+1)^2, h, w), rows of dy, zero
-    outside; STE-FlowNet's 9x9 cost."""
+    """Return <f1(x), f2(x + d)> / D for |d| <= radius, (N, (2r+1)^2, h, w), with rows of dy and zeros outside (the 9x9
+    cost of STE-FlowNet)."""
     h, w = f1.shape[-2:]
-    # Zeros round f2, so that every displacement is a slice of it.
+    # With zeros around f2 every displacement is a slice of it.
     padded = F.pad(f2, (radius,) * 4)
     side = 2 * radius + 1
     return torch.stack(

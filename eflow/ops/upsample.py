@@ -1,5 +1,5 @@
-"""Low-resolution flow to full resolution: learned convex combinations (RAFT, Teed & Deng,
-ECCV 2020, sec. 3.3) and bilinear."""
+"""Upsampling of flow to full resolution, by learned convex combinations (RAFT, Teed & Deng, ECCV 2020, sec. 3.3) or
+bilinear."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ SCALE = 8
 
 
 def convex_upsample(flow: Tensor, mask: Tensor, border: str = "replicate") -> Tensor:
-    """flow (N, 2, h, w) low-resolution px; mask (N, 9*64, h, w) logits, channel k*64 + 8*i + j: neighbour k (row-major
-    3x3) of sub-pixel (i, j). Returns (N, 2, 8h, 8w) full-resolution px, fp32.
+    """Return flow (N, 2, 8h, 8w) full-resolution px, fp32, as convex combinations of flow (N, 2, h, w) low-resolution
+    px.
 
-    border : neighbours outside the image repeat the edge ("replicate"), or are "zero" as in RAFT's code, which turns a
-    constant 24 px into 10.7 in the corners unless the network has learnt it so.
+    mask : (N, 9*64, h, w) logits; channel k*64 + 8*i + j is neighbour k (row-major 3x3) of sub-pixel (i, j).
+    border : neighbours outside the image repeat the edge ("replicate") or are "zero" as in RAFT's code, which turns a
+    constant 24 px into 10.7 px in the corners unless the network was trained with it.
     """
     n, _, h, w = flow.shape
     with fp32(flow):
-        # Weights of the nine neighbours add up to 1 for each of the 64 sub-pixels: a convex
-        # combination.
+        # The weights of the nine neighbours sum to 1 for each of the 64 sub-pixels.
         weights = mask.float().view(n, 9, SCALE * SCALE, h * w).softmax(1)
         padded = _padded(flow, border)
         neighbours = torch.stack([padded[..., dy : dy + h, dx : dx + w] for dy in range(3) for dx in range(3)], 2).view(
@@ -35,12 +35,11 @@ def convex_upsample(flow: Tensor, mask: Tensor, border: str = "replicate") -> Te
 
 def _padded(flow: Tensor, border: str) -> Tensor:
     """Return the flow in full-resolution px, padded by one pixel."""
-    # Low-resolution px times 8 are full-resolution px.
     return F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode={"replicate": "replicate", "zero": "constant"}[border])
 
 
 def convex_upsample_slow(flow: Tensor, mask: Tensor, border: str = "replicate") -> Tensor:
-    """:func:`convex_upsample` as RAFT writes it: unfold, one big product, one big permutation."""
+    """Slow reference of :func:`convex_upsample`, as in RAFT: unfold, one large product, one permutation."""
     n, _, h, w = flow.shape
     weights = torch.softmax(mask.float().view(n, 1, 9, SCALE, SCALE, h, w), dim=2)
     patches = F.unfold(_padded(flow, border), [3, 3]).view(n, 2, 9, 1, 1, h, w)
@@ -49,7 +48,6 @@ def convex_upsample_slow(flow: Tensor, mask: Tensor, border: str = "replicate") 
 
 
 def bilinear_upsample(flow: Tensor) -> Tensor:
-    """(N, 2, h, w) low-resolution px to (N, 2, 8h, 8w) full-resolution px; pixel centres
-    aligned as the strided trunk's are."""
+    """Return flow (N, 2, h, w) low-resolution px upsampled to (N, 2, 8h, 8w) full-resolution px, bilinear."""
     with fp32(flow):
         return SCALE * F.interpolate(flow.float(), scale_factor=SCALE, mode="bilinear", align_corners=False)

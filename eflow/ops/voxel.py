@@ -1,7 +1,4 @@
-"""Events to dense tensors in one pass (numba), with slow NumPy twins.
-
-The kernels are serial and release the GIL: loader workers are the parallelism.
-"""
+"""Conversion of events to dense tensors in one pass (numba). Kernels are serial; loader workers run in parallel."""
 
 from __future__ import annotations
 
@@ -23,19 +20,17 @@ def voxel_grid(
     *,
     normalise: str = "nonzero",
 ) -> np.ndarray:
-    """Signed event voxel grid with a linear kernel in time (Zhu et al., CVPR 2019, eq. 1), bin
-    coordinate (B-1)(t-t0)/(t1-t0).
+    """Return the signed voxel grid (bins, height, width) float32 of events, with a linear kernel in time (Zhu et al.,
+    CVPR 2019, eq. 1) and the bin coordinate (B-1)(t-t0)/(t1-t0).
 
-    x, y : uint16 px, or float32 rectified px, which are splatted bilinearly (corners outside the sensor are dropped).
-    t : int64 µs, t0 <= t <= t1; subtracted as integers. p : uint8 {0, 1}, counted as -1 and +1.
+    x, y : uint16 px, or float32 rectified px, which are splatted bilinearly (without corners outside the sensor).
+    t : int64 µs, t0 <= t <= t1. p : uint8 {0, 1}, counted as -1 and +1.
     normalise : "nonzero" (zero mean, unit standard deviation over cells that are not 0), "all", "none".
-    Returns (bins, height, width) float32.
-
-    Raises ValueError: an integer pixel or a time outside the grid (bad data must not become a quiet blur).
+    Raises ValueError: an integer pixel or a time is outside the grid.
     """
     grid = np.zeros((bins, height, width), np.float32)
     if len(t):
-        # An empty window has no length to divide by: all its events go to the first bin.
+        # A window of length 0: all events are in the first bin.
         scale = (bins - 1) / (int(t1) - int(t0)) if t1 > t0 else 0.0
         kernel = _splat_t if x.dtype.kind == "u" else _splat_xyt
         outside = kernel(x, y, t, p, np.int64(t0), np.int64(t1), scale, grid)
@@ -56,7 +51,7 @@ def _splat_t(x, y, t, p, t0, t1, scale, grid):
             continue
         # Times are subtracted as integers, which is exact.
         c = np.float64(t[i] - t0) * scale
-        # t == t1 belongs wholly to the last bin.
+        # t == t1 is in the last bin.
         b = min(int(c), max(bins - 2, 0))
         w = np.float32(c - b)
         s = np.float32(1) if p[i] else np.float32(-1)
@@ -78,7 +73,7 @@ def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
         b = min(int(c), max(bins - 2, 0))
         wt = np.float32(c - b)
         s = np.float32(1) if p[i] else np.float32(-1)
-        # Rectified coordinates lie between pixels; each event goes to the four around it.
+        # Rectified coordinates are between pixels; each event is distributed to four pixels.
         fx, fy = np.floor(x[i]), np.floor(y[i])
         # NaN fails these comparisons and is dropped.
         if not (fx >= -1 and fx < width and fy >= -1 and fy < height):
@@ -99,7 +94,7 @@ def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
 
 @kernel
 def _normalise(cells, everything):
-    # Two passes in float64: mean first, then the sum of squared deviations, which does not cancel.
+    # Two passes in float64, mean and squared deviations: one pass would suffer from cancellation.
     n, total = 0, 0.0
     for v in cells:
         if everything or v != 0:
@@ -112,7 +107,7 @@ def _normalise(cells, everything):
     for v in cells:
         if everything or v != 0:
             square += (v - mean) ** 2
-    # The unbiased estimate, as torch.std has it.
+    # The unbiased estimate, as torch.std.
     std = np.sqrt(square / (n - 1)) if n > 1 else 0.0
     scale = 1.0 / std if std > 0 else 1.0
     for i in range(len(cells)):
@@ -123,9 +118,9 @@ def _normalise(cells, everything):
 def count_slices(
     x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, slices: int, height: int, width: int
 ) -> np.ndarray:
-    """Events counted per slice of equal duration and polarity: (slices, 2, height, width) float32, channel 0 OFF, 1 ON.
+    """Return event counts per slice of equal duration and polarity, (slices, 2, height, width) float32; 0 OFF, 1 ON.
 
-    x, y : uint16 px. t in [t0, t1]; t == t1 falls into the last slice. Raises ValueError as :func:`voxel_grid`."""
+    x, y : uint16 px. t in [t0, t1]; t == t1 is in the last slice. Raises ValueError as :func:`voxel_grid`."""
     counts = np.zeros((slices, 2, height, width), np.float32)
     outside = _count(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), counts)
     if outside:
@@ -150,8 +145,9 @@ def _count(x, y, t, p, t0, span, counts):
 def counts_and_times(
     x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, height: int, width: int
 ) -> np.ndarray:
-    """EV-FlowNet's image (Zhu et al., RSS 2018): (4, height, width) float32 = OFF count, ON count, latest OFF time,
-    latest ON time; times as fractions of the window, 0 where no event was. Raises ValueError as :func:`voxel_grid`."""
+    """Return the input of EV-FlowNet (Zhu et al., RSS 2018), (4, height, width) float32: OFF count, ON count, latest
+    OFF time, latest ON time. Times are fractions of the window, 0 without an event. Raises ValueError as
+    :func:`voxel_grid`."""
     out = np.zeros((4, height, width), np.float32)
     outside = _latest(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), out)
     if outside:
@@ -168,7 +164,7 @@ def _latest(x, y, t, p, t0, span, out):
         if x[i] >= width or y[i] >= height or d < 0 or d > span:
             outside += 1
             continue
-        # Events come in order of time, so the last one written is the latest.
+        # Events are sorted by time, so the last one written is the latest.
         out[p[i], y[i], x[i]] += np.float32(1)
         out[2 + p[i], y[i], x[i]] = np.float32(d / span)
     return outside

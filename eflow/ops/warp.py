@@ -1,4 +1,4 @@
-"""Warping by a flow field."""
+"""Warping of images and flow by a flow field."""
 
 from __future__ import annotations
 
@@ -11,24 +11,28 @@ from eflow.precision import fp32
 
 
 def backward_warp(image: Tensor, flow: Tensor, border: str = "zero") -> Tensor:
-    """image (N, C, h, w) read at x + flow(x), bilinear; outside it is "zero", or its edge goes on ("replicate").
-    flow (N, 2, h, w) px of this resolution."""
+    """Return an image (N, C, h, w) sampled at x + flow(x), bilinear.
+
+    flow : (N, 2, h, w) px of this resolution. border : the image outside is "zero", or repeats its edge
+    ("replicate")."""
     h, w = image.shape[-2:]
     with fp32(image):
         at = (pixel_grid(h, w, flow) + flow.float()).permute(0, 2, 3, 1)
         beyond = {"zero": "zeros", "replicate": "border"}[border]
-        # (Not divided by a tensor [w, h]: a card would wait for its two numbers.)
+        # A tensor [w, h] as divisor would make a GPU wait for its two numbers.
         # grid_sample takes -1 to 1 between the image's outer edges (align_corners=False).
         normal = torch.stack([(2 * at[..., k] + 1) / size - 1 for k, size in ((0, w), (1, h))], -1)
         return F.grid_sample(image.float(), normal, align_corners=False, padding_mode=beyond)
 
 
 def forward_warp(flow: Tensor) -> Tensor:
-    """A flow field carried along itself to the next reference time (warm start): every vector splatted bilinearly to
-    where it points, averaged where several land, zero where none does. (N, 2, h, w) px."""
+    """Return a flow field (N, 2, h, w) px moved along itself to the next reference time, for a warm start.
+
+    Every vector is splatted bilinearly to its end point; several vectors are averaged; pixels without a vector are
+    0."""
     n, _, h, w = flow.shape
     at = (pixel_grid(h, w, flow) + flow).flatten(2)
-    # The splat's sum of flow in channels 0 and 1, of weights in channel 2.
+    # Channels 0 and 1: sum of the splatted flow; channel 2: sum of the weights.
     base = at.floor()
     total = flow.new_zeros(n, 3, h * w)
     values = torch.cat([flow.flatten(2), torch.ones_like(at[:, :1])], 1)
@@ -40,5 +44,5 @@ def forward_warp(flow: Tensor) -> Tensor:
             inside = (corner[:, :1] >= 0) & (corner[:, :1] < w) & (corner[:, 1:] >= 0) & (corner[:, 1:] < h)
             x, y = corner[:, :1].clamp(0, w - 1).long(), corner[:, 1:].clamp(0, h - 1).long()
             total.scatter_add_(2, (y * w + x).expand(-1, 3, -1), values * weight * inside)
-    # The mean where anything landed, else 0.
+    # Mean of the vectors at a pixel, 0 without one.
     return (total[:, :2] / total[:, 2:].clamp(min=1e-6) * (total[:, 2:] > 1e-6)).view(n, 2, h, w)

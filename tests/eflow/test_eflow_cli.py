@@ -100,7 +100,7 @@ def test_a_window_as_long_as_things_need_to_move_by_five_pixels(tmp_path, capsys
     found = float(re.search(r"windows of (\S+) ms", capsys.readouterr().out).group(1))
     assert 0.7 * span < 1000 * found < 1.4 * span
     assert run([*command[:-1], "soon"]) == 2
-    assert "--window-ms: not a length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
+    assert "--window-ms: not a window length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
 
 
 def test_windows_of_a_recording_that_hardly_moves_are_as_long_as_it_allows(network, tmp_path, capsys):
@@ -116,7 +116,7 @@ def test_windows_of_a_recording_that_hardly_moves_are_as_long_as_it_allows(netwo
     assert one[0].t_us == int(events.t[0]) and [w.t_us for w in one[1:]] == [w.t_us for w in two]
     command = ["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]
     assert run(command) == 0
-    assert "as long as the recording allows: things move by less than 5 px in it" in capsys.readouterr().out
+    assert "the longest window of this recording: motion in it is below 5 px" in capsys.readouterr().out
     assert run(["predict", network, str(tmp_path / "e.h5"), "--whole", "--no-sharpen"]) == 0
 
 
@@ -128,7 +128,7 @@ def test_another_motion_by_contrast_maximisation_is_said(monkeypatch, tmp_path, 
     assert run(["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]) == 0
     out = capsys.readouterr().out
     assert "makes the events in the middle no sharper" in out
-    assert re.search(r"contrast maximisation moves the middle by \(\d.*, this flow by \(-5.0, 3.0\)", out)
+    assert re.search(r"contrast maximisation finds a motion of \(\d.* this flow \(-5.0, 3.0\)", out)
 
 
 def test_from_eflow_import_load_model(network):
@@ -185,9 +185,12 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
             ["contrast-rotation", "E"],
             "error: --focal: a rotation's flow depends on the lens; expected its focal length",
         ),
-        (["contrast-affine", "E", "--iterations", "3"], "error: --iterations: contrast-affine is no network (got 3)"),
-        (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is no network (got True)"),
-        (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method takes it (got 200.0); expected contrast-"),
+        (
+            ["contrast-affine", "E", "--iterations", "3"],
+            "error: --iterations: contrast-affine is not a network (got 3)",
+        ),
+        (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is not a network (got True)"),
+        (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method uses it (got 200.0); expected contrast-"),
         (
             ["contrast-affine", "FEW"],
             "too few events for contrast maximisation (got 5); expected at least 50, or --empty",
@@ -285,8 +288,8 @@ def test_a_silent_window(network, tmp_path, capsys):
         ("none", ["--whole"], "fewer than two events"),
         ("one", [], "shorter than a window of 100 ms"),
         ("one", ["--whole"], "fewer than two events"),
-        ("one", ["--window-ms", "auto"], "no events where they are looked for; expected a length instead of auto"),
-        ("jump", ["--window-ms", "auto"], "no events where they are looked for"),
+        ("one", ["--window-ms", "auto"], "no events at a quarter, half and three quarters of the recording"),
+        ("jump", ["--window-ms", "auto"], "no events at a quarter, half and three quarters"),
         ("jump", ["--empty", "zero", "--no-sharpen"], "event times jump by 3.6e+09 s; expected --end-ms before"),
         ("pixel", [], None),
         ("pixel", ["--whole"], None),

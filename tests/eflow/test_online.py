@@ -219,4 +219,4 @@ def test_a_recipe_is_evaluated_without_files(recipe, capsys, tmp_path):
     assert "3 samples" in said and json.loads((out / "results.json").read_text())["samples"] == 3
     for wrong in ("5ms", "100-5", "-5", "1-2-3"):
         assert run([*command[:3], f"--window-ms={wrong}"]) == 2
-        assert "--window-ms: not lengths of windows" in capsys.readouterr().err
+        assert "--window-ms: not a range of window lengths" in capsys.readouterr().err

@@ -82,7 +82,7 @@ def test_rafts_own_weights_are_refused(tmp_path):
     weights = published(prefix="module.")
     of_pictures = {k: v[:, :3] if k.endswith("net.conv1.weight") else v for k, v in weights.items()}
     torch.save(of_pictures, tmp_path / "raft-things.pth")
-    with pytest.raises(AssetError, match="RAFT's own weights see images and no events; expected E-RAFT's checkpoint"):
+    with pytest.raises(AssetError, match="weights of RAFT are for images, not events; expected E-RAFT's checkpoint"):
         import_published(tmp_path / "raft-things.pth", tmp_path / "r.safetensors")
 
 
@@ -138,7 +138,7 @@ def test_truncated_files(tmp_path):
         (lambda t: t.update({"fnet.conv1.bias": torch.zeros(64, dtype=torch.int64)}), "has another shape or type"),
         (lambda t: t.update({"fnet.conv1.bias": torch.full((64,), np.nan)}), "holds NaN or infinity"),
         (lambda t: t.update({"fnet.conv1.weight": torch.zeros(64)}), r"'fnet\.conv1\.weight' has another shape"),
-        (lambda t: t.update({"epoch": 3}), "'epoch' is no tensor"),
+        (lambda t: t.update({"epoch": 3}), "'epoch' is not a tensor"),
         (lambda t: t.clear(), "holds no tensors by name"),
     ],
 )

@@ -72,9 +72,12 @@ def test_an_interruption_keeps_what_is_there(recipe, tmp_path):
     ("spoil", "message"),
     [
         (lambda f: (f / "0000002.npz").unlink(), "windows are missing"),
-        (lambda f: (f / "windows.json").write_text("{"), "not readable"),
-        (lambda f: (f / "windows.json").write_text('{"version": 9}'), "of another version"),
-        (lambda f: (f / "windows.json").write_text('{"version": 1, "samples": "6"}'), "not a list of windows"),
+        (lambda f: (f / "windows.json").write_text("{"), "cannot be read"),
+        (lambda f: (f / "windows.json").write_text('{"version": 9}'), "unknown version"),
+        (
+            lambda f: (f / "windows.json").write_text('{"version": 1, "samples": "6"}'),
+            "not the description of a folder of windows",
+        ),
         (lambda f: (f / "0000000.npz").write_bytes((f / "0000000.npz").read_bytes()[:900]), "0000000.npz"),
         (lambda f: (f / "0000000.npz").write_bytes(b"no zip"), "0000000.npz"),
         (lambda f: np.savez(f / "0000000.npz", t=3), "0000000.npz"),
@@ -91,7 +94,7 @@ def test_a_damaged_folder_is_one_line(folder, tmp_path, spoil, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--window-ms", "long"], "error: --window-ms: not lengths of windows"),
+        (["--window-ms", "long"], "error: --window-ms: not a range of window lengths"),
         (["--split", "judge"], "error: --split: unknown choice"),
         (["--max-flow", "-1"], "error: max_flow: "),
         (["--window-ms", "500"], "holds no two windows of 500 ms"),

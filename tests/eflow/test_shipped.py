@@ -94,7 +94,7 @@ def test_pack_then_call_by_name(source, list_of, tmp_path, capsys, monkeypatch):
 def test_an_empty_list_works(list_of, capsys):
     assert run(["models"]) == 0 and "no trained network" in capsys.readouterr().out
     assert run(["models", "--json"]) == 0 and json.loads(capsys.readouterr().out) == []
-    assert run(["models", "toy_net"]) == 2 and "none comes with this version" in capsys.readouterr().err
+    assert run(["models", "toy_net"]) == 2 and "no network comes with this version" in capsys.readouterr().err
     with pytest.raises(AssetError, match="no such checkpoint.*a run folder$"):
         ckpt.load_model("toy_net")
 
@@ -111,7 +111,7 @@ def test_weights_that_are_not_the_cards(source, list_of):
     packed(source, list_of)
     path = list_of / "toy_net" / shipped.WEIGHTS
     path.write_bytes(path.read_bytes()[:-4] + b"\0\0\0\1")
-    with pytest.raises(AssetError, match="not the weights that the card is of"):
+    with pytest.raises(AssetError, match="checksum of the weights differs from that of the card"):
         ckpt.load_model("toy_net")
     path.unlink()
     with pytest.raises(AssetError, match=r"model\.safetensors: cannot be read"):
@@ -121,9 +121,9 @@ def test_weights_that_are_not_the_cards(source, list_of):
 @pytest.mark.parametrize(
     "name, change, message",
     [
-        ("Toy Net", {}, "--name: not a name"),
-        ("contrast-affine", {}, "--name: not a name"),
-        ("eraft", {}, "--name: not a name"),
+        ("Toy Net", {}, "--name: not a valid name"),
+        ("contrast-affine", {}, "--name: not a valid name"),
+        ("eraft", {}, "--name: not a valid name"),
         ("toy", {"scores": {}}, "card.yaml.*scores"),
         ("toy", {"commands": None}, "card.yaml.*commands"),
         ("toy", {"sha256": "0" * 64}, "card.yaml.*sha256.*unknown key"),

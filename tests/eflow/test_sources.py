@@ -96,7 +96,7 @@ def test_mvsec_frames_of_a_protocol(tmp_path, monkeypatch):
     root = outdoor(tmp_path)
     everything = [s.name for s in MvsecSource(root)]
     assert everything == [f"outdoor_day1/{i:06d}" for i in range(1, 9)]
-    with pytest.raises(AssetError, match="none of the frames that ste-flownet scores .*1 to 8.*9200 to 9599 and 10500"):
+    with pytest.raises(AssetError, match="no frame that ste-flownet scores .*1 to 8.*9200 to 9599 and 10500"):
         MvsecSource(root, protocol="ste-flownet")
     protocol(monkeypatch, "ste-flownet", frames={"outdoor_day1": ((2, 4), (6, 7)), "indoor_flying1": ((0, 1),)})
     source = MvsecSource(root, protocol="ste-flownet")
@@ -145,7 +145,7 @@ def test_what_is_asked_of_mvsec_alone(tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             open_source(root, **options)
-    with pytest.raises(ConfigError, match="protocol: only of MVSEC"):
+    with pytest.raises(ConfigError, match="protocol: only for MVSEC"):
         open_source(blinkgl_set(tmp_path / "b", sequences=1, labels=1), protocol="e-raft")
 
 

@@ -1,21 +1,21 @@
 """The shader debugger: ``blinkgl shader passes | probe | diff | check | show | serve``.
 
-In:    a configuration, a moment of one of its sequences, a folder of shaders.
-Out:   what every pass wrote there beside what a float64 reference says, as pictures, words and a page.
+In:    a configuration, a time in one of its sequences, a folder of shaders.
+Out:   the buffers of all passes beside those of a float64 reference, as pictures, text and a page.
 Start: cli.py (the commands), then session.py:
 
-    session.py    one moment of the scene that a generation run would render; the shader folder; the OpenGL side
-    moments.py    every buffer of that moment, from the GPU and from the float64 reference, by the same names
-    twins.py      pictures made of pictures: what `edges` puts together and what a lens sees
-    lamps.py      shadow maps in float64, and where they may be off; soft shadows
-    quantities.py how each buffer is graded, and with which tolerance
-    compare.py    one against the other, at which pixels
-    suspicions.py what the error looks like
+    session.py    the scene of a generation run at one time; the shader folder; the OpenGL context
+    moments.py    every buffer at that time, from the GPU and from the float64 reference, by the same names
+    twins.py      float64 versions of the filter of `edges` and of the image behind a lens
+    lamps.py      shadow maps in float64 and their tolerance; soft shadows
+    quantities.py the error measure and the tolerance of each buffer
+    compare.py    comparison of the two, and the pixels that differ
+    suspicions.py likely causes of an error
     probe.py      everything about one pixel
     picture.py    arrays as pictures: colour maps, labelled PNGs, the contact sheet
-    check.py      every program in every variant, errors at their own line (diagnostics.py)
-    server.py     the page (page/); inspector.py: what it may ask, and the answers
+    check.py      compiles every program in every variant; errors at their source line (diagnostics.py)
+    server.py     serves the page (page/); inspector.py answers its requests
     cli.py        the commands
 
-Production code never imports this package, and ``shaders/debug.glsl`` is compiled only when it asks.
+Production code never imports this package. ``shaders/debug.glsl`` is compiled only for it.
 """

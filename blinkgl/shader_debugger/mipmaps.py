@@ -80,33 +80,33 @@ def levels(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: Camer
             sides = sides + np.sign(total)
         along = np.abs([there[1, k] - there[0, k] for k in (0, 1)])
         down = np.abs([there[k, 1] - there[k, 0] for k in (0, 1)])
-        # The least that either row and either column can give, and the most.
+        # Lower and upper bound over both rows and both columns.
         low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
         high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
         usual = np.hypot(*np.moveaxis([along, down], -1, 0)).mean(axis=1).max(axis=0)
-        # The sum's sign is that of the plane's side that is seen; between two signs lies the horizon.
+        # The sign says which side of the plane is visible; different signs mean that the horizon lies between.
         whole = np.abs(sides)[:, None] == 4
         return np.log2(np.where(whole, np.stack([low, usual, high], axis=1), [0.0, np.inf, np.inf]))
 
 
 MISPLACED = 0.01 + 2.0**-8.5
-"""px: how far a surface of triangles that are no needles may be misplaced: by what float32 rounds, and by half a
-diagonal step of the grid of 1/256 px that corners are snapped to (guard.glsl)."""
+"""Tolerance of the position of a surface without needle-like triangles, px: rounding of float32, and half a diagonal
+step of the grid of 1/256 px to which corners are snapped (guard.glsl)."""
 _ROUNDING = 8 * 2.0**-24
-"""Of a corner's place in the picture: a row of the matrix rounds four products and three sums, the division once."""
+"""Relative rounding error of the position of a corner: four products, three sums and one division."""
 
 
 def needles(points: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """(N,) >= 1: how many times :data:`MISPLACED` float32 may misplace the surface of N triangles. points : (N, 3, 3)
-    corners, camera axes.
+    """Return the factor on :data:`MISPLACED`, (N,) >= 1, for the surfaces of N triangles in float32.
 
-    Where a corner is off by e, the shares of the corners are off by e / height, and the surface by that times the
-    longest side. 1 for triangles through the near plane, which are clipped."""
+    points : (N, 3, 3) corners, camera axes.
+    If a corner is wrong by e, barycentric coordinates are wrong by e / height, and the surface by that times the
+    longest side. Triangles through the near plane are clipped; they have 1."""
     whole = (points[..., 2] > camera.near).all(axis=1)
-    # A corner behind the camera is not in the picture: any place in front will do for those left out.
+    # A corner behind the camera has no pixel: use any point in front, since the result is not used.
     px = camera.project(np.where(whole[:, None, None], points, [0.0, 0.0, 1.0]))
     sides = px - np.roll(px, 1, axis=1)
-    # Twice the triangle's area is its longest side times its height.
+    # Twice the area of a triangle is its longest side times its height.
     area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
     extent = np.maximum(np.abs(px).max(axis=(1, 2)), max(camera.width, camera.height))
     off = _ROUNDING * extent * (sides**2).sum(axis=2).max(axis=1) / np.maximum(area, 1e-12)

@@ -1,5 +1,5 @@
-"""Every buffer of one moment by name: :class:`GpuMoment` reads them from OpenGL, :class:`ReferenceMoment` computes them
-in float64. Both have the same names, shapes and conventions; each buffer is computed at its first use."""
+"""All buffers at one time, by name. :class:`GpuMoment` reads them from OpenGL, :class:`ReferenceMoment` computes them
+in float64. Names, shapes and conventions are the same; each buffer is computed at its first use."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Pass:
-    """kind : how it is shown: scalar, depth (on a logarithmic scale), signed, ids, mask, light
-    (linear rgb), unit (vectors), uv, motion.
+    """Description of a buffer.
+
+    kind : how it is shown: scalar, depth (logarithmic scale), signed, ids, mask, light (linear rgb), unit (vectors),
+    uv, motion.
     source : the program and output that write it."""
 
     name: str
@@ -41,10 +43,10 @@ class Pass:
 
 
 LOOKUPS = ("uv", "level", "albedo", "direct", "shadow", "around", "light", "mirrored", "emission")
-"""Buffers of a lit pass on the way to its result, in the order of computation: albedo · light + mirrored + emission,
-where the light of the matt part is direct · shadow + around."""
+"""Intermediate buffers of a lit pass, in the order of computation. Its result is albedo · light + mirrored + emission,
+where the light of the diffuse part is direct · shadow + around."""
 MAPS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
-"""Buffers that are a lamp's picture, not the camera's."""
+"""Buffers that are rendered from a lamp, not from the camera."""
 
 
 def _lookups(name: str, program: str) -> tuple[Pass, ...]:
@@ -95,11 +97,11 @@ _SHADED = (
 
 
 class OfLabels(Mapping[str, _T]):
-    """By the name of a buffer: one of every view of the labels that are registered now, among fixed ones, in the order
-    in which a mistake shows: where the surface is (``before``, and labels of one time), what it
-    looks like (``shaded``), how it moves.
+    """Values by the name of a buffer: one for every view of all labels that are registered now, and fixed ones.
 
-    made : entry of a label and one of its views.   before, shaded : the fixed ones."""
+    The order is that of computation, so that a mistake shows first where it was made: where the surface is (``before``,
+    and labels of one time), its appearance (``shaded``), its motion.
+    made : returns the value for a label and one of its views.   before, shaded : the fixed values."""
 
     def __init__(self, made: Callable[[Label, View], _T], before: Iterable[_T], shaded: Iterable[_T]):
         self._made, self._before, self._shaded = made, tuple(before), tuple(shaded)
@@ -140,7 +142,7 @@ PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
 def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
     """Return the :data:`PASSES` that a scene has: without shadows no shadow maps, and so on.
 
-    twinned : those of :data:`twins.TWINNED` that are included."""
+    twinned : names of :data:`twins.TWINNED` to include."""
     # A lamp has no map if no body casts a shadow.
     maps = len(shadowing(scene.light)) if appearance.casts(scene) else 0
     materials = [part.material for _, part in casting.scene_parts(scene) if not part.material.unlit]
@@ -160,12 +162,12 @@ def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
 
 
 def view_of(name: str) -> tuple[Label, View] | None:
-    """Return the label that has this buffer, and its view; None: no label has it."""
+    """Return the label of a buffer and its view, or None."""
     return next(((label, view) for label in LABELS.values() for view in label.views if view.name == name), None)
 
 
 def lookup_of(name: str) -> tuple[str, str]:
-    """Return ("luminance", "uv") of "luminance_uv"; ("", "") for a buffer that is no lookup."""
+    """Return ("luminance", "uv") for "luminance_uv", and ("", "") for a buffer that is not a lookup."""
     pass_name, _, what = name.rpartition("_")
     return (pass_name, what) if pass_name in LOOKUP_PASSES and what in LOOKUPS else ("", "")
 
@@ -178,7 +180,7 @@ def check_pass(name: str, known: Any = PASSES, where: str = "--pass") -> str:
 
 
 class _Lazy:
-    """``self[name]``, computed by the method that makes its group of buffers."""
+    """Buffers by name; ``_make`` computes a group of them when one is first used."""
 
     def __init__(self):
         self._made: dict[str, np.ndarray] = {}
@@ -193,15 +195,17 @@ class _Lazy:
 
 
 class GpuMoment(_Lazy):
-    """What the GPU wrote. Besides :data:`PASSES`: part (H, W) int32, -1: nothing hit; window (H, W, 4) gl_FragCoord;
-    next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H,
-    W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in colour; NAME_plain and
-    NAME_twin of what :data:`twins.TWINNED` has.
+    """Buffers that the GPU wrote.
 
-    Behind a lens labels are in the lens's pixels; of all that is drawn as a flat picture a pixel is the one that the
-    lens looks at.
+    Besides those of :data:`PASSES`: part (H, W) int32, -1 where nothing is hit; window (H, W, 4), gl_FragCoord;
+    next_depth_forward and next_depth_backward (H, W), the depth at t' that the flow program returns; luminance_count
+    and colour_count (H, W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in
+    colour; NAME_plain and NAME_twin for the names of :data:`twins.TWINNED`.
 
-    Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
+    With a lens, labels are in the pixels of the lens. Buffers drawn as a flat picture are sampled at the flat pixel
+    that each pixel of the lens shows.
+
+    Where nothing is hit depth is inf, and flow, velocity and id are 0.
     """
 
     def __init__(self, renderer: DebugRenderer, when: When):
@@ -214,7 +218,7 @@ class GpuMoment(_Lazy):
             return {name: draw.picture(name, when.t_ns)}
         if name == "velocity_pass":
             return {name: draw.velocity(when.t_ns).read()}
-        # ``edges`` writes a flat picture, a lens its own pixels.
+        # ``edges`` writes a flat picture, a lens pass the pixels of the lens.
         own = draw.at_pixels if name.partition("_")[2].startswith("edges") else np.asarray
         if name in TWINNED:
             return {name: own(drawn(draw, name, when.t_ns))}
@@ -246,28 +250,28 @@ class GpuMoment(_Lazy):
 
     def _labels(self):
         when = self.when
-        # Request all at once, so that they are drawn together.
+        # One request for all labels, so that they are drawn together.
         ask = LabelRequest(*(name for name, label in LABELS.items() if label.views))
         frame = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
         return {view.name: view.of(frame.values[name]) for name in ask for view in LABELS[name].views}
 
 
 class ReferenceMoment(_Lazy):
-    """What the GPU should have written, float64, by :mod:`blinkgl.render.reference`.
+    """Buffers that the GPU should have written, in float64, by :mod:`blinkgl.render.reference`.
 
-    scene : as it is drawn, behind a lens as the flat picture.   seen : as the camera sees it.   maps : of shadows.
+    scene : with the camera that draws; with a lens, that of the flat picture.   seen : with the camera itself.
+    maps : shadow maps.
 
     The level of a look-up is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6,
-    section 8.14, eq. 8.7), from the exact derivatives of uv on the triangle's plane, plus ``mip_bias``; a GPU takes it
-    from 2 x 2 pixels. The albedo, and what follows from it (colour, luminance), is sampled at
-    that level by the CPU twin in :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full
-    resolution, are albedo_level0, colour_level0 and luminance_level0.   texture_size : (H, W,
-    2) texels, 1 where there is no texture.
-    lamps : (H, W, lamps) what each sends, without shadows.   matt : light over what arrives: less than 1 under a gloss.
-    light, and its terms : of the luminance of what the surface is made of: coloured light takes of each colour as much
-    as it has.
-    uv, level, albedo, light … : what both passes should look up; luminance_albedo is the luminance of albedo.
-    shadow_map_0 … : as ``maps``, those of the renderer, lie.
+    section 8.14, eq. 8.7), from the exact derivatives of uv on the plane of the triangle, plus ``mip_bias``; a GPU
+    takes differences over 2 x 2 pixels. :mod:`mipmaps` samples the albedo at that level, and colour and luminance
+    follow from it. The reference itself has no mip maps: its values, at full resolution, are albedo_level0,
+    colour_level0 and luminance_level0.
+    texture_size : (H, W, 2) texels, 1 without a texture.
+    lamps : (H, W, lamps), light of each lamp without shadows.   matt : diffuse over arriving light; below 1 with gloss.
+    light, and its terms : weighted by the colours that the surface reflects.
+    uv, level, albedo, light … : for both passes; luminance_albedo is the luminance of albedo.
+    shadow_map_0 … : at the poses of ``maps``, those of the renderer.
     """
 
     def __init__(self, scene: Scene, when: When, mip_bias: float = 0.0, maps: tuple[ShadowMap, ...] = ()):
@@ -279,18 +283,18 @@ class ReferenceMoment(_Lazy):
 
     @cached_property
     def labels(self) -> reference.ReferenceFrame:
-        """Labels of the camera's pixels, with flow."""
+        """Labels at the pixels of the camera, with flow."""
         when = self.when
         return reference.render(self.seen, when.t_ns, forward_ns=when.forward_ns, backward_ns=when.backward_ns)
 
     @cached_property
     def shadow_edges(self) -> np.ndarray:
-        """(H, W) bool: where hard shadows of maps differ from those of rays."""
+        """(H, W) bool: pixels where shadows of maps may differ from shadows of rays."""
         return near_an_edge(self.scene, self.frame, self.maps)
 
     @cached_property
     def frame(self) -> reference.ReferenceFrame:
-        """The drawn frame: without a lens :attr:`labels`."""
+        """The frame that is drawn; without a lens it is :attr:`labels`."""
         if self._places is None:
             return self.labels
         return reference.render(self.scene, self.when.t_ns, xy=self._places.astype(np.float64))
@@ -328,8 +332,8 @@ class ReferenceMoment(_Lazy):
         }
 
     def _velocity_drawn(self) -> np.ndarray:
-        """(H, W, 2) px/s, in the lens's pixels, at the centres of the flat picture's."""
-        # The lens's pixel of a flat one, in fractions.
+        """Return velocity (H, W, 2), px/s in pixels of the lens, at the pixel centres of the flat picture."""
+        # Position in the lens of each flat pixel, px.
         xy = self.seen.camera.project(self.scene.camera.rays(self._places.astype(np.float64)))
         hits = casting.cast(self.seen, self.when.t_ns, xy.reshape(-1, 2))
         return np.nan_to_num(casting.velocity(self.seen, hits)).reshape(xy.shape)
@@ -360,11 +364,11 @@ class ReferenceMoment(_Lazy):
         part: Part,
         on: np.ndarray,
     ) -> None:
-        """Write the position on a part of the pixels ``on``, and the albedo read there."""
+        """Write the texture coordinates of the pixels ``on`` of a part, and the albedo there."""
         scene, mesh, material = self.scene, part.mesh, part.material
         corners = mesh.faces[frame.triangle[on]]
         pose = casting.relative_pose_at(scene, thing, frame.t_ns)
-        # In the camera's axes, as the shape is at this time.
+        # In the axes of the camera, with the shape at this time.
         points = casting.vertices_at(mesh, frame.t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
         out["needles"][on] = needles(points, scene.camera)
         if material.texture is not None:  # otherwise the GPU has no coordinates either
@@ -381,7 +385,7 @@ class ReferenceMoment(_Lazy):
     def _light_up(
         self, out: dict[str, np.ndarray], frame: reference.ReferenceFrame, part: Part, on: np.ndarray
     ) -> None:
-        """Write the light of the pixels ``on`` of a part, whose albedo is known, and its terms."""
+        """Write the light of the pixels ``on`` of a part, and its terms. Their albedo must be known."""
         albedo = out["albedo"][on]
         out["lit"][on], out["light"][on], out["shadow"][on] = albedo, 1.0, 1.0
         if part.material.unlit:
@@ -416,11 +420,11 @@ _COMPONENTS = {
     **dict.fromkeys(("uv", "texture_size"), 2),
     **dict.fromkeys(("levels", "albedo", "mirrored", "emission", "lit"), 3),
 }
-"""Of what :meth:`ReferenceMoment._surface` makes; 0: (H, W)."""
+"""Channels of the buffers of :meth:`ReferenceMoment._surface`; 0: (H, W)."""
 
 
 def open_reference(subject: Subject, when: When, maps: tuple[ShadowMap, ...] = ()) -> ReferenceMoment:
-    """Return the values that the GPU should write for this subject. maps : of the renderer that draws it."""
+    """Return the reference buffers of a subject. maps : shadow maps of its renderer."""
     return ReferenceMoment(subject.scene, when, subject.config.render.mip_bias, maps)
 
 

@@ -85,12 +85,12 @@ def _mistakes(comparison, name, r, g, on) -> Candidates:
     specific = _SPECIFIC.get(what or name)
     if specific is not None:
         yield from specific(comparison, name, r, g, on)
-    yield ("the pass looks nothing up here" if what in ("uv", "level") else "everything is zero"), np.zeros_like(r)
+    yield ("the pass reads no texture here" if what in ("uv", "level") else "everything is zero"), np.zeros_like(r)
     if what in ("uv", "level"):
         return
     yield "the sign is wrong", -r
     yield "twice the right value (a factor 0.5 is missing)", 2 * r
-    yield "half the right value (a factor 0.5 too many)", r / 2
+    yield "half the right value (one factor 0.5 too many)", r / 2
     if r.ndim == 2 and r.shape[1] == 2:
         yield "the sign of x is wrong", r * [-1, 1]
         yield "the sign of y is wrong", r * [1, -1]
@@ -122,8 +122,8 @@ def _typical(values: np.ndarray) -> np.ndarray:
 
 def _depth(comparison, name, r, g, on) -> Candidates:
     camera = comparison.ref.scene.camera
-    yield f"off by the near plane: near = {camera.near:g} is subtracted", r - camera.near
-    yield f"off by the near plane: near = {camera.near:g} is added", r + camera.near
+    yield f"near = {camera.near:g} is subtracted from the depth", r - camera.near
+    yield f"near = {camera.near:g} is added to the depth", r + camera.near
     yield "window depth near / Z instead of Z", camera.near / r
     y, x = np.nonzero(on)
     rays = camera.rays(np.stack([x, y], axis=1))
@@ -134,7 +134,7 @@ def _depth(comparison, name, r, g, on) -> Candidates:
 
 def _normals(comparison, name, r, g, on) -> Candidates:
     rotation = comparison.ref.scene.camera_path.pose(comparison.gpu.when.t_ns)[:3, :3]
-    yield "not turned into the camera's axes (world axes)", r @ rotation.T
+    yield "in world axes, not in camera axes", r @ rotation.T
     yield "the normal points the other way (not turned towards the camera, or turned twice)", -r
 
 
@@ -154,7 +154,7 @@ def _level(comparison, name, r, g, on) -> Candidates:
     # A driver's own logarithm is up to 0.086 too small.
     bias = round(bias) if abs(bias - round(bias)) < 0.15 else bias
     than = "coarser" if bias > 0 else "finer"
-    yield f"a mip bias of {bias:+g} (levels that are {than} than one texel a pixel)", r + bias
+    yield f"a mip bias of {bias:+g} (levels {than} than one texel per pixel)", r + bias
     yield "always level 0: no mip maps", np.zeros_like(r)
 
 
@@ -178,8 +178,8 @@ def _light(comparison, name, r, g, on) -> Candidates:
 
 
 def _shadow(comparison, name, r, g, on) -> Candidates:
-    yield "no shadow falls", np.ones_like(r)
-    yield "light and shadow are exchanged", 1 - r
+    yield "shadows are missing", np.ones_like(r)
+    yield "lit and shadowed areas are exchanged", 1 - r
 
 
 def _shaded(comparison, name, r, g, on) -> Candidates:
@@ -187,7 +187,7 @@ def _shaded(comparison, name, r, g, on) -> Candidates:
     light = comparison.gpu[f"{name}_light"][on].astype(np.float64)
     albedo, light = (albedo[:, 0], light) if name == "luminance" else (albedo, light[:, None])
     yield "the light is missing (albedo alone)", albedo
-    yield "the light is multiplied twice", albedo * light**2
+    yield "the light is applied twice", albedo * light**2
     yield "the albedo is missing (light alone)", np.broadcast_to(light, r.shape)
     yield "encoded as sRGB: the light is not linear", srgb_from_linear(np.clip(r, 0, 1)).astype(np.float64)
     if (fog := comparison.ref.scene.fog) is not None:
@@ -198,14 +198,14 @@ def _shaded(comparison, name, r, g, on) -> Candidates:
         # Solved for the light before the fog: L' = L T + F (1 - T).
         clear = (r - fog.radiance * (1 - arrives)) / arrives
         yield "the fog is missing", clear
-        yield "fog of the depth, not of the distance", fog.radiance + (clear - fog.radiance) * of_depth
-        yield "fog that hides what should arrive", fog.radiance + (clear - fog.radiance) * (1 - arrives)
+        yield "fog by depth instead of distance", fog.radiance + (clear - fog.radiance) * of_depth
+        yield "transmittance of the fog T is used as 1 - T", fog.radiance + (clear - fog.radiance) * (1 - arrives)
 
 
 def _edges(comparison, name, r, g, on) -> Candidates:
     plain = comparison.gpu[f"{name}_plain"].astype(np.float64)[on]
-    yield "nothing is filtered: the picture is as it was", plain
-    yield "what the lines change has the wrong sign", 2 * plain - r
+    yield "nothing is filtered: the picture is the unfiltered one", plain
+    yield "the correction at contour lines has the wrong sign", 2 * plain - r
 
 
 # ------------------------------------------------------------------------------------------------- motion
@@ -216,7 +216,7 @@ def _motion(comparison, name, r, g, on) -> Candidates:
     yield "in clip units instead of px (0.5 * image_size is missing)", r * 2 / np.array([camera.width, camera.height])
     if name.startswith("velocity"):
         yield "the perspective division is missing (not divided by Z)", r * ref["depth"][on][:, None]
-        yield "per label interval instead of per second", r * gpu.when.interval_s
+        yield "px per label interval instead of px/s", r * gpu.when.interval_s
         return
     way, other = ("forward", "backward") if name == "flow_forward" else ("backward", "forward")
     yield "the perspective division is missing (not divided by Z')", r * ref[f"next_depth_{way}"][on][:, None]

@@ -129,7 +129,7 @@ def test_armature_shape_key_modifiers_camera_and_lights(imported):
     counts = {"meshes": 3, "skins": 1, "cameras": 1, "lights": 2, "animations": 1, "shapes baked frame by frame": 0}
     assert counts.items() <= came.report.counts.items()
     lines = came.report.left_out
-    assert len(lines) == 2 and "area lights in glTF, left out: 'AREA'" in lines[0] and "'Checks'" in lines[1]
+    assert len(lines) == 2 and "glTF has no area lights; left out: 'AREA'" in lines[0] and "'Checks'" in lines[1]
     assert (came.report.cameras, came.report.camera, came.report.frames) == (("Eye",), "Eye", (1, 24))
     assert came.report.duration_s == pytest.approx(23 / 24) and came.report.fps == 24
     lights = came.tree["extensions"]["KHR_lights_punctual"]["lights"]
@@ -191,7 +191,7 @@ def test_base_colours(imported):
     np.testing.assert_allclose(paint["Picture"].texture.image[10, :, 0], np.round(255 * np.arange(64) / 63), atol=1)
     assert paint["Glow"].unlit or max(paint["Glow"].emission) > 0
     (line,) = came.report.left_out
-    assert line.startswith("no plain colour and no picture") and line.endswith(": 'Pattern'")
+    assert line.startswith("materials without a plain colour or image") and line.endswith(": 'Pattern'")
 
 
 # ----------------------------------------------------------------------------------------------------- what cannot come
@@ -201,8 +201,8 @@ def test_what_cannot_come_is_said(imported):
     came = imported("left_out.blend")
     lines = "; ".join(came.report.left_out)
     for words in (
-        "no volumes in glTF, left out: 'Smoke'",
-        "area lights in glTF, left out: 'Panel'",
+        "glTF has no volumes; left out: 'Smoke'",
+        "glTF has no area lights; left out: 'Panel'",
         "no metaballs",
         "'Fish'",
         "'Hairy'",
@@ -214,10 +214,10 @@ def test_what_cannot_come_is_said(imported):
 @pytest.mark.parametrize(
     "name, words",
     [
-        ("keys_and_modifiers", "'Both' has shape keys and modifiers \\(Bevel\\), which glTF has not together"),
-        ("at_vertices", "'Spots' shows others at its vertices or faces; expected real objects"),
-        ("offset", "'One' shows a collection about a point of its own; expected an instance offset of 0"),
-        ("builds", "'Builds' changes how many faces it has"),
+        ("keys_and_modifiers", "'Both' has shape keys and modifiers \\(Bevel\\); glTF cannot store both"),
+        ("at_vertices", "'Spots' has instances at its vertices or faces; expected real objects"),
+        ("offset", "'One' is an instance of a collection with an offset; expected an instance offset of 0"),
+        ("builds", "the number of faces of 'Builds' changes"),
     ],
 )
 def test_what_would_come_wrong_is_refused(scenes, tmp_path, name, words):
@@ -252,8 +252,8 @@ def test_the_users_blender_is_not_asked(scenes, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "name, words",
     [
-        ("empty.blend", "the scene shows no surface; expected a scene with a mesh"),
-        ("nothing_shown.blend", "the scene shows no surface"),
+        ("empty.blend", "the scene has no surface; expected a scene with a rendered mesh"),
+        ("nothing_shown.blend", "the scene has no surface"),
         ("no_blender.blend", "Blender cannot read it"),
         ("future.blend", r"saved by Blender 9\.99, newer than the 4\.5 that would open it"),
         ("short.blend", "Blender cannot read it"),

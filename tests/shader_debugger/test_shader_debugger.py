@@ -166,7 +166,7 @@ def test_a_mistake_in_edges_is_named_and_can_be_probed(shader, config, shaders):
     status, out, _ = shader("diff", config, "--shaders", shaders, *names)
     lines = out.splitlines()
     assert status == 1 and lines[0].startswith("The first that is wrong: luminance, edges (edges.glsl), on ")
-    assert "it looks as if: what the lines change has the wrong sign" in lines[1]
+    assert "it looks as if: the correction at contour lines has the wrong sign" in lines[1]
     pixel = re.search(r"1 of 2 buffers are over their tolerance; look closer with: probe --pixel (\d+,\d+)", out)[1]
     status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", pixel)
     assert status == 0 and any(line.startswith("!! luminance, edges") for line in out.splitlines())
@@ -249,7 +249,7 @@ def test_diff_of_the_shipped_shaders_is_clean(shader, config, tmp_path):
 EXPECTED = {
     "sign of the flow": ("flow_forward", "the sign is wrong", "forward flow"),
     "no perspective division": ("flow_forward", "the perspective division is missing", "forward flow"),
-    "depth off by near": ("depth", "off by the near plane: near = 0.05 is subtracted", "depth"),
+    "depth off by near": ("depth", "near = 0.05 is subtracted from the depth", "depth"),
 }
 
 

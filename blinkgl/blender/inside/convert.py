@@ -1,13 +1,13 @@
-"""What Blender runs for ``blinkgl import``: opens a file and exports it by Blender's own exporter of glTF.
+"""The program that Blender runs for ``blinkgl import``: opens a file and exports it by Blender's exporter of glTF.
 
     python convert.py FOLDER        FOLDER/job.json in; FOLDER/scene.glb out
 
-A program of Blender's side: it needs nothing but ``bpy`` and NumPy and imports nothing of BlinkGL (Blender is GPL).
+It needs only ``bpy`` and NumPy and imports nothing of BlinkGL, since Blender is GPL.
 job.json: source (absolute path), shown (as the user wrote it), scene (name or null), frames ([first, last] or null),
 fps (or null), keys_per_frame, clips. ``blinkgl.blender.importing`` writes it.
 
-Standard output carries one JSON object per line: ``{"blender"}``, ``{"doing"}`` as it goes on, ``{"report"}`` when
-scene.glb is whole, or ``{"error", "where", "accepted"}``. What Blender itself prints goes to standard error.
+Standard output has one JSON object per line: ``{"blender"}``, ``{"doing"}`` for progress, ``{"report"}`` when scene.glb
+is complete, or ``{"error", "where", "accepted"}``. Blender's own output goes to standard error.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def set_clock(scene: Any, frames: list[int] | None, per: int) -> dict:
     new = render.frame_map_new // common * per
     if last < first or (last - first) * per > MOST_FRAMES or new > 900 or render.fps * per > 32767:
         raise Refused(
-            f"frames {first} to {last} with {per} keys each cannot be written down",
+            f"frames {first} to {last} with {per} keys each are too many",
             f"--frames FIRST LAST, at most {MOST_FRAMES} keys, or fewer --keys-per-frame",
         )
     render.frame_map_old, render.frame_map_new = render.frame_map_old // common, new
@@ -125,7 +125,7 @@ def set_clock(scene: Any, frames: list[int] | None, per: int) -> dict:
     return {"first": first, "last": last, "fps": fps, "duration_s": (last - first) / fps}
 
 
-# --- what glTF cannot say ---------------------------------------------------------------------------------------------
+# --- what glTF cannot store -------------------------------------------------------------------------------------------
 
 
 def rendered(bpy: Any) -> list[Any]:
@@ -144,16 +144,16 @@ def check(things: list[Any]) -> None:
     for thing in things:
         if thing.instance_type in ("VERTS", "FACES"):
             raise Refused(
-                f"'{thing.name}' shows others at its vertices or faces", "real objects (Apply > Make Instances Real)"
+                f"'{thing.name}' has instances at its vertices or faces", "real objects (Apply > Make Instances Real)"
             )
         shown = thing.instance_collection if thing.instance_type == "COLLECTION" else None
         if shown is not None and any(shown.instance_offset):
-            raise Refused(f"'{thing.name}' shows a collection about a point of its own", "an instance offset of 0")
+            raise Refused(f"'{thing.name}' is an instance of a collection with an offset", "an instance offset of 0")
         others = [m for m in active_modifiers(thing) if m.type != "ARMATURE"]
         if others and thing.type == "MESH" and thing.data.shape_keys is not None:
             raise Refused(
-                f"'{thing.name}' has shape keys and modifiers ({others[0].name}), which glTF has not together",
-                "modifiers that are applied, or no shape keys",
+                f"'{thing.name}' has shape keys and modifiers ({others[0].name}); glTF cannot store both",
+                "applied modifiers, or no shape keys",
             )
 
 
@@ -193,9 +193,7 @@ def bake_shapes(bpy: Any, things: list[Any]) -> list[str]:
             places = np.empty((len(mesh.vertices), 3), np.float32)
             mesh.vertices.foreach_get("co", places.ravel())
             if len(mesh.polygons) != faces.setdefault(thing, len(mesh.polygons)):
-                raise Refused(
-                    f"'{thing.name}' changes how many faces it has", "a shape of the same faces in all frames"
-                )
+                raise Refused(f"the number of faces of '{thing.name}' changes", "the same faces in all frames")
             shown.to_mesh_clear()
             if not shapes or len(shapes) <= MOST_SHAPES or changed(shapes[0], places):
                 shapes.append(places)
@@ -219,8 +217,8 @@ def as_shape_keys(thing: Any, mesh: Any, shapes: list[np.ndarray], first: int) -
     """Create one shape key per frame, linearly interpolated. Refused: too many frames."""
     if len(shapes) > MOST_SHAPES:
         raise Refused(
-            f"'{thing.name}' changes its shape for more than {MOST_SHAPES} frames",
-            "--frames FIRST LAST, a shorter part",
+            f"the shape of '{thing.name}' changes for more than {MOST_SHAPES} frames",
+            "a shorter part: --frames FIRST LAST",
         )
     thing.modifiers.clear()
     thing.data = mesh
@@ -243,21 +241,23 @@ def left_out(bpy: Any, things: list[Any]) -> list[str]:
     lines = []
     for kind, words in UNKNOWN.items():
         if found := [thing for thing in things if thing.type == kind]:
-            lines.append(f"no {words} in glTF, left out: {names(found)}")
+            lines.append(f"glTF has no {words}; left out: {names(found)}")
     if lamps := [thing for thing in things if thing.type == "LIGHT" and thing.data.type == "AREA"]:
-        lines.append(f"no area lights in glTF, left out: {names(lamps)}")
+        lines.append(f"glTF has no area lights; left out: {names(lamps)}")
     if wide := [thing for thing in things if thing.type == "CAMERA" and thing.data.type == "PANO"]:
-        lines.append(f"no panoramic cameras in glTF, left out: {names(wide)}")
+        lines.append(f"glTF has no panoramic cameras; left out: {names(wide)}")
     if hairy := [thing for thing in things if getattr(thing, "particle_systems", None)]:
-        lines.append(f"particles and hair left out: of {names(hairy)}")
+        lines.append(f"particles and hair are left out: {names(hairy)}")
     used = {slot.material for thing in things for slot in thing.material_slots if slot.material is not None}
     if odd := sorted((m for m in used if not has_plain_colour(m)), key=lambda m: m.name):
-        lines.append(f"no plain colour and no picture (bake them in Blender), not as they look there: {names(odd, 8)}")
+        lines.append(
+            f"materials without a plain colour or image look different (bake them in Blender): {names(odd, 8)}"
+        )
     pictures = [i for i in bpy.data.images if i.source == "FILE" and not i.packed_file and i.users]
     if gone := [i for i in pictures if not os.path.isfile(bpy.path.abspath(i.filepath))]:
-        lines.append(f"pictures that are not there: {names(gone)}")
+        lines.append(f"missing images: {names(gone)}")
     if libraries := [one for one in bpy.data.libraries if not os.path.isfile(bpy.path.abspath(one.filepath))]:
-        lines.append(f"linked libraries that are not there: {names(libraries)}")
+        lines.append(f"missing linked libraries: {names(libraries)}")
     return lines
 
 
@@ -346,12 +346,12 @@ def run(bpy: Any, job: dict, out: Path, say: Any) -> dict:
     check(things)
     realize(bpy, things)
     clock = set_clock(scene, job["frames"], job["keys_per_frame"])
-    say(doing="looking at its shapes")
+    say(doing="checking shapes")
     baked = bake_shapes(bpy, things)
     say(doing="writing the GLB")
     found = counts(export(bpy, out, job["clips"]))
     if not found["meshes"] and not any(thing.type == "ARMATURE" for thing in things):  # a clip for another's figure
-        raise Refused("the scene shows no surface", "a scene with a mesh that has faces and is rendered")
+        raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
     cameras = [thing for thing in things if thing.type == "CAMERA" and thing.data.type != "PANO"]
     return {
         "blender": bpy.app.version_string,

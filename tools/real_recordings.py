@@ -1,7 +1,8 @@
 """How well does a network, or a method, tell the motion in recordings of cameras?
 
     python -m blinkgl.tools.real_recordings real_small contrast-affine --recordings ../shared/data/events
-    python -m blinkgl.tools.real_recordings real_small contrast-affine --recordings ../shared/data/events --bursts
+    python -m blinkgl.tools.real_recordings real_small contrast-affine --recordings ../shared/data/events --bursts \\
+        --sets out/independent/test
 
 The first line is for choosing: of every recording but the two bursts with ground truth, up to ``--windows`` pairs of
 windows, evenly spaced, of a length over which contrast maximisation's translation says about five px (the same windows
@@ -19,7 +20,8 @@ image's x axis: ``x`` is the share of its flow along it.
 The second line is for judging, and to be used seldom: the bursts' flow is known. AEE and cosine of the whole burst as
 one window and (``halves``) of its second half, behind its first, beside zero flow's and the best constant and affine
 flow (which know the truth); at pixels with events, and over all. ``NAME+sharp`` is a network whose flow is as long as
-makes the events sharpest, which is what `eflow predict` gives.
+makes the events sharpest, which is what `eflow predict` gives. ``--sets`` adds the same table for data sets with labels
+(configs/eflow/independent_data.yaml is one): means over up to ``--windows`` samples of each, evenly spaced.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ from blinkgl.io.formats import open_events
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
+from eflow.data.sources import open_source
 from eflow.data.window import Window
 from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
 from eflow.methods.iwe import flow_warp_loss
@@ -178,14 +181,7 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
     valid = np.isfinite(truth).all(-1)
     hit = np.zeros_like(valid)
     hit[events.y, events.x] = True
-    v, u = np.mgrid[:height, :width]
-    basis = np.stack([np.ones_like(u), u, v], -1).astype(np.float64)
-    fit = np.linalg.lstsq(basis[valid], truth[valid], rcond=None)[0]
-    flows = {
-        "zero": np.zeros_like(truth),
-        "best constant": np.broadcast_to(np.median(truth[valid], 0), truth.shape),
-        "best affine": basis @ fit,
-    }
+    flows = best_of(truth, valid)
     nothing = events.x[:0], events.y[:0], events.t[:0], events.p[:0]
     for name in names:
         if name in METHODS:
@@ -202,21 +198,57 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
         if "old" not in model.reads:
             flows[name] = predictor(StreamWindow(t0, Window(*nothing, t0 - (t1 - t0), t0), whole))[0]
         flows[f"{name}, halves"] = predictor(halves)[0] * ((t1 - t0) / (t1 - middle))
-    rows = {}
-    for name, flow in flows.items():
-        row = {}
-        for where, mask in (("events", valid & hit), ("all", valid)):
-            mine, its = np.asarray(flow, np.float64)[mask], truth[mask]
-            error, size = np.hypot(*(mine - its).T).mean(), np.hypot(*its.T)
-            length = np.hypot(*mine.T)
-            row |= {
-                f"aee_{where}": float(error),
-                f"of_zero_{where}": float(error / size.mean()),
-                f"cosine_{where}": float(((mine * its).sum(1) / np.maximum(length * size, 1e-9)).mean()),
-                f"length_{where}": float(length.sum() / size.sum()),
-            }
-        rows[name] = row
-    return rows
+    return {name: row_of([(np.asarray(flow, np.float64), truth, valid, hit)]) for name, flow in flows.items()}
+
+
+def best_of(truth: np.ndarray, valid: np.ndarray) -> dict[str, np.ndarray]:
+    """Zero flow, and the best constant and affine flow, which know the truth (H, W, 2)."""
+    v, u = np.mgrid[: truth.shape[0], : truth.shape[1]]
+    basis = np.stack([np.ones_like(u), u, v], -1).astype(np.float64)
+    fit = np.linalg.lstsq(basis[valid], truth[valid], rcond=None)[0]
+    return {
+        "zero": np.zeros_like(truth),
+        "best constant": np.broadcast_to(np.median(truth[valid], 0), truth.shape),
+        "best affine": basis @ fit,
+    }
+
+
+def row_of(judged: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, float]:
+    """AEE, its share of zero flow's, cosine and length of (flow, truth, valid, pixels with events) of samples: means
+    over samples, at pixels with events and over all."""
+    row: dict[str, float] = {}
+    for where in ("events", "all"):
+        sums = []
+        for flow, truth, valid, hit in judged:
+            mask = valid & hit if where == "events" else valid
+            if not mask.any():
+                continue
+            mine, its = flow[mask], truth[mask]
+            size, length = np.hypot(*its.T), np.hypot(*mine.T)
+            cosine = ((mine * its).sum(1) / np.maximum(length * size, 1e-9)).mean()
+            sums.append((np.hypot(*(mine - its).T).mean(), size.mean(), cosine, length.mean()))
+        error, size, cosine, length = np.mean(sums, axis=0)
+        row |= {f"aee_{where}": error, f"of_zero_{where}": error / size}
+        row |= {f"cosine_{where}": cosine, f"length_{where}": length / size}
+    return {key: float(value) for key, value in row.items()}
+
+
+def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float]]:
+    """The same of a data set with labels: its samples as pairs of windows, at most ``most``, evenly spaced."""
+    source = open_source(path)
+    answers: dict[str, Answer] = {}
+    judged: dict[str, list] = {}
+    for i in np.unique(np.linspace(0, len(source) - 1, most).round().astype(int)):
+        s = source[int(i)]
+        if s.flow is None or s.valid is None or not s.valid.any():
+            continue
+        for name in names:
+            answers.setdefault(name, answer_of(name, s.height, s.width))
+        pair, truth = StreamWindow(s.new.t0, s.old, s.new), s.flow.astype(np.float64)
+        flows = best_of(truth, s.valid) | {name: answer(pair) for name, answer in answers.items()}
+        for name, flow in flows.items():
+            judged.setdefault(name, []).append((np.asarray(flow, np.float64), truth, s.valid, s.hit))
+    return {name: row_of(rows) for name, rows in judged.items()}
 
 
 def table(title: str, heads: list[str], rows: list[list[Any]]) -> str:
@@ -230,17 +262,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("answers", nargs="+", help=f"checkpoints, packaged networks, or {', '.join(METHODS)}")
     parser.add_argument("--recordings", type=Path, required=True)
-    parser.add_argument("--windows", type=int, default=12, help="of a recording, at most")
+    parser.add_argument("--windows", type=int, default=12, help="of a recording or a set, at most")
     parser.add_argument("--bursts", action="store_true", help=f"the recordings of {TEST}, whose flow is known")
+    parser.add_argument("--sets", type=Path, nargs="*", default=[], help="data sets with labels, with --bursts")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     console, found = plain_console(), {}
     if a.bursts:
-        for folder in sorted((a.recordings / TEST).iterdir()):
-            rows = found[folder.name] = burst(folder, a.answers)
+        known = {folder.name: burst(folder, a.answers) for folder in sorted((a.recordings / TEST).iterdir())}
+        known |= {path.as_posix(): of_set(path, a.answers, a.windows) for path in a.sets}
+        for title, rows in known.items():
+            found[title] = rows
             keys = [f"{what}_{where}" for where in ("events", "all") for what in ("aee", "of_zero", "cosine", "length")]
             heads = [key.replace("_", " ") for key in keys]
-            say(console, table(folder.name, heads, [[n, *(row[k] for k in keys)] for n, row in rows.items()]) + "\n")
+            say(console, table(title, heads, [[n, *(row[k] for k in keys)] for n, row in rows.items()]) + "\n")
     else:
         for path in recordings(a.recordings):
             name = path.relative_to(a.recordings).as_posix()

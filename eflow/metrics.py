@@ -161,6 +161,6 @@ def pixel_error(predicted: Tensor, target: Tensor, loss: LossConfig) -> Tensor:
         length = ((predicted**2).sum(1) + 1e-6).sqrt()
         total = (
             total
-            + loss.length * (torch.log(length + loss.knee) - torch.log(target.norm(dim=1) + loss.knee)).abs()
+            + loss.length * (torch.log(length + loss.knee) - torch.log((target**2).sum(1).sqrt() + loss.knee)).abs()
         )
     return total

@@ -323,7 +323,7 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
     )
     with torch.no_grad():
         valid = batch["valid"]
-        error = (prediction.flow - torch.where(valid[:, None], batch["flow"], 0)).norm(dim=1)
+        error = (prediction.flow - torch.where(valid[:, None], batch["flow"], 0)).square().sum(1).sqrt()
         epe = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
     return loss, epe, prediction.flow.detach()
 

@@ -211,3 +211,14 @@ def test_constraints_pin_what_setup_cfg_asks_for():
         requirement = Requirement(line)
         assert key(requirement.name) in pins, f"{line} has no pin"
         assert requirement.specifier.contains(pins[key(requirement.name)]), line
+
+
+def test_the_container_copies_what_its_context_has_and_installs_what_setup_does():
+    lines = (REPOSITORY / "Dockerfile").read_text().splitlines()
+    kept = {line[1:] for line in (REPOSITORY / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    copied = {source for line in lines if line.startswith("COPY") for source in line.split()[1:-1]}
+    assert copied == kept and all((REPOSITORY / source).exists() for source in copied)
+    (apt,) = (line for line in lines if "apt-get install" in line)
+    installed = set(apt.split("--no-install-recommends ")[1].split(" && ")[0].split())
+    setup = (REPOSITORY / "tools/setup.sh").read_text()
+    assert installed == set(re.findall(r"\b(?:python3|python3-venv|lib(?:egl|gl|os)[\w-]*)\b(?= |\")", setup))

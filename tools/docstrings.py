@@ -101,3 +101,8 @@ class Docstrings(griffe.Extension):
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:
             obj.docstring.value = markdown(obj.docstring.value)
+
+    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+        # The root of a package is no object of another one, so the hook above does not see it.
+        if pkg.docstring is not None:
+            pkg.docstring.value = markdown(pkg.docstring.value)

@@ -227,7 +227,7 @@ def row_of(judged: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) 
             size, length = np.hypot(*its.T), np.hypot(*mine.T)
             cosine = ((mine * its).sum(1) / np.maximum(length * size, 1e-9)).mean()
             sums.append((np.hypot(*(mine - its).T).mean(), size.mean(), cosine, length.mean()))
-        error, size, cosine, length = np.mean(sums, axis=0)
+        error, size, cosine, length = np.mean(sums, axis=0) if sums else [np.nan] * 4
         row |= {f"aee_{where}": error, f"of_zero_{where}": error / size}
         row |= {f"cosine_{where}": cosine, f"length_{where}": length / size}
     return {key: float(value) for key, value in row.items()}
@@ -248,6 +248,8 @@ def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float
         flows = best_of(truth, s.valid) | {name: answer(pair) for name, answer in answers.items()}
         for name, flow in flows.items():
             judged.setdefault(name, []).append((np.asarray(flow, np.float64), truth, s.valid, s.hit))
+    if not judged:
+        raise BlinkGLError("no labelled sample", where=str(path))
     return {name: row_of(rows) for name, rows in judged.items()}
 
 
@@ -267,10 +269,15 @@ def main() -> None:
     parser.add_argument("--sets", type=Path, nargs="*", default=[], help="data sets with labels, with --bursts")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
+    if a.sets and not a.bursts:
+        parser.error("--sets: needs --bursts")
     console, found = plain_console(), {}
     if a.bursts:
         known = {folder.name: burst(folder, a.answers) for folder in sorted((a.recordings / TEST).iterdir())}
-        known |= {path.as_posix(): of_set(path, a.answers, a.windows) for path in a.sets}
+        try:
+            known |= {path.as_posix(): of_set(path, a.answers, a.windows) for path in a.sets}
+        except BlinkGLError as error:
+            parser.error(str(error))
         for title, rows in known.items():
             found[title] = rows
             keys = [f"{what}_{where}" for where in ("events", "all") for what in ("aee", "of_zero", "cosine", "length")]

@@ -6,7 +6,7 @@ Start: cli.py (the commands), then session.py:
 
     session.py    the scene of a generation run at one time; the shader folder; the OpenGL context
     moments.py    every buffer at that time, from the GPU and from the float64 reference, by the same names
-    twins.py      float64 versions of the filter of `edges` and of the image behind a lens
+    twins.py      float64 references of pictures made from pictures: `edges`, and the image of a lens
     lamps.py      shadow maps in float64 and their tolerance; soft shadows
     quantities.py the error measure and the tolerance of each buffer
     compare.py    comparison of the two, and the pixels that differ

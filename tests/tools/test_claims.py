@@ -27,12 +27,8 @@ def test_every_claim_stands_on_its_page():
 
 def test_every_guide_has_claims():
     made = {"commands", "configuration", "eflow_configuration", "benchmarks", "peers", "python", "rooms", "changelog"}
-    without = {
-        "examples",
-        "alternatives",
-        "learning",
-        "results_eflow",
-    }  # programs, opinions, tables with their commands
+    # Programs, opinions, and tables that name their commands.
+    without = {"examples", "alternatives", "learning", "results_eflow"}
     guides = {p.stem for p in (ROOT / "docs").glob("*.md") if not p.stem.startswith("room_")} - made - without
     assert guides == {Path(page).stem for page, *_ in LINES if page != "README.md"}
 

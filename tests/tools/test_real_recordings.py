@@ -1,10 +1,13 @@
 """The table of `real_recordings --bursts --sets`: errors of known flow."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
+from blinkgl.errors import BlinkGLError
 from blinkgl.tools import real_recordings as rr
 from eflow.data.window import RawSample, Window
 
@@ -50,3 +53,9 @@ def test_pixels_with_events_are_judged_by_themselves(two):
     assert 1 < two["half"]["length_all"] < 2 and two["half"]["cosine_all"] == pytest.approx(1)
     # Of the valid pixels seven columns of eight are twice as long as the truth.
     assert 0 < two["half"]["of_zero_all"] == pytest.approx(two["half"]["length_all"] - 1)
+
+
+def test_a_set_without_labels_is_one_line(monkeypatch):
+    monkeypatch.setattr(rr, "open_source", lambda path: [replace(sample(np.ones((6, 8, 2))), flow=None, valid=None)])
+    with pytest.raises(BlinkGLError, match="nowhere: no labelled sample"):
+        rr.of_set("nowhere", [], 2)

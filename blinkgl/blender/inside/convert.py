@@ -116,7 +116,7 @@ def set_clock(scene: Any, frames: list[int] | None, per: int) -> dict:
     new = render.frame_map_new // common * per
     if last < first or (last - first) * per > MOST_FRAMES or new > 900 or render.fps * per > 32767:
         raise Refused(
-            f"frames {first} to {last} with {per} keys each are too many",
+            f"frames {first} to {last} with {per} keys each cannot be exported",
             f"--frames FIRST LAST, at most {MOST_FRAMES} keys, or fewer --keys-per-frame",
         )
     render.frame_map_old, render.frame_map_new = render.frame_map_old // common, new

@@ -67,6 +67,7 @@ class Radtan(DistortedModel):
             ],
             axis=-1,
         )
+        # The derivative is symmetric: both parts of the distortion are gradients.
         cross = 2 * (x * y * slope + self.p1 * x + self.p2 * y)
         D = np.empty((len(u), 2, 2))
         D[:, 0, 0] = ratio + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
@@ -140,6 +141,8 @@ class Radtan(DistortedModel):
         xy = np.asarray(xy, np.float64)
         u = self.rays(xy).reshape(-1, 3)[:, :2]
         D = self._distort(u)[1]
+        # Cramer's rule: a nan, where there is no ray, passes through, while np.linalg.inv would refuse a singular
+        # matrix.
         inverse = np.stack([D[:, 1, 1], -D[:, 0, 1], -D[:, 1, 0], D[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
         inverse /= (D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0])[:, None, None]
         out = np.concatenate([inverse / [self.fx, self.fy], 0.0 * inverse[:, :1]], axis=1)

@@ -118,6 +118,7 @@ def _bursts(t: np.ndarray, window: float) -> np.ndarray:
     them."""
     parts = WINDOWS * _BURST
     count = np.bincount(np.minimum((t / window * _BURST).astype(np.int64), parts - 1), minlength=parts).astype(float)
+    # A mean over half a window: slower changes of the rate are motion, not bursts.
     usual = np.convolve(count, np.full(_BURST // 2 + 1, 1 / (_BURST // 2 + 1)), "same")
     return np.log((count + 1) / (usual + 1))
 
@@ -125,6 +126,9 @@ def _bursts(t: np.ndarray, window: float) -> np.ndarray:
 @kernel
 def _of_pixels(x, y, t, p, window, size, sums):
     """Compute sums over each pixel's own events in a patch."""
+    # 0, 1: ON, OFF events; 2: turns of polarity; 3: pairs of successive events; 4: sum of their ln intervals; 5: short
+    # ones; 6: pixels that fired; 7: most events of a pixel; 8: sum of 1 + 2 + … n over pixels; 9: turns to ON; 10, 11:
+    # ln intervals before turns to ON, to OFF; 12: runs of three of one polarity; 13: growing less shrinking intervals.
     last = np.full(size, -1, np.int64)
     before = np.zeros(size, np.uint8)
     gap_before = np.full(size, -1, np.int64)  # of one polarity; -1: the event before was of the other, or the first
@@ -137,6 +141,7 @@ def _of_pixels(x, y, t, p, window, size, sums):
         s[0 if p[i] else 1] += 1
         gap = t[i] - last[at] if last[at] >= 0 else -1
         turn = p[i] != before[at]
+        # The first event of a pixel in a window has no interval: it would reach into another window.
         if seen[at] != k:
             seen[at], count[at] = k, 0
             s[6] += 1
@@ -162,6 +167,8 @@ def _of_pixels(x, y, t, p, window, size, sums):
 @kernel
 def _of_neighbours(x, y, t, p, window, size, sums):
     """Compute sums over the preceding events of the eight pixels around each event."""
+    # 0: events with company; 1, 2: neighbours inside the patch, and those linked (the same polarity, half a window ago
+    # at most); 3, 4: the same across its border; 5: links; 6, 7: sums of their steps to the right, down.
     height, width = size
     last = np.full(size, -1, np.int64)
     before = np.zeros(size, np.uint8)

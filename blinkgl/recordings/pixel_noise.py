@@ -142,6 +142,7 @@ def fit_pixels_of(
     say("counts of pixels", 0.8)
     if answered.likelihood - hot.likelihood < WORTH:
         answered = hot
+    # Without hot pixels, answers are tried alone: each of the two must be worth it by itself.
     if hot.likelihood - plain.likelihood < WORTH:
         alone = law.fit(False, True, plain.at)
         answered = alone if alone.likelihood - plain.likelihood >= WORTH else plain
@@ -174,6 +175,7 @@ def fit_pixels_of(
     say("judging", 0.9)
     noise = PixelNoise(config, height, width, seed + 1)
     noise.step(Events.empty(), 0)
+    # As long as the half that was not fitted, with another seed: the law is judged, not its draws.
     made = noise.step(Events.empty(), t1 - middle)
     made = made.part(looked[made.y.astype(np.int64) * width + made.x])
     ours, theirs = (
@@ -225,6 +227,7 @@ def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: floa
     """(median s, spread in decades) of a log-normal law of the time to an answer: by maximum likelihood from pixels
     with two events of opposite polarity, of which a share are two by chance. And the share of them that begin ON."""
     pairs = counts[pixel] == 2
+    # Sorted by pixel, the two events of each are neighbours.
     order = np.lexsort((events.t[pairs], pixel[pairs]))
     t, p = events.t[pairs][order].reshape(-1, 2), events.p[pairs][order].reshape(-1, 2)
     opposite = p[:, 0] != p[:, 1]
@@ -238,6 +241,8 @@ def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: floa
         pdf = lambda x: np.exp(-0.5 * ((x - median) / spread) ** 2) / spread
         whole = np.trapezoid(pdf(grid) * (1 - np.exp(grid) / seconds), grid)
         room = np.maximum(1 - gap / seconds, 1e-9)
+        # The law of ln(delay) becomes one of the delay by 1 / gap. Both events must be within the recording, which
+        # for two independent ones gives the triangular law 2 (1 - gap / T) / T.
         density = (1 - chance) * pdf(np.log(gap)) * room / max(whole, 1e-12) / gap + chance * 2 * room / seconds
         return -float(np.log(np.maximum(density, 1e-300)).sum())
 
@@ -257,6 +262,7 @@ def _preferences(
         return {"hot_on_share": float(on.sum() / max(n.sum(), 1)) if len(n) else 0.5}, {}
     logit = np.linspace(-15, 15, 1201)  # a step of 0.025: a pixel of 1,000 events tells its own to 0.06
     chances = on[:, None] * log_expit(logit) + (n - on)[:, None] * log_expit(-logit)
+    # Products of a thousand chances underflow. Each pixel's largest becomes 1, which moves no maximum.
     chances = np.exp(chances - chances.max(axis=1, keepdims=True))
 
     def loss(at: np.ndarray) -> float:
@@ -277,6 +283,7 @@ def _preferences(
 def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: float) -> float:
     """Return the dead time of a pixel after an event, s: a low percentile of the intervals of the most active pixels,
     if no shorter ones are expected; 0 where no pixel is active enough."""
+    # Only pixels that fire nearly without a pause show the shortest possible interval.
     busy = counts >= max(100, 0.3 * counts.max())
     inside = busy[pixel]
     order = np.lexsort((events.t[inside], pixel[inside]))
@@ -284,7 +291,7 @@ def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: f
     if len(gap) < 200:
         return 0.0
     low = float(np.percentile(gap, 2))
-    # By chance alone two of a hundred exponential intervals are below a fiftieth of their mean.
+    # By chance alone, two of a hundred exponential intervals are below a fiftieth of their mean.
     return low if low > 5 * 0.02 * gap.mean() else 0.0
 
 
@@ -316,6 +323,7 @@ class _Counts:
         self._seconds, self._dead = seconds, dead
         top = max(int(counts.max()), _EXACT) + 1
         decades = int(np.ceil(_PER_DECADE * np.log10(top / _EXACT))) + 1
+        # Hot pixels have up to millions of events; bins of equal ratio keep the table small.
         edges = _EXACT * 10 ** (np.arange(decades + 1) / _PER_DECADE)
         self._edges = np.concatenate([np.arange(_EXACT + 1), edges[1:]]) + 0.5
         """upper ends of the bins; the last one is open"""
@@ -336,12 +344,16 @@ class _Counts:
         if number in self._kept:
             return self._kept[number]
         q = number / _SHARES
+        # A pixel that sleeps after each event fires 1 / (1 / rate + dead) times a second.
         mean = np.exp(_GRID) / (1 + np.exp(_GRID) * self._dead / self._seconds)
         k = np.arange(_EXACT + 1)
+        # Of m events m / (1 + q) are noise, and the others answers to it, at most one to each.
         few = poisson.pmf(k[None, :], mean[:, None] / (1 + q))
         if q > 0:
             few = few @ binom.pmf(k[None, :] - k[:, None], k[:, None], q)
         asleep = mean * self._dead / self._seconds
+        # A normal law does for more than _EXACT events. Noise with its answers comes in ones and twos, so the
+        # variance is m / (1 + q) E[n²], and E[n²] = 1 + 3q.
         deviation = np.sqrt(mean * (1 + 3 * q) / (1 + q)) * np.maximum(1 - asleep, 1e-2)
         above = ndtr((self._edges[None, _EXACT:] - mean[:, None]) / deviation[:, None])
         many = np.diff(above, axis=1, append=1.0)
@@ -386,6 +398,7 @@ class _Counts:
 
         def loss(at: np.ndarray) -> float:
             if np.abs(at).max() > 40:
+                # The simplex may wander to where exp() overflows; this turns it back.
                 return 1e300
             v = read(at)
             chances = np.sum(self._chances(v), axis=0)
@@ -396,6 +409,8 @@ class _Counts:
         starts = [] if before is None else [before]
         for below, spread in ((1.0, -1.5), (5.0, -0.5)) if before is None else ():
             rate = np.log(max(self._mean, 1e-6) / self._seconds) - below
+            # Few pixels have most of the events, so the median rate is far below the mean. A first guess of hot ones:
+            # 0.25 % of the pixels, nearly alike, as busy as the busiest thousandth.
             starts.append(np.array([rate, spread, *((-6.0, tail, -2.0) if hot else ())]))
         for start in starts:
             start = np.append(start, 0.0) if answers else start
@@ -409,6 +424,7 @@ class _Counts:
         for d in np.diag(deviations):
             apart = read(best + d), read(best - d)
             step |= {key: abs(apart[0][key] - apart[1][key]) / 2 for key in values if apart[0][key] != apart[1][key]}
+        # The two laws have no order of their own: the busier one is called hot.
         if hot and values["hot_rate_hz"] < values["rate_hz"]:
             for table in (values, step):
                 for key in ("rate_hz", "spread_decades"):

@@ -39,15 +39,18 @@ class Sums:
     """Of the intervals [first, stop) of a clip; the first axis is the group. What lies in a burst that the camera's
     frames set off is left out on both sides.
 
-    rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.   lights : (G, 8, 2), by
-    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity, where
-    no burst set off either.   counts : (G, C) pixels and
-    intervals by number of events.   still, still_counts : (G, 2), (G, C) of pixels that saw none, over all intervals.
-    products : (G, 3) sums of a*b, a*a, b*b of polarity sums with the recording's.   pixels : (G, 2) that moved, and
-    did not.   polarity : (K, H*W) float32, polarity sums,
-    blurred by a pixel.   both : (H*W,) a pixel's events.   alike : (G, 6) pixels and sums of a, b, a*b, a*a, b*b of
-    these with the recording's.   looks : (G, 2 F + 1) of the recording's patches that are not all but empty: their
-    number, sums and sums of squares of what is told of them."""
+    rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.
+    lights : (G, 8, 2) the same by brightness.
+    isi : (G, 2, bins) intervals between a pixel's events without a burst between them, by whether the second event is
+    of the other polarity.
+    counts : (G, C) pixels and intervals by number of events.
+    still, still_counts : (G, 2), (G, C) of pixels that saw no change, over all intervals.
+    products : (G, 3) sums of a*b, a*a, b*b of polarity sums a with the recording's b.
+    pixels : (G, 2) number of pixels that saw a change, and that did not.
+    polarity : (K, H*W) float32, polarity sums, blurred by a pixel.   both : (H*W,) a pixel's events.
+    alike : (G, 6) pixels and sums of a, b, a*b, a*a, b*b of ``both`` with the recording's.
+    looks : (G, 2 F + 1) of the recording's patches with enough events: their number, and sums and sums of squares of
+    their F features (:mod:`~blinkgl.recordings.patches`).   full : (T, Y, X) bool, these patches."""
 
     rates: np.ndarray
     lights: np.ndarray
@@ -89,6 +92,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     used, still = clip.used.ravel(), clip.still.ravel()
     moving = used & ~still
     on_group = np.where(moving, group, GROUPS)
+    # Group GROUPS is the bin of the pixels that do not count; _by drops it.
     per_pixel = total.sum(axis=2)
     rates = np.stack([_by(on_group, total[k, :, p]) for k in range(count) for p in (0, 1)], 1).reshape(GROUPS, count, 2)
     both = total.sum(axis=0, dtype=np.int64)
@@ -110,6 +114,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
         ],
         1,
     )
+    # Sums of products, not correlations, since only sums can be added over groups, and without one of them.
     pixels = np.stack([_by(on_group, np.ones(len(group))), _by(np.where(still, group, GROUPS), np.ones(len(group)))], 1)
     seconds = np.diff(clip.edges_us[first : stop + 1]) * 1e-6
     mine = both.sum(axis=1)
@@ -142,7 +147,7 @@ def _looks(
 
 
 def groups(size: tuple[int, int]) -> np.ndarray:
-    """Return the group of every pixel, (H*W,) int64: tiles assigned at random, neither rows nor columns."""
+    """Return the group of every pixel, (H*W,) int64: tiles scattered over the image, neither rows nor columns."""
     y, x = np.divmod(np.arange(size[0] * size[1]), size[1])
     side = TILE_PX // 2
     return ((y // side) * 7 + (x // side) * 3) % GROUPS
@@ -171,6 +176,8 @@ def _collect(where, t, p, edges, bursts, group, total, isi):
             k += 1
         j = where[i]
         total[k, j, p[i]] += 1
+        # Events within bursts were removed, so an interval across one may lack events; only pairs since the last
+        # burst count.
         while burst < len(bursts) and t[i] >= bursts[burst, 1]:
             quiet_since = bursts[burst, 1]
             burst += 1
@@ -221,9 +228,11 @@ class Target:
         error beyond chance, block by block, between the two."""
         value = lambda without: self._numbers(simulated, without) - self._numbers(self.sums, without)
         jackknife = np.stack([value(group) for group in range(GROUPS)])
+        # The jackknife's variance: its values differ by a (G - 1)-th of what independent groups would.
         chance = np.sqrt((GROUPS - 1) / GROUPS * ((jackknife - jackknife.mean(axis=0)) ** 2).sum(axis=0))
         most = np.array([FLOOR[b] for b in self.block])
         floors = most * (LOWEST if floor == "lowest" else 1.0)
+        # What chance does not explain of a difference is the model's own error.
         off = value(None) ** 2 - chance**2
         for name in set(self.block.tolist()) if floor == "seen" else ():
             here = self.block == name
@@ -277,6 +286,7 @@ def target(recorded: Sums, together: bool = False) -> Target:
     values, block = numbers(recorded, probes, spread, together=together)
     floor = np.array([FLOOR[b] for b in block])
     sizes = {b: max(np.count_nonzero(block == b), 1) for b in FLOOR}
+    # A block weighs the same in the sum of squares, however many numbers it has.
     weight = np.array([WEIGHTS[b] / np.sqrt(sizes[b]) for b in block])
     chance, jackknife = np.zeros(len(values)), np.zeros((GROUPS, len(values)))
     return Target(recorded, probes, values, chance, floor, weight, jackknife, block, spread, together)
@@ -304,6 +314,7 @@ def _probes(isi: np.ndarray) -> np.ndarray:
         return np.empty(0, np.int64)
     cdf = np.cumsum(isi) / isi.sum()
     found = np.searchsorted(cdf, PROBES)
+    # The one before the first tells whether a simulation has shorter intervals than the camera ever has.
     return np.unique(np.concatenate([found, [max(found[0] - 2, 0)]]))
 
 
@@ -322,6 +333,7 @@ def numbers(
         rates, lights = (part.sum(axis=-1, keepdims=True) for part in (rates, lights))
     if pixels[0] >= LEAST_STILL:
         seconds = s.seconds[:, None] * pixels[0]
+        # A pixel more or less in an empty interval must not decide: 1, 2 or 4 events are added before each logarithm.
         add("rate", np.log((rates + 1) / seconds))
         add("rate", np.log((rates.sum(axis=0) + 1) / seconds.sum()))
         add("total", np.log((rates.sum() + 1) / seconds.sum()))

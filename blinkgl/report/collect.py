@@ -31,7 +31,6 @@ from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
 _FLOW = LABELS["flow_forward"]
-"""Width and height of the inertial unit's picture, px."""
 
 
 @dataclass(eq=False)

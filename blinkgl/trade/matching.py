@@ -95,8 +95,10 @@ def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
     for k in range(len(starts_a) - 1):
         a0, n = starts_a[k], starts_a[k + 1] - starts_a[k]
         b0, m = starts_b[k], starts_b[k + 1] - starts_b[k]
+        # Nothing can match: partner stays -1, and extra is counted from what is matched.
         if n == 0 or m == 0:
             continue
+        # Scratch memory grows to the longest train so far, so most trains allocate nothing.
         if len(low) <= n:
             low, high, row_start = (
                 np.empty(2 * n + 2, np.int64),
@@ -129,6 +131,8 @@ def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
                     other = cost[here + j - 1] + limit
                     if other < best:
                         best, what = other, _EXTRA
+                    # Only b's events above low[i] are not too early for event i, so within a row every j but the
+                    # first may match.
                     pair = (
                         cost[above + min(j - 1, top)]
                         + limit * max(j - 1 - top, 0)
@@ -137,6 +141,8 @@ def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
                     if pair <= best:
                         best, what = pair, _MATCH
                 cost[here + j], choice[here + j] = best, what
+        # Back along the choices. Judged events beyond a row's end were counted as extra on the way up, so they are
+        # skipped.
         i, j = n, m
         while i > 0:
             j = min(j, high[i])

@@ -79,9 +79,13 @@ def visible(
     the eye, y, z, along the normal), and the fraction that leaves, (N, count); its mean is the energy of uniform
     light."""
     i = np.arange(count)
+    # A lattice by the golden ratio instead of random points: it converges faster, and tables are the same
+    # everywhere.
     u1, u2 = (i + 0.5) / count, (i * 0.6180339887498949 + 0.5) % 1.0
     sv = np.sqrt(np.maximum(1 - nv**2, 0))
     alpha = max(roughness, SMOOTHEST) ** 2
+    # Stretched by alpha, the surface is a hemisphere, whose visible normals are the eye's direction plus a spherical
+    # cap.
     x, z = alpha * sv, nv.copy()
     length = np.hypot(x, z)
     x, z = (x / length)[:, None], (z / length)[:, None]
@@ -104,6 +108,7 @@ def visible(
 def energy() -> np.ndarray:
     """Return (roughness 32, cosine 64, 2) float64 (r, g): a lobe with reflectance F0 returns F0 r + g of uniform light
     with single reflection. Roughness and cosine are i / (n - 1); by visible half vectors, whose weights are smooth."""
+    # At the cosine 0 the eye sees no surface, and the quotients below are 0 / 0.
     nv = np.maximum(np.arange(_ANGLES) / (_ANGLES - 1), 1e-3)
     out = np.empty((_ROUGHNESSES, _ANGLES, 2))
     sv = np.sqrt(np.maximum(1 - nv**2, 0))[:, None]

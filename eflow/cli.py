@@ -342,7 +342,8 @@ def pack(
     ],
     raw: Raw = False,
 ) -> None:
-    """Pack a checkpoint as a network that can come with the package: weights (5 MB at most) and a card.
+    """Pack a checkpoint as a network that can come with the package: weights (5 MB at most, above it in half precision)
+    and a card.
 
     The weights are read back before the folder appears."""
     from eflow import shipped

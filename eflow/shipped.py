@@ -147,10 +147,12 @@ def pack(
 ) -> tuple[Path, Card]:
     """Write the new folder ``out/name`` with the weights of a checkpoint and a card (a YAML file of
     :class:`CardText`); return the folder and its card. It appears after its weights were read back, or not at all.
+    Weights above 5 MB are rounded to float16; the card says what that changes.
 
     averaged : use the averaged weights if there are any.
-    Raises ConfigError: bad name or card. AssetError: bad checkpoint, or weights above 5 MB. OutputError."""
+    Raises ConfigError: bad name or card. AssetError: bad checkpoint, or above 5 MB in float16, too. OutputError."""
     from eflow.checkpoint import load_model, metadata_of, write_tensors
+    from eflow.infer import largest_change
     from eflow.models import NETWORKS, parameters_of
 
     if not _NAME.fullmatch(name) or name in METHODS or name in NETWORKS:
@@ -164,19 +166,22 @@ def pack(
     final = Path(out) / name
     refuse_existing(final)
     model = load_model(checkpoint, averaged=averaged)
-    tensors = model.state_dict()
-    size = sum(v.numel() * v.element_size() for v in tensors.values())
-    if size > LARGEST:
+    tensors, stored = model.state_dict(), "fp32"
+    size = lambda: sum(v.numel() * v.element_size() for v in tensors.values())
+    if size() > LARGEST:
+        tensors = {k: v.half() if v.is_floating_point() else v for k, v in tensors.items()}
+        stored = "fp16"
+    if size() > LARGEST:
         raise AssetError(
             "too large to come with the package",
             where=str(checkpoint),
-            value=f"{size / 1e6:.1f} MB",
+            value=f"{size() / 1e6:.1f} MB in float16",
             accepted=f"at most {LARGEST / 1e6:g} MB",
         )
     with atomic_folder(final) as folder:
         write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
         (folder / WEIGHTS).chmod(0o644)  # other users of an installation must be able to read it
-        load_model(folder / WEIGHTS, expected=model.config)  # raises if it cannot be read
+        packed = load_model(folder / WEIGHTS, expected=model.config)  # raises if it cannot be read
         read = (folder / WEIGHTS).read_bytes()
         full = Card(
             **text.model_dump(),
@@ -184,8 +189,8 @@ def pack(
             network=model.config.name,
             size=model.config.size,
             parameters=parameters_of(model),
-            stored="fp32",
-            rounding_px=0.0,
+            stored=stored,
+            rounding_px=largest_change(model, packed),
             bytes=len(read),
             sha256=hashlib.sha256(read).hexdigest(),
             version=__version__,

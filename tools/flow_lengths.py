@@ -96,6 +96,9 @@ def enlarged(sample: RawSample, factor: int) -> RawSample:
     )
 
 
+THINNED, TRIPLED = "5 % of the events", "coordinates tripled"
+DENSITIES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
+"""Edges of the bins of events per pixel."""
 VIEWS: dict[str, Callable[[RawSample], RawSample]] = {
     "as it is": lambda s: s,
     "mirrored": lambda s: s.flip("x"),
@@ -103,31 +106,41 @@ VIEWS: dict[str, Callable[[RawSample], RawSample]] = {
     "transposed": lambda s: s.transpose(),
     "time reversed": lambda s: s.reverse(),
     "polarity swapped": lambda s: s.invert(),
-    "5 % of the events": lambda s: s.drop(0.95, np.random.default_rng(0)),
+    THINNED: lambda s: s.drop(0.95, np.random.default_rng(0)),
     "noise of 3 /s/px": lambda s: s.noise(3.0, np.random.default_rng(0)),
     "coordinates doubled": lambda s: enlarged(s, 2),
-    "coordinates tripled": lambda s: enlarged(s, 3),
+    TRIPLED: lambda s: enlarged(s, 3),
 }
 
 
-def of_views(model: FlowModel, path: str, limit: int) -> list[list[object]]:
-    """A row for each view of the windows of a pool: error and zero flow's, px over all pixels, their ratio, and that
-    beside the ratio of the windows as they are."""
-    source, rows = open_source(path), []
-    chosen = np.linspace(0, len(source) - 1, min(limit, len(source))).round().astype(int)
-    for name, view in VIEWS.items():
-        errors = []
-        for i in chosen:
-            s = view(source[int(i)])
-            predictor = Predictor(model, s.height, s.width, empty="zero")
-            flow = predictor(StreamWindow(s.new.t0, s.old, s.new))[0][s.valid]
-            if len(flow):
-                true = s.flow[s.valid]
-                errors.append((np.hypot(*(flow - true).T).mean(), np.hypot(*true.T).mean()))
-        error, zero = np.mean(errors, axis=0)
-        ratio = float(error / zero)
-        rows.append([name, float(error), float(zero), ratio, ratio / rows[0][3] if rows else 1.0])
-    return rows
+def of_views(model: FlowModel, path: str, limit: int) -> list[list[list[object]]]:
+    """Rows of three tables of the windows of a pool. Errors are over all pixels with truth, as shares of zero flow's.
+
+    Each view: error and zero flow's, px, their ratio, and that beside the ratio of the windows as they are. Windows as
+    they are and thinned, by events per pixel: whether thinned ones are worse than others with so few events. Windows
+    tripled, by the length of the flow before it: whether they are worse than others with such flow."""
+    source = open_source(path)
+    samples = [source[int(i)] for i in np.linspace(0, len(source) - 1, min(limit, len(source))).round().astype(int)]
+    samples = [s for s in samples if s.valid.any()]
+    errors = {name: np.array([_error(model, view(s)) for s in samples]) for name, view in VIEWS.items()}
+    plain, thin, tripled = (errors[name] for name in ("as it is", THINNED, TRIPLED))
+    share = lambda of: float(of[:, 0].mean() / of[:, 1].mean()) if len(of) else float("nan")
+    views = [[n, *e.mean(0)[:2].tolist(), share(e), share(e) / share(plain)] for n, e in errors.items()]
+    density, length = [], []
+    for low, high in itertools.pairwise(DENSITIES):
+        some = [of[(of[:, 2] >= low) & (of[:, 2] < high)] for of in (plain, thin)]
+        density.append([f"{low:g} to {high:g}", *(value for of in some for value in (len(of), share(of)))])
+    for low, high in itertools.pairwise((0.0, *BINS[2:])):
+        inside = (plain[:, 1] >= low) & (plain[:, 1] < high)
+        length.append([f"{low:g} to {high:g} px", int(inside.sum()), share(plain[inside]), share(tripled[inside])])
+    return [views, density, length]
+
+
+def _error(model: FlowModel, s: RawSample) -> tuple[float, float, float]:
+    """Error of a sample, and zero flow's, px; events per pixel of the new window."""
+    predictor = Predictor(model, s.height, s.width, empty="zero")
+    flow, true = predictor(StreamWindow(s.new.t0, s.old, s.new))[0][s.valid], s.flow[s.valid]
+    return np.hypot(*(flow - true).T).mean(), np.hypot(*true.T).mean(), len(s.new) / (s.height * s.width)
 
 
 def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -> Iterator[Judged]:
@@ -168,11 +181,17 @@ def main() -> None:
     parser.add_argument("--views", action="store_true", help="errors of changed windows in place of lengths")
     parser.add_argument("--limit", type=int, default=200, help="windows of the pool that --views takes")
     options = parser.parse_args()
-    model, heads = load_model(options.network), ["windows", "length", "length, sharp", "error", "error, sharp"]
+    model = load_model(options.network)
     if options.views:
-        rows = of_views(model, options.pool, options.limit)
-        say(plain_console(), table("view", ["error, px", "zero flow", "ratio", "to as it is"], rows))
+        heads = (
+            ("view", ["error, px", "zero flow", "ratio", "to as it is"]),
+            ("events per pixel", ["windows", "ratio", "windows, thinned", "ratio, thinned"]),
+            ("mean flow", ["windows", "ratio", "ratio, tripled"]),
+        )
+        for (title, columns), rows in zip(heads, of_views(model, options.pool, options.limit), strict=True):
+            say(plain_console(), table(title, columns, rows) + "\n")
         return
+    heads = ["windows", "length", "length, sharp", "error", "error, sharp"]
     pool = list(judged(model, of_pool(options.pool)))
     say(plain_console(), table("true length", heads, rows_of(pool, itertools.pairwise(BINS))))
     pans = list(judged(model, of_pans()))

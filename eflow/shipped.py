@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -166,18 +166,7 @@ def pack(
     final = Path(out) / name
     refuse_existing(final)
     model = load_model(checkpoint, averaged=averaged)
-    tensors, stored = model.state_dict(), "fp32"
-    size = lambda: sum(v.numel() * v.element_size() for v in tensors.values())
-    if size() > LARGEST:
-        tensors = {k: v.half() if v.is_floating_point() else v for k, v in tensors.items()}
-        stored = "fp16"
-    if size() > LARGEST:
-        raise AssetError(
-            "too large to come with the package",
-            where=str(checkpoint),
-            value=f"{size() / 1e6:.1f} MB in float16",
-            accepted=f"at most {LARGEST / 1e6:g} MB",
-        )
+    tensors, stored = _stored(model.state_dict(), str(checkpoint))
     with atomic_folder(final) as folder:
         write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
         (folder / WEIGHTS).chmod(0o644)  # other users of an installation must be able to read it
@@ -198,3 +187,21 @@ def pack(
         with output_errors(folder):
             (folder / CARD).write_text(to_yaml(full.model_dump(mode="json")), encoding="utf-8")
     return final, full
+
+
+def _stored(tensors: dict[str, Any], where: str) -> tuple[dict[str, Any], Literal["fp32", "fp16"]]:
+    """Return the tensors to store, and their precision: as they are, or in half precision where that is too large.
+
+    Raises AssetError: above 5 MB in half precision, too."""
+    size = lambda some: sum(v.numel() * v.element_size() for v in some.values())
+    if size(tensors) <= LARGEST:
+        return tensors, "fp32"
+    halves = {k: v.half() if v.is_floating_point() else v for k, v in tensors.items()}
+    if size(halves) > LARGEST:
+        raise AssetError(
+            "too large to come with the package",
+            where=where,
+            value=f"{size(halves) / 1e6:.1f} MB in float16",
+            accepted=f"at most {LARGEST / 1e6:g} MB",
+        )
+    return halves, "fp16"

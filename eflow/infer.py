@@ -153,15 +153,16 @@ def likely_span(
     """Return (Δ, longest possible Δ) in µs, where Δ is the time in which motion is about :data:`LIKELY_PX`.
 
     The speed is the median of the predictor's own flow at pixels with events, at three places of the recording; Δ is
-    changed until that speed fits it. Δ is at least 1 ms and at most half of the recording, or all of it if the
-    predictor ``reads`` only the new window. Raises EventDataError: no events, or none at those places."""
+    changed until that speed fits it, or until the flow no longer grows with it. Δ is at least 1 ms and at most half of
+    the recording, or all of it if the predictor ``reads`` only the new window. Raises EventDataError: no events, or
+    none at those places."""
     ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
     if not ends:
         raise EventDataError("holds no events", where=str(file.path))
     first, last = ends[0][0], ends[-1][1]
     pair = 2 if "old" in reads else 1
     longest = max((last + 1 - first) // pair, 1000)
-    span = min(30_000, longest)
+    span, before = min(30_000, longest), None
     for _ in range(4):
         speeds = []
         for place in (0.25, 0.5, 0.75):
@@ -177,7 +178,15 @@ def likely_span(
                 where=str(file.path),
                 accepted="--window-ms in milliseconds instead of auto",
             )
-        factor = min(max(LIKELY_PX / max(float(np.median(speeds)), 1e-3), 0.4), 2.5)
+        speed = max(float(np.median(speeds)), 1e-3)
+        # In windows that are too long for a network its flow no longer grows with them, which would ask for still
+        # longer ones: the last length stays for which it grew at least by half of what the length did. Where hardly
+        # anything moves this says nothing.
+        grows = before is None or span < before[0] or speed >= 0.5 * before[1] * (1 + span / before[0])
+        if not grows and before[1] > LIKELY_PX / 10:
+            return before[0], longest
+        before = span, speed
+        factor = min(max(LIKELY_PX / speed, 0.4), 2.5)
         span = int(min(max(span * factor, 1000), longest))
         if 0.8 < factor < 1.25:
             break

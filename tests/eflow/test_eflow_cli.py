@@ -103,6 +103,17 @@ def test_a_window_as_long_as_things_need_to_move_by_five_pixels(tmp_path, capsys
     assert "--window-ms: not a window length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
 
 
+def test_windows_do_not_outgrow_a_network(tmp_path):
+    """A network whose flow stays below 3 px however long the window is: not the longest window, but the last one with
+    which its flow grew."""
+    events = moving_events(64, 72, 0, 900_000, (0, 0), n=9000)
+    write_events(tmp_path / "e.h5", events, 64, 72)
+    file = infer.open_sized(tmp_path / "e.h5")
+    says = lambda most: lambda w: (np.full((64, 72, 2), [min(4e-5 * (w.new.t1 - w.new.t0), most), 0]), None)
+    assert infer.likely_span(file, says(3.0), ("new",))[0] == 75_000  # 1.2 px in 30 ms, 3 px in 75 ms, and in more
+    assert infer.likely_span(file, says(9.0), ("new",))[0] == pytest.approx(125_000, rel=0.01)
+
+
 def test_windows_of_a_recording_that_hardly_moves_are_as_long_as_it_allows(network, tmp_path, capsys):
     """All of it for a network that reads one window, half of it for a pair; and a line says so."""
     events = moving_events(130, 145, 0, 90_000, (0, 0), n=4000)

@@ -166,7 +166,7 @@ def pack(
     final = Path(out) / name
     refuse_existing(final)
     model = load_model(checkpoint, averaged=averaged)
-    tensors, stored = _stored(model.state_dict(), str(checkpoint))
+    tensors, stored = _stored(model.state_dict(), checkpoint)
     with atomic_folder(final) as folder:
         write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
         (folder / WEIGHTS).chmod(0o644)  # other users of an installation must be able to read it
@@ -189,7 +189,7 @@ def pack(
     return final, full
 
 
-def _stored(tensors: dict[str, Any], where: str) -> tuple[dict[str, Any], Literal["fp32", "fp16"]]:
+def _stored(tensors: dict[str, Any], checkpoint: str | os.PathLike) -> tuple[dict[str, Any], Literal["fp32", "fp16"]]:
     """Return the tensors to store, and their precision: as they are, or in half precision where that is too large.
 
     Raises AssetError: above 5 MB in half precision, too."""
@@ -200,7 +200,7 @@ def _stored(tensors: dict[str, Any], where: str) -> tuple[dict[str, Any], Litera
     if size(halves) > LARGEST:
         raise AssetError(
             "too large to come with the package",
-            where=where,
+            where=str(checkpoint),
             value=f"{size(halves) / 1e6:.1f} MB in float16",
             accepted=f"at most {LARGEST / 1e6:g} MB",
         )

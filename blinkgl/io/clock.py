@@ -1,0 +1,124 @@
+"""Units of time of files: read from a heading, declared by the user, or guessed from all values together.
+
+One list of times has one unit. A guess is never made value by value, and :attr:`TimeUnit.line` says it in one line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.errors import ConfigError, EventDataError
+
+NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""ns in each unit, by the name that ``--time-unit`` takes."""
+_SPELT = {
+    "s": "s sec secs second seconds",
+    "ms": "ms msec msecs millisecond milliseconds",
+    "us": "us usec usecs microsecond microseconds µs μs",
+    "ns": "ns nsec nsecs nanosecond nanoseconds",
+}
+_UNIT_OF = {word: unit for unit, words in _SPELT.items() for word in words.split()}
+_TYPICAL_HZ = 100.0
+"""Frame rate nearest to which, as a ratio, a guessed unit brings the frames."""
+_EPOCH_S = (9.4e8, 4.1e9)
+"""Seconds since 1970 of the years 2000 to 2099: times of a clock that counts from there betray their unit."""
+_LEAP = 500.0
+"""Ratio of neighbouring steps from which on a list of times is taken to be in two units."""
+
+
+@dataclass(frozen=True)
+class TimeUnit:
+    """The unit of a file's times.   name : "s", "ms", "us" or "ns".   how : "read" from the file, "declared" by the
+    user, or "guessed".   span : first and last time in that unit, for the line."""
+
+    name: str
+    how: str
+    span: tuple[float, float] | None = None
+
+    @property
+    def nanoseconds(self) -> int:
+        """Return the ns in one unit."""
+        return NANOSECONDS[self.name]
+
+    @property
+    def line(self) -> str | None:
+        """Return the sentence that says a guess and the option that overrules it; None: nothing was guessed."""
+        if self.how != "guessed":
+            return None
+        shown = ""
+        if self.span is not None:
+            first, last = (value * self.nanoseconds / 1e9 for value in self.span)
+            shown = f": {first:.9g} … {last:.9g} s" if self.span[0] < 1e6 else f": {last - first:.9g} s in all"
+        others = ", ".join(unit for unit in NANOSECONDS if unit != self.name)
+        return f"times taken as {self.name}{shown} (--time-unit {others} if that is wrong)"
+
+
+def checked_unit(unit: str | None, where: str = "--time-unit") -> str | None:
+    """Return a declared unit. Raises ConfigError: not one of s, ms, us, ns."""
+    if unit is None or unit in NANOSECONDS:
+        return unit
+    raise ConfigError("unknown unit of time", where=where, value=unit, accepted=", ".join(NANOSECONDS))
+
+
+def named_unit(heading: str) -> str | None:
+    """Return the unit that a heading, a column's or an array's name, or a file's stem states: ``t_us``, ``t[us]``,
+    ``timestamp [ns]``, ``time (ms)``, ``timestamps_ns``, ``Time in seconds``; None where it states none.
+
+    A bare ``s`` counts in brackets and after an underscore only: it ends many words."""
+    text = heading.strip().lower()
+    if found := re.search(r"[\[(<{]\s*([a-zµμ]+)\s*[\])>}]", text):
+        return _UNIT_OF.get(found[1])
+    if found := re.search(r"(?:_|\bin )([a-zµμ]+)$", text):
+        return _UNIT_OF.get(found[1])
+    return _UNIT_OF.get(text) if len(text) > 1 else None
+
+
+def guessed_frame_unit(values: np.ndarray, where: str) -> TimeUnit:
+    """Return the unit in which times of frames, (N,) numbers of an unknown unit, make sense together.
+
+    Times within this century's seconds since 1970 in one unit are in that unit; else the unit is the one in which the
+    median step is nearest to that of 100 Hz. Raises EventDataError: steps that only two units explain."""
+    values = np.asarray(values, np.float64)
+    steps = np.diff(values)
+    if not len(steps):
+        return TimeUnit("s" if (values % 1).any() else "us", "guessed", (float(values[0]), float(values[-1])))
+    positive = steps[steps > 0]
+    least = float(np.quantile(positive, 0.25)) if len(positive) else 1.0
+    for k in np.flatnonzero(np.abs(steps) > _LEAP * least)[:1]:
+        small, large = sorted(abs(values[k : k + 2]))
+        if large > _LEAP * small:
+            raise EventDataError(
+                "times in two units",
+                where=f"{where}: frames {k} and {k + 1}",
+                value=values[k : k + 2].tolist(),
+                accepted="one unit for all, or --time-unit s, ms, us or ns where the leap is meant",
+            )
+    usual = float(np.median(positive)) if len(positive) else 1.0
+    likely = {
+        unit: abs(np.log10(1e9 / (usual * ns * _TYPICAL_HZ)))
+        - (2.5 if _EPOCH_S[0] <= values[0] * ns / 1e9 <= _EPOCH_S[1] else 0)
+        for unit, ns in NANOSECONDS.items()
+    }
+    return TimeUnit(min(likely, key=likely.__getitem__), "guessed", (float(values[0]), float(values[-1])))
+
+
+def nanoseconds(values: Sequence[str] | np.ndarray, unit: TimeUnit) -> list[int]:
+    """Return times as whole ns, rounded to the nearest. Texts are converted exactly: a float64 of seconds since 1970
+    holds steps of 240 ns only."""
+    scale = unit.nanoseconds
+    if isinstance(values, np.ndarray):
+        if values.dtype.kind in "iu":
+            return [int(value) * scale for value in values]
+        return [round(Fraction(float(value)) * scale) for value in values]
+    return [round(Fraction(value) * scale) for value in values]
+
+
+def unit_of_file(path: Path) -> str | None:
+    """Return the unit that a file's name states: ``times_us.txt``."""
+    return named_unit(path.stem)

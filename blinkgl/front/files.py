@@ -5,7 +5,7 @@ Each function imports what it needs when it is called, so that reading an event 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
@@ -14,6 +14,7 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.front import arguments as check
 from blinkgl.io import formats
 from blinkgl.io.formats import EventFile
+from blinkgl.io.frames import Declared
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
@@ -199,22 +200,38 @@ def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarra
     trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
 
 
+class DeclaredFrames(TypedDict, total=False):
+    """What a file of frames does not say; :func:`blinkgl.simulate_file` describes them."""
+
+    fps: float | None
+    timestamps: str | os.PathLike | None
+    time_unit: str | None
+    white_level: float | None
+    range: str | None
+    background: str | None
+
+
 @check.public
 def compare(
     a: str | os.PathLike,
     b: str | os.PathLike | None = None,
     *,
     frames: str | os.PathLike | None = None,
-    fps: float | None = None,
     interval_ms: float = 20.0,
     zero_time: bool = False,
     judge: bool = False,
+    gamma: str | float | None = None,
+    frame_delay_ms: float = 0.0,
+    **declared: Unpack[DeclaredFrames],
 ) -> Comparison:
     """Compare two event files over their common time: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: only ``a`` is described.
-    frames : video or folder of images that both are compared with.   fps : of the frames, Hz.
-    interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
+    frames : video or folder of images that both are compared with.   gamma : of their codes; None: what the file
+    states, linear for grey images, srgb for video and colour.   frame_delay_ms : added to their times, ms.   declared :
+    what the file does not say of them, as of :func:`simulate_file`.
+    interval_ms : ms, of rates and correlations.   zero_time : count both from their first event, and frames from the
+    first.
     judge : also compute how well a classifier separates b from a, and the halves of each: ``told_apart``, ``halves``.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
@@ -223,17 +240,20 @@ def compare(
         check.path(a, "a"),
         None if b is None else check.path(b, "b"),
         frames=None if frames is None else check.path(frames, "frames"),
-        fps=_fps(fps),
+        declared=_declared(declared),
+        gamma=gamma,
+        frame_delay_ms=check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6),
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
         judge=bool(judge),
     )
 
 
-class ReadingOptions(TypedDict, total=False):
+class ReadingOptions(DeclaredFrames, total=False):
     """Options of frames beside a recording; :func:`blinkgl.calibrate` describes them."""
 
-    gamma: str | float
+    zero_time: bool
+    gamma: str | float | None
     interpolate: str
     max_px: float
     frame_delay_ms: float | None
@@ -247,8 +267,6 @@ def calibrate(
     emulator: EmulatorSettings = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
-    fps: float | None = None,
-    timestamps: str | os.PathLike | None = None,
     starts: int = 3,
     seed: int = 0,
     **reading: Unpack[ReadingOptions],
@@ -259,13 +277,15 @@ def calibrate(
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping of initial values.   fixed : keys that keep their initial values.   still : a static scene in
-    constant light, without frames: only noise is fitted.   fps : of the frames, Hz.   timestamps : file of the frames'
-    times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
-    "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: estimated.
-    starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
+    constant light, without frames: only noise is fitted.   fps, timestamps, time_unit, white_level, range, background :
+    of the frames, as of :func:`simulate_file`.   zero_time : count events from the first, and frames from the first.
+    gamma : of their codes; None: what the file states, linear for grey images, srgb for video and colour.   interpolate
+    : between them, "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None:
+    estimated. starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
+    from blinkgl.recordings.decoding import Codes
 
     listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
     given = tuple(fixed) if listed else (None,)
@@ -274,7 +294,7 @@ def calibrate(
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
     delay = reading.get("frame_delay_ms")
     understood = FrameReading(
-        reading.get("gamma", FrameReading.gamma),
+        Codes(reading.get("gamma")),
         reading.get("interpolate", FrameReading.interpolate),
         check.number(reading.get("max_px", FrameReading.max_px), "max_px", above=0, most=1000),
         None if delay is None else check.number(delay, "frame_delay_ms", least=-1e6, most=1e6),
@@ -286,8 +306,7 @@ def calibrate(
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
-        fps=_fps(fps),
-        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        declared=_declared(reading),
         starts=check.whole(starts, "starts", 1, 20),
         seed=check.seed(seed),
     )
@@ -297,6 +316,9 @@ class FrameOptions(TypedDict, total=False):
     """Options of frames that are converted to events; :func:`blinkgl.simulate` describes them."""
 
     fps: float | None
+    zero_time: bool
+    white_level: float | None
+    range: str | None
     emulator: EmulatorSettings
     gamma: str | float | None
     interpolate: str
@@ -308,21 +330,23 @@ class FrameOptions(TypedDict, total=False):
 
 @check.public
 def simulate(
-    frames: Iterable, *, report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
+    frames: Iterable, *, unit: str = "ns", report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
-    """Yield the :class:`Events` of any stream of frames, a chunk per step, t in µs; only the current frames are stored.
+    """Yield the :class:`Events` of any stream of frames, t in µs: one chunk per frame, an empty one too, as soon as
+    that frame has come. Nothing of an array is used after the next is asked for, so that one buffer may serve all.
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
-    t_ns). uint8, uint16, or float (1.0 is white).
+    time). uint8, uint16, or float.   unit : of the times: "ns", whole numbers, or "s", "ms", "us", floats too.
+    zero_time : count times from the first frame.   white_level : code of white (default: the type's largest, 1.0 of
+    floats).   range : "limited" for codes from 16 to 235 of 8 bits.
     emulator : as of :func:`record`, default "esim".   seed : of its noise, default 0.
     sensor : camera whose read-out limit is used and, with an emulator's name, its values; frames keep their size.
-    gamma : "srgb", "linear" or an exponent; default: linear for floats, srgb for integers, except grey ones of the size
-    of ``sensor``, which count as its own (``report.assumed_gamma``).   keep_noise : also make events from the noise of
-    integer frames, which otherwise causes none (``report.noise``).
-    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, necessary for frames
-    between which motion exceeds 2 px (``report.guessed_over_px``).
-    report : a SimulationReport to be filled.
-    Raises ConfigError at once; EventDataError during iteration, naming the frame."""
+    gamma : "srgb", "linear", "pq", "hlg" or an exponent; default: linear for floats, srgb for integers, except grey
+    ones of the size of ``sensor``, which count as its own (``report.assumed_gamma``, ``report.notes``).   keep_noise :
+    also make events from the noise of integer frames, which otherwise causes none (``report.noise``). interpolate :
+    "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, necessary for frames between which
+    motion exceeds 2 px (``report.guessed_over_px``). report : a SimulationReport to be filled. Raises ConfigError at
+    once; EventDataError during iteration, naming the frame."""
     from blinkgl.recordings import simulation
 
     if not isinstance(frames, Iterable) or isinstance(frames, (str, os.PathLike)):
@@ -330,7 +354,9 @@ def simulate(
             "not frames", where="frames", value=frames, accepted="an iterable of arrays; of a file, simulate_file"
         )
     use, options = _options(**frame_options)
-    return simulation.frames_to_events(_frames(frames), report=report, **vars(use), **options)
+    if unit not in ("ns", "us", "ms", "s"):
+        raise ConfigError("unknown unit of time", where="unit", value=unit, accepted="s, ms, us or ns")
+    return simulation.frames_to_events(_frames(frames), use, unit=unit, report=report, **options)
 
 
 @check.public
@@ -339,25 +365,32 @@ def simulate_file(
     target: str | os.PathLike,
     *,
     timestamps: str | os.PathLike | None = None,
+    time_unit: str | None = None,
+    background: str | None = None,
     size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
     **frames: Unpack[FrameOptions],
 ) -> SimulationReport:
-    """Convert a video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
+    """Convert a video, a folder of images, a stack or .npy frames (N, H, W[, 3]) to an event file, as
     ``blinkgl simulate``; files appear complete or not at all.
 
-    timestamps : file of times, one a frame.   size : (height, width), px, to which frames are cropped and scaled; None:
+    timestamps : file of times, one a frame.   time_unit : of these, "s", "ms", "us", "ns" or "frames" of fps; None: as
+    the file says, else guessed from all.   background : below transparent pixels, "black", "grey", "white" or
+    "#rrggbb".   size : (height, width), px, to which frames are cropped and scaled; None:
     that of ``sensor``, or else the frames' own.   preview : a video of frames and events to write.
-    frames : fps, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of :func:`simulate`. Returns a
-    report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
+    frames : fps, zero_time, white_level, range, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of
+    :func:`simulate`. Returns a report: frames, steps, events, lost, notes on what was guessed … Raises AssetError,
+    OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
     use, options = _options(**frames)
+    given: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
+    options = {key: options[key] for key in ("emulator", "seed", "readout")}
     return simulation.file_to_events(
         check.path(source, "source"),
         check.path(target, "target"),
-        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        declared=_declared(given),
         size=_sensor_size(frames.get("sensor")) if size is None else _size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
@@ -369,6 +402,9 @@ def simulate_file(
 def _options(
     *,
     fps: float | None = None,
+    zero_time: bool = False,
+    white_level: float | None = None,
+    range: str | None = None,
     emulator: EmulatorSettings = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
@@ -381,28 +417,40 @@ def _options(
     from blinkgl.config.sensor import load_sensor
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import simulation
+    from blinkgl.recordings.decoding import Codes
 
     tree = events_tree(emulator)
     camera = None if sensor is None else load_sensor(sensor)
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
+    declared = _declared({"white_level": white_level, "range": range, "fps": fps})
     use = simulation.FrameUse(
-        gamma,
+        Codes(gamma, declared.white_level, declared.range, simulation.own_frames(camera)),
         interpolate,
         check.number(max_px, "max_px", above=0, most=1e4),
         bool(keep_noise),
-        simulation.own_frames(camera),
     )
     return use, dict(
-        fps=_fps(fps),
+        fps=declared.fps,
+        zero_time=bool(zero_time),
         emulator=simulation.emulator_config(tree),
         seed=check.seed(seed),
         readout=None if camera is None else camera.readout,
     )
 
 
-def _fps(fps: float | None) -> float | None:
-    return None if fps is None else check.number(fps, "fps", above=0, most=1e9)
+def _declared(given: Mapping[str, Any]) -> Declared:
+    """Return what is declared of frames. Raises ConfigError."""
+    fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
+    return Declared(
+        None if fps is None else check.number(fps, "fps", above=0, most=1e9),
+        None if stamps is None else check.path(stamps, "timestamps"),
+        given.get("time_unit"),
+        bool(given.get("zero_time", False)),
+        None if white is None else check.number(white, "white_level", above=0, most=1e9),
+        given.get("range"),
+        given.get("background"),
+    )
 
 
 def _frames(frames: Iterable) -> Iterator:
@@ -411,10 +459,10 @@ def _frames(frames: Iterable) -> Iterator:
         try:
             array, *rest = item if isinstance(item, tuple) else (item,)
             array = np.asarray(array)
-            if not 0 <= len(rest) <= 2 or (rest and int(rest[0]) != rest[0]):
+            if not 0 <= len(rest) <= 2:
                 raise ValueError
         except (TypeError, ValueError, OverflowError):
             raise EventDataError(
-                "not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, whole ns)"
+                "not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, time)"
             ) from None
         yield (array, *rest) if rest else array

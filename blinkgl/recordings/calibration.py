@@ -18,6 +18,7 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.frames import NOTHING, Declared
 from blinkgl.recordings.clip import (
     PLAIN,
     Clip,
@@ -125,8 +126,7 @@ def calibrate(
     emulator: str | EmulatorConfig | dict = EmulatorConfig.members.default,
     fixed: Iterable[str] = (),
     still: bool = False,
-    fps: float | None = None,
-    timestamps: str | os.PathLike | None = None,
+    declared: Declared = NOTHING,
     starts: int = 3,
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
@@ -134,7 +134,8 @@ def calibrate(
     """Fit an emulator to a recording.
 
     frames : of the scene, of the camera's size and at the middle of the exposures
-    (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   reading : how they are interpreted.
+    (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   declared : what the user says of them;
+    zero_time also counts events from the first.   reading : how they are interpreted.
     still : a static scene in constant light, without frames: only noise.
     emulator : a name, or the initial configuration; ``fixed``: keys that keep their values.
     starts : of the search.   progress : called with (current activity, fraction).
@@ -149,13 +150,18 @@ def calibrate(
     if progress:
         progress("reading", 0.0)
     events, size = read_recording(recording, least=LEAST_EVENTS)
-    given = None
+    given, said = None, []
     if not still:
         frames = _own_frames(recording) if frames is None else frames
-        timed, exposures = timed_frames(frames, fps=fps, timestamps=timestamps)
-        given, reading = list(timed), replace(reading, exposures=exposures, name=os.fspath(frames))
+        source, exposures = timed_frames(frames, declared)
+        given, said = list(source), source.notes
+        codes = replace(reading.codes, white_level=declared.white_level, range=declared.range).of(source)
+        reading = replace(reading, codes=codes, exposures=exposures, name=os.fspath(frames))
+    if declared.zero_time:
+        events = replace(events, t=events.t - events.t[0])
     search = dict(emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    return calibrate_events(events, size, given, reading, name=os.fspath(recording), **search)
+    result = calibrate_events(events, size, given, reading, name=os.fspath(recording), **search)
+    return replace(result, notes=[*result.notes, *said])
 
 
 def calibrate_events(
@@ -215,7 +221,7 @@ def calibrate_events(
         streams[0],
         streams[1],
         notes,
-        None if frames is None else reading.gamma,
+        clip.gamma,
         warnings,
     )
 
@@ -356,7 +362,7 @@ def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]
         ),
     ]
     notes.append(
-        f"The frames' codes were taken as `--gamma {reading.gamma}`; the sensor file tells `simulate`, which takes "
+        f"The frames' codes were taken as `--gamma {clip.gamma}`; the sensor file tells `simulate`, which takes "
         "grey images of the sensor's size for the camera's own."
     )
     if "bursts" in facts:

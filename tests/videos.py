@@ -20,6 +20,7 @@ def put_video(
     codec: str = "ffv1",
     pix_fmt: str | None = None,
     source: str | None = None,
+    size: tuple[int, int] | None = None,
     options: dict[str, str] | None = None,
     range_: int | None = None,
     matrix: int | None = None,
@@ -27,7 +28,8 @@ def put_video(
     container_options: dict[str, str] | None = None,
     sound_s: tuple[float, float] | None = None,
 ) -> Path:
-    """Write frames, (H, W) or (H, W, 3) uint8, or of the format ``source``, at ``ticks`` of ``tick`` s.
+    """Write frames, (H, W) or (H, W, 3) uint8, or planes of the format ``source`` and (H, W) ``size``, at ``ticks`` of
+    ``tick`` s.
 
     range_, matrix, curve : tags (ITU-T H.273 numbers; 1 limited, 2 full).   sound_s : beginning and end of a track of
     silence."""
@@ -35,7 +37,7 @@ def put_video(
     source = source or ("gray" if first.ndim == 2 else "rgb24")
     with av.open(str(path), "w", options=container_options or {}) as file:
         stream = file.add_stream(codec, rate=rate)
-        stream.height, stream.width = first.shape[:2]
+        stream.height, stream.width = size or first.shape[:2]
         stream.pix_fmt = pix_fmt or ("gray" if source == "gray" and codec == "ffv1" else "yuv444p")
         stream.options = options or {}
         stream.codec_context.time_base = stream.time_base = tick
@@ -53,7 +55,9 @@ def put_video(
             file.mux(sound.encode(None))
         for k, image in enumerate(frames):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), source)
-            if range_ is not None or matrix is not None:
+            if frame.format.name == stream.pix_fmt:
+                frame.color_range, frame.colorspace = range_ or 0, matrix or 2
+            elif range_ is not None or matrix is not None:
                 given = {"dst_color_range": range_ or 1, "dst_colorspace": matrix or 5}
                 frame = frame.reformat(format=stream.pix_fmt, **given)
                 frame.color_range, frame.colorspace = range_ or 1, matrix or 2

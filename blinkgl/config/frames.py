@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -35,15 +35,28 @@ class FramesConfig(Config):
     )
     first: int = Field(0, ge=0, description="frames skipped at the beginning")
     count: int | None = Field(None, ge=3, description="frames used; null: all")
-    gamma: Literal["srgb", "linear"] = Field("srgb", description="transfer curve of the images")
+    gamma: Literal["srgb", "linear", "pq", "hlg"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
+        None,
+        description="transfer curve of the images, or an exponent; null: what the files state, else srgb for integers, "
+        "linear for floats",
+    )
+    white_level: float | None = Field(
+        None,
+        gt=0,
+        le=1e9,
+        description="code of white, 4095 of 12 bits in 16; null: what the files state, or the type's",
+    )
+    range: Literal["full", "limited"] | None = Field(
+        None, description="of the codes: limited is 16 to 235 of 8 bits; null: full"
+    )
     interpolate: Literal["linear", "motion"] = Field(
         "motion", description="between frames: as `blinkgl simulate --interpolate`"
     )
     max_px: float = Field(1.0, gt=0, le=1e3, description="for motion: largest displacement per step, px")
     keep_noise: bool = Field(
         False,
-        description="make events of the images' noise, too; otherwise the noise is estimated from the first "
-        "images and changes that it explains cause no events (images without noise are used "
+        description="make events of the images' noise, too; otherwise the noise is estimated all along "
+        "and changes that it explains cause no events (images without noise are used "
         "unchanged)",
     )
     max_displacement: float | None = Field(

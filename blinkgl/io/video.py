@@ -21,6 +21,7 @@ import numpy as np
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.alpha import over
 from blinkgl.io.ticks import frame_times
+from blinkgl.io.yuv import known, rgb_from_yuv
 
 if TYPE_CHECKING:
     import av
@@ -37,7 +38,13 @@ TRANSFERS = {16: "pq", 18: "hlg", 8: "linear", 4: 2.2, 5: 2.8}
 """Curves of ITU-T H.273, by their number, that codes are decoded with; all others count as sRGB, which a display's
 curve for BT.709 and BT.601 is closer to than their camera's."""
 _RANGES = {1: "limited", 2: "full"}
-_BT601, _UNSPECIFIED = 5, 2
+_UNSPECIFIED = 2
+_PACKED = {
+    "nv12": "yuv420p", "nv21": "yuv420p", "nv16": "yuv422p", "yuyv422": "yuv422p", "uyvy422": "yuv422p",
+    "yvyu422": "yuv422p", "p010le": "yuv420p10le", "p210le": "yuv422p10le", "y210le": "yuv422p10le",
+    "v210": "yuv422p10le",
+}  # fmt: skip
+"""Formats with interleaved samples, by the planar one with the same samples."""
 
 
 class VideoWriter:
@@ -164,13 +171,13 @@ class VideoReader:
         self._grey = len(parts) == 1 + self._alpha and frame.format.name != "pal8"
         self.transfer = TRANSFERS.get(int(frame.color_trc))
         stated = _RANGES.get(int(frame.color_range))
-        # FFmpeg converts the range of YUV; codes of grey and RGB stay as they are.
+        # Codes of grey and RGB stay as they are; YUV is converted with its range.
         self._by_levels = self._grey or frame.format.is_rgb or frame.format.name == "pal8"
         self.levels = None
         if self._by_levels and (self._range or (stated if self._grey else None)) == "limited":
             self.levels = tuple(code << self._bits - 8 for code in (16, 235))
-        elif 8 < self._bits < 32:
-            self.levels = 0, self._code_of_white(frame)
+        elif self._by_levels and 8 < self._bits < 16 and not self._alpha:
+            self.levels = 0, 2**self._bits - 1
         unstated = [] if self._by_levels or stated or self._range else ["range (limited; --range full for another)"]
         if not self._by_levels and int(frame.colorspace) == _UNSPECIFIED:
             unstated.append("YUV matrix (BT.601)")
@@ -220,13 +227,7 @@ class VideoReader:
 
     def _pixels(self, frame: av.VideoFrame) -> np.ndarray:
         """Return a frame's pixels, upright."""
-        if self._bits == 32:
-            image = _floats(frame)
-        else:
-            name = ("gray" if self._grey else "rgba" if self._alpha else "rgb24") if self._bits <= 8 else None
-            name = name or (f"gray{self._bits}le" if self._grey and not self._alpha else None)
-            name = name or ("rgba64le" if self._alpha else "rgb48le")
-            image = self._converted(frame, name)
+        image = self._codes(frame)
         if self._alpha:
             image, note = over(image, self._background)
             if note and note not in self.notes:
@@ -236,32 +237,32 @@ class VideoReader:
             image = image.swapaxes(0, 1)
         return np.ascontiguousarray(image[:: -1 if up else 1, :: -1 if left else 1])
 
-    def _converted(self, frame: av.VideoFrame, name: str) -> np.ndarray:
-        if frame.format.name != name:
-            source = {}
-            if not self._by_levels:
-                source["src_colorspace"] = _BT601 if int(frame.colorspace) == _UNSPECIFIED else int(frame.colorspace)
-                if self._range:
-                    frame.color_range = {"limited": 1, "full": 2}[self._range]
-            frame = frame.reformat(format=name, **source)
-        return frame.to_ndarray()
-
-    def _code_of_white(self, frame: av.VideoFrame) -> int:
-        """Return what white becomes: FFmpeg's conversion of more than 8 bits does not reach 65535."""
-        if self._grey and not self._alpha:
-            return 2**self._bits - 1
-        made = self._av.VideoFrame(16, 16, frame.format.name)
-        made.color_range, made.colorspace = frame.color_range, frame.colorspace
-        limited = (self._range or _RANGES.get(int(frame.color_range))) != "full" and not frame.format.is_rgb
-        for plane, part in zip(made.planes, frame.format.components):
-            top = 2**part.bits - 1
-            code = (
-                (235 << (part.bits - 8) if limited else top) if part.is_luma or frame.format.is_rgb else (top + 1) // 2
-            )
-            if len(made.planes) < len(frame.format.components):  # packed RGB is white where every byte is
-                code = 65535
-            plane.update(np.full(plane.buffer_size // 2, code, np.uint16).tobytes())
-        return int(self._converted(made, "rgb48le").max())
+    def _codes(self, frame: av.VideoFrame) -> np.ndarray:
+        """Return (H, W), (H, W, 3) or, with alpha, (H, W, 4) codes."""
+        name, bits = frame.format.name, self._bits
+        planar = name.startswith(("yuv", "yuvj", "gbr", "gray")) and name.endswith(("p", "le", "gray")) and bits <= 16
+        if bits == 32 or (bits == 16 and "f16" in name):
+            return _floats(frame)
+        if planar and (self._by_levels or known(int(frame.colorspace))):
+            planes = [_plane(plane, bits) for plane in frame.planes]
+            if self._grey:
+                return planes[0]
+            if self._by_levels:  # the planes are G, B, R, A
+                rgb = np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
+                return np.rint(rgb * (65535.0 / (2**bits - 1))).astype(np.uint16) if self._alpha and bits > 8 else rgb
+            limited = (self._range or _RANGES.get(int(frame.color_range), "limited")) == "limited"
+            limited = limited and not (name.startswith("yuvj") and self._range is None)
+            rgb = rgb_from_yuv((planes[0], planes[1], planes[2]), bits, int(frame.colorspace), limited)
+            if not self._alpha:
+                return rgb
+            alpha = planes[3] if bits == 8 else np.rint(planes[3] * (65535.0 / (2**bits - 1))).astype(np.uint16)
+            return np.dstack([rgb, alpha])
+        if not self._by_levels and (name in _PACKED) and known(int(frame.colorspace)):
+            return self._codes(frame.reformat(format=_PACKED[name]))
+        wanted = ("rgba" if self._alpha else "rgb24") if bits <= 8 else "rgba64le" if self._alpha else "rgb48le"
+        if self._grey and bits <= 8:
+            wanted = "rgba" if self._alpha else "gray"
+        return frame.to_ndarray() if name == wanted else frame.reformat(format=wanted).to_ndarray()
 
     def _scanned(self, file: av.container.InputContainer, stream: av.VideoStream) -> _Scan:
         """Read the packets, without decoding them: the times of all frames, and whether the file is whole."""
@@ -351,6 +352,13 @@ def _orientation(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
                 return True, c < 0, b < 0
             return False, a < 0, d < 0
     return False, False, False
+
+
+def _plane(plane: av.video.plane.VideoPlane, bits: int) -> np.ndarray:
+    """Return a plane's samples, (H, W) uint8 or uint16."""
+    dtype = np.dtype(np.uint8) if bits <= 8 else np.dtype("<u2")
+    rows = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    return rows[: plane.height, : plane.width]
 
 
 def _floats(frame: av.VideoFrame) -> np.ndarray:

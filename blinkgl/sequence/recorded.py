@@ -20,8 +20,11 @@ from blinkgl.events.camera import EventCamera
 from blinkgl.io.flow import read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
+from blinkgl.io.names import natural_order
+from blinkgl.io.stills import open_stills
 from blinkgl.labels import Flow, LabelFrame, asked_for
-from blinkgl.recordings.simulation import FrameUse, Step, stepped, timed
+from blinkgl.recordings.decoding import Codes
+from blinkgl.recordings.simulation import FrameUse, SimulationReport, Step, stepped, timed
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.sequence.request import GroundTruth, Picture, SequenceRequest, StageClock
@@ -100,7 +103,7 @@ def used_images(config: FramesConfig, folder: Path) -> list[Path]:
 def _listed(folder: Path, suffixes) -> list[Path]:
     if not folder.is_dir():
         raise AssetError("no such folder", where=str(folder))
-    return sorted(
+    return natural_order(
         p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
     )
 
@@ -173,9 +176,8 @@ def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def read_frame(path: Path) -> np.ndarray:
-    """Return (H, W) or (H, W, 3) RGB of an image file, without alpha. Raises AssetError."""
-    image = read_any_image(path)
-    return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])
+    """Return (H, W) or (H, W, 3) RGB of an image file, upright, without alpha. Raises AssetError."""
+    return read_any_image(path)
 
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
@@ -194,6 +196,7 @@ class RecordedSequence(Simulation):
         config, clock, frames = request.config, StageClock(), request.config.frames
         assert frames is not None
         self._recorded = frames
+        self._report = SimulationReport()
         self.folder = folder_of(frames, request.index, request.base)
         self.files = used_images(frames, self.folder)
         self.flows, self.masks = flow_files(self.folder, frames, self.files)
@@ -245,11 +248,18 @@ class RecordedSequence(Simulation):
             yield frame, self._time_of(k, self._recorded.fps), str(file)
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
-        frames = self._recorded
+        frames, stated = self._recorded, open_stills(self.files[0])
+        levels = None if stated.white is None else (0.0, float(stated.white))
         steps = stepped(
             timed(self._given()),
             self.camera,
-            FrameUse(frames.gamma, frames.interpolate, frames.max_px, frames.keep_noise),
+            FrameUse(
+                Codes(frames.gamma, frames.white_level, frames.range, transfer=stated.transfer, levels=levels),
+                frames.interpolate,
+                frames.max_px,
+                frames.keep_noise,
+            ),
+            report=self._report,
         )
         while True:
             with self.clock("events"):  # reading and interpolating, too
@@ -290,6 +300,7 @@ class RecordedSequence(Simulation):
                 "images": len(self.files),
                 "first": self.files[0].name,
                 "last": self.files[-1].name,
+                **({"notes": notes} if (notes := [*self._report.notes, *self._report.caveats]) else {}),
             },
         }
 

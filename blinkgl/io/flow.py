@@ -16,8 +16,8 @@ from blinkgl.io.images import encode_npy, encode_png, read_npy, read_png
 # ---------------------------------------------------------------------------------------------------------------------
 # Flow as 16-bit PNG: DSEC's (quantum 1/128 px, ±256 px) and KITTI's (1/64 px, ±512 px).
 #
-# On disk the channels are R = x, G = y, B = valid. OpenCV is the codec because imageio's default and Pillow silently
-# return 8 bits for 16-bit RGB; it speaks BGR, so the order is turned here and nowhere else.
+# On disk the channels are R = x, G = y, B = valid. OpenCV is the codec, since Pillow silently returns
+# 8 bits for 16-bit RGB; OpenCV's order is BGR, so the order is turned here and nowhere else.
 
 DSEC_SCALE = 128.0
 _ZERO = 1 << 15

@@ -314,7 +314,8 @@ def _listed(declared: Declared, count: int | None, notes: list[str], what: str) 
 def _video(path: Path, declared: Declared) -> FrameSource:
     from blinkgl.io.video import VideoReader
 
-    reader = VideoReader(path, range=declared.range, background=background_of(declared.background))
+    below = background_of(declared.background)
+    reader = VideoReader(path, range=declared.range, background=below, zero_time=declared.zero_time)
     listed = _listed(declared, reader.count, reader.notes, path.name)
     fps = declared.fps or reader.fps
     if not fps and listed is None and None in reader.times_ns:

@@ -7,6 +7,7 @@ What a file says is used: the orientation of EXIF and TIFF, the transfer curve o
 from __future__ import annotations
 
 import io
+import logging
 import re
 import struct
 import warnings
@@ -89,8 +90,7 @@ class Stills:
                     yield np.asarray(page.convert("RGBA"))
 
     def _tiff_pages(self, first: int) -> Iterator[np.ndarray]:
-        import tifffile
-
+        tifffile = _tifffile()
         with _decoding(self.path), tifffile.TiffFile(self.path) as file:
             for k in range(first, self.pages):
                 page = file.series[0].keyframe
@@ -177,9 +177,16 @@ def _animated(path: Path) -> Stills:
     return Stills(path, len(delays), [delay if delay > 0 else _UNSTATED_MS for delay in delays], notes=notes)
 
 
-def _tiff(path: Path) -> Stills:
+def _tifffile() -> Any:
+    """Return the library, which logs what it finds wrong with a file; the exceptions say it, too."""
     import tifffile
 
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    return tifffile
+
+
+def _tiff(path: Path) -> Stills:
+    tifffile = _tifffile()
     with _decoding(path), tifffile.TiffFile(path) as file:
         series, notes = file.series[0], []
         page = series.keyframe

@@ -7,6 +7,7 @@ component. PyAV is imported when a video is opened.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -129,7 +130,8 @@ class VideoReader:
     Iterating yields (frame, t_ns): (H, W) or (H, W, 3) RGB, uint8, uint16 or float32, and int ns since the file's
     start, None where the file has none.
 
-    range : "full" or "limited", overrules the file's.   background : (r, g, b), 0 to 255, below transparent pixels.
+    range : "full" or "limited", overrules the file's.   zero_time : whether the start does not matter.   background :
+    (r, g, b), 0 to 255, below transparent pixels.
 
     Raises
     ------
@@ -138,13 +140,18 @@ class VideoReader:
     """
 
     def __init__(
-        self, path: str | os.PathLike, *, range: str | None = None, background: tuple[int, int, int] | None = None
+        self,
+        path: str | os.PathLike,
+        *,
+        range: str | None = None,
+        background: tuple[int, int, int] | None = None,
+        zero_time: bool = False,
     ):
         self.path = Path(path)
         if not self.path.is_file():
             raise AssetError("no such file", where=str(path))
         self._av = _av(AssetError, path)
-        self._range, self._background = range, background
+        self._range, self._background, self._zero_time = range, background, zero_time
         self.notes: list[str] = []
         with self._opened() as (file, stream):
             self._scan = self._scanned(file, stream)
@@ -189,7 +196,7 @@ class VideoReader:
             notes.append(f"the video states the curve {self.transfer} (--gamma for another)")
         if frame.interlaced_frame:
             notes.append("interlaced video: both fields, which are of different times, are taken as one frame")
-        if self._scan.times_ns and self._scan.times_ns[0]:
+        if self._scan.times_ns and self._scan.times_ns[0] and not self._zero_time:
             notes.append(f"the first frame is at {self._scan.times_ns[0] / 1e9:.6g} s of the file (--zero-time: at 0)")
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int | None]]:
@@ -316,16 +323,15 @@ class VideoReader:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+        accepted = "a video by itself (mp4, mov, mkv, webm, avi …), no list or manifest of others"
         with contextlib.ExitStack() as stack:
             try:
                 file = stack.enter_context(self._av.open(_url(self.path), options=_ALONE))
             except (self._av.FFmpegError, OSError, ValueError) as error:
-                accepted = "a video by itself (mp4, mov, mkv, webm, avi …), no list or manifest of others"
-                raise AssetError(
-                    f"cannot read video: {_gist(error)}", where=str(self.path), accepted=accepted
-                ) from error
+                # A format that is not on the list is an invalid argument for FFmpeg.
+                reason = "not a video" if getattr(error, "errno", 0) == errno.EINVAL else _gist(error)
+                raise AssetError(f"cannot read video: {reason}", where=str(self.path), accepted=accepted) from error
             if not set(file.format.name.split(",")) & _FORMATS:
-                accepted = "a video by itself (mp4, mov, mkv, webm, avi …), no list or manifest of others"
                 raise AssetError("cannot read video: not a container", where=str(self.path), accepted=accepted)
             # A cover of an audio file counts as a video stream, too.
             streams = [s for s in file.streams.video if not s.disposition & self._av.stream.Disposition.attached_pic]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from blinkgl.machine.kernels import kernel
 from blinkgl.timeline.interpolate import DenseFlow
 
 BAND = 4.0
@@ -28,8 +29,10 @@ MOST_CODES = 10.0
 stimulus of random dots. A phone's video by night has 5 to 8."""
 _KEPT = 8
 """Pairs of frames, the last ones looked at, from which the noise is estimated."""
-_FIRST, _EVERY, _EVERY_NOISY = 4, 16, 4
-"""Every one of the first pairs is looked at, later every 16th, or every 4th where there is noise, and four in a row
+_PART_PX = (384, 512)
+"""Rows and columns of a pair that are looked at."""
+_FIRST, _EVERY, _EVERY_NOISY = 4, 16, 6
+"""Every one of the first pairs is looked at, later every 16th, or every 6th where there is noise, and four in a row
 where the picture's brightness or the share of pixels that change has changed by these factors."""
 _BRIGHTER, _LIVELIER = 1.1, 2.0
 _SPARSE_PX = 64
@@ -190,6 +193,20 @@ def _lower_line(level: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
     return float(line[0] * scale), float(line[1] * scale)
 
 
+@kernel(error_model="numpy")
+def _push(at, light, constant, slope, band, leap, out):
+    """Write what pixels at ``at`` show after ``light``, (H, W) float32."""
+    for row in range(at.shape[0]):
+        for column in range(at.shape[1]):
+            value, new = at[row, column], light[row, column]
+            width = band * np.sqrt(constant + slope * max(value, np.float32(0)))
+            # At the band's edge the noise's own extremes would push on for many frames after a cut.
+            if abs(new - value) > leap * width:
+                out[row, column] = new
+            else:
+                out[row, column] = min(max(value, new - width), new + width)
+
+
 class Steadied:
     """Light of frames without their noise, as they come.
 
@@ -212,7 +229,7 @@ class Steadied:
         self._last: np.ndarray | None = None
         self._sparse: np.ndarray | None = None
         self._nature = (0.0, 0.0)
-        self._frames, self._banded, self._more, self._known = 0, 0, _FIRST, False
+        self._frames, self._banded, self._more, self._known, self._looked = 0, 0, _FIRST, False, 0
 
     def __call__(self, frame: np.ndarray, luminance: np.ndarray | None = None) -> np.ndarray | None:
         """Return the pixels' values for the next frame, (H, W) float32; None: the frame's own, since it has no noise.
@@ -225,7 +242,8 @@ class Steadied:
             assert self._last is not None and luminance is not None
             self._last = self._last if self._last.dtype == np.float32 else self._light(self._last)
             if due:
-                self._look(self._last, luminance)
+                part = self._part(luminance.shape)
+                self._look(self._last[part], luminance[part])
         if self._now is None:
             self._at = None
         else:
@@ -235,10 +253,10 @@ class Steadied:
                 self._banded = 1
             at = self._last if self._at is None else self._at
             # At first a pixel's value is the frames' mean, whose own noise is included in the difference.
-            width = BAND * np.sqrt(1 + 1 / self._banded) * self._now.sigma(np.maximum(at, 0))
-            pushed = np.clip(at, luminance - width, luminance + width)
-            # At the band's edge the noise's own extremes would push on for many frames after a cut.
-            self._at = np.where(np.abs(luminance - at) > _LEAP * width, luminance, pushed).astype(np.float32)
+            band = np.float32(BAND * (1 + 1 / self._banded) ** 0.5)
+            self._at = np.empty_like(luminance)
+            constant, slope = np.float32(self._now.constant), np.float32(self._now.slope)
+            _push(at, luminance, constant, slope, band, np.float32(_LEAP), self._at)
             self._banded += 1
         self._last = frame.copy() if luminance is None else luminance
         return self._at
@@ -263,6 +281,17 @@ class Steadied:
         self._more -= 1
         every = _EVERY if self._now is None else _EVERY_NOISY
         return self._more >= 0 or number % every == 0 or not self._known
+
+    def _part(self, shape: tuple[int, ...]) -> tuple[slice, slice]:
+        """Return the part of the picture that the next look is at: each in turn, so that large pictures cost no
+        more."""
+        starts = [
+            np.linspace(0, max(0, side - most), -(-side // most)).astype(int) for side, most in zip(shape, _PART_PX)
+        ]
+        row, column = divmod(self._looked % (len(starts[0]) * len(starts[1])), len(starts[1]))
+        self._looked += 1
+        top, left = int(starts[0][row]), int(starts[1][column])
+        return slice(top, top + _PART_PX[0]), slice(left, left + _PART_PX[1])
 
     def _look(self, a: np.ndarray, b: np.ndarray) -> None:
         look = looked_at(a, b)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,57 +78,94 @@ NOTHING = Declared()
 class FrameSource:
     """Frames with their times.
 
-    height, width : px. count : number of frames, None when unknown before the end. fps : Hz, None where frames have
-    times of their own. Iterating yields (frame, t_ns, name): frame (H, W) or (H, W, 3) RGB of uint8, uint16 or float32;
-    t_ns int, strictly increasing; name for messages.
+    height, width : px. count : number of frames, None when unknown before the end. Iterating yields (frame, t_ns,
+    name): frame (H, W) or (H, W, 3) RGB of uint8, uint16 or float32; t_ns int, strictly increasing; name for messages.
 
-    origin : "camera" (a camera's own frames beside its events, proportional to light), "video" or "images".
-    transfer : curve that the file states: "linear", "pq", "hlg", an exponent; None: it states none. levels : codes of
-    black and white that the file states or that were guessed, None: the ends of the type. notes : what was read that is
-    unusual, guessed or left out, a line each; more may be added while iterating.
+    own_times : whether the file itself has times. fps, times_ns : what is used in their place, or None. origin :
+    "camera" (a camera's own frames beside its events, proportional to light), "video" or "images". transfer : curve
+    that the file states: "linear", "pq", "hlg", an exponent; None: it states none. levels : codes of black and white
+    that the file states or that were guessed, None: the ends of the type. notes : what was read that is unusual,
+    guessed or left out, a line each; more may be added while iterating.
 
     Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do
-    not increase, a single frame.
+    not increase, more or fewer times than frames, a single frame.
     """
 
     path: Path
     height: int
     width: int
     count: int | None
-    fps: float | None
     _frames: Callable[[], Frames] = field(repr=False)
+    own_times: bool = False
     origin: str = "images"
     transfer: str | float | None = None
     levels: tuple[float, float] | None = None
     notes: list[str] = field(default_factory=list)
+    fps: float | None = None
+    times_ns: list[int] | None = None
     zero_time: bool = False
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int, str]]:
         last = first = None
-        index = -1
-        for index, (frame, t_ns, name) in enumerate(self._frames()):
+        count = 0
+        for frame, own, name in self._frames():
             if frame.shape[:2] != (self.height, self.width):
                 raise EventDataError(
                     "frame size changed",
-                    where=f"{self.path}: frame {index} ({name})",
+                    where=f"{self.path}: frame {count} ({name})",
                     value=frame.shape[:2],
                     accepted=f"{(self.height, self.width)} as frame 0",
                 )
-            if t_ns is None:
-                assert self.fps is not None
-                t_ns = round(index * 1e9 / self.fps)
+            t_ns = self._time(count, own)
             if last is not None and t_ns <= last:
                 raise EventDataError(
                     "time stamps must increase",
-                    where=f"{self.path}: frame {index} ({name})",
+                    where=f"{self.path}: frame {count} ({name})",
                     value=f"{t_ns / 1e9:.9g} s",
                     accepted=f"more than {last / 1e9:.9g} s, or --fps instead of the stamps",
                 )
             last = t_ns
             first = t_ns if first is None else first
             yield frame, t_ns - first if self.zero_time else t_ns, name
-        if index < 1:
-            raise EventDataError("events need at least two frames", where=str(self.path), value=f"{index + 1} frame(s)")
+            count += 1
+        if count < 2:
+            raise EventDataError("events need at least two frames", where=str(self.path), value=f"{count} frame(s)")
+        self.check_count(count)
+
+    def _time(self, number: int, own: int | None) -> int:
+        if self.times_ns is not None:
+            self.check_count(max(number + 1, len(self.times_ns)))
+            return self.times_ns[number]
+        if self.fps is not None:
+            return round(number * 1e9 / self.fps)
+        assert own is not None
+        return own
+
+    def check_count(self, count: int | None) -> None:
+        """Raise EventDataError where ``count`` frames, if known, have another number of times."""
+        if self.times_ns is not None and count is not None and count != len(self.times_ns):
+            raise EventDataError(
+                "one time stamp per frame",
+                where=str(self.path),
+                value=f"{len(self.times_ns)} stamps, {count} frames",
+                accepted="as many, or --fps",
+            )
+
+    def timed(self, declared: Declared, stamps: Stamps | None = None) -> FrameSource:
+        """Return the frames at the times that are declared, else at those of a list that lies beside them, else at
+        their own. Raises EventDataError: none of these, or another number of them."""
+        if declared.timestamps is not None:
+            stamps = read_timestamps(Path(declared.timestamps), declared.time_unit, declared.fps)
+        if stamps is None and declared.fps is None and not self.own_times:
+            raise EventDataError("frames without times", where=str(self.path), accepted="--fps or --timestamps")
+        if stamps is not None and stamps.note:
+            self.notes.append(stamps.note)
+        times = None if stamps is None else stamps.times_ns
+        source = replace(self, fps=declared.fps, times_ns=times or self.times_ns, zero_time=declared.zero_time)
+        source.check_count(self.count)
+        if self.count == 1:
+            raise EventDataError("events need at least two frames", where=str(self.path), value="1 frame")
+        return source
 
 
 def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameSource:
@@ -146,26 +183,22 @@ def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameS
         raise AssetError("no such file or folder", where=str(path))
     suffix = path.suffix.lower()
     if path.is_dir():
-        source = _folder(path, declared)
-    elif suffix in VIDEO:
-        source = _video(path, declared)
-    elif suffix in STACK or (suffix == ".png" and open_stills(path).pages > 1):
-        source = _stacks([path], path, Series([path]), declared)
-    elif suffix in (".npy", ".npz"):
-        source = _array(path, declared)
-    elif suffix in RECORDING:
-        source = _recording(path, declared)
-    else:
-        raise AssetError(
-            "unknown input",
-            where=str(path),
-            value=path.suffix,
-            accepted="a video (" + " ".join(sorted(VIDEO)) + "), a folder of images, a stack or animation ("
-            + " ".join(sorted(STACK)) + "), .npy, .npz, .aedat or .aedat4",
-        )  # fmt: skip
-    if source.count == 1:
-        raise EventDataError("events need at least two frames", where=str(path), value="1 frame")
-    return source
+        return _folder(path, declared)
+    if suffix in VIDEO:
+        return _video(path, declared).timed(declared)
+    if suffix in STACK or (suffix == ".png" and open_stills(path).pages > 1):
+        return _stacks(path, Series([path]), declared).timed(declared)
+    if suffix in (".npy", ".npz"):
+        return _array(path, declared).timed(declared)
+    if suffix in RECORDING:
+        return _recording(path).timed(declared)
+    raise AssetError(
+        "unknown input",
+        where=str(path),
+        value=path.suffix,
+        accepted=f"a video ({' '.join(sorted(VIDEO))}), a folder of images, a stack or animation "
+        f"({' '.join(sorted(STACK))}), .npy, .npz, .aedat or .aedat4",
+    )
 
 
 def read_any_image(path: Path, background: str | None = None) -> np.ndarray:
@@ -184,79 +217,54 @@ def _folder(folder: Path, declared: Declared) -> FrameSource:
             found.notes.append(f"{list_file.name} beside the images is not used, because of --fps")
             list_file = None
     stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps)
-    if not found.files and stamps is not None and stamps.names:
+    if not found.files and list_file is not None and stamps is not None and stamps.names:
         found = Series([p for name in stamps.names if (p := list_file.parent / name).is_file()])
     if not found.files:
         raise AssetError("no images in the folder", where=str(folder), accepted=" ".join(sorted(IMAGE)))
-    return _stacks(found.files, folder, found, declared, stamps, list_file)
+    source = _stacks(folder, found, declared)
+    if stamps is not None and stamps.names is not None and source.count == len(found.files):
+        stamps = _by_name(stamps, found, str(list_file))
+    return source.timed(replace(declared, timestamps=None), stamps)
 
 
-def _stacks(
-    files: list[Path],
-    where: Path,
-    found: Series,
-    declared: Declared,
-    stamps: Stamps | None = None,
-    list_file: Path | None = None,
-) -> FrameSource:
+def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
     """Return the pages of all files as frames."""
-    background, notes = background_of(declared.background), list(found.notes)
-    if stamps is None and declared.timestamps is not None:
-        list_file = Path(declared.timestamps)
-        stamps = read_timestamps(list_file, declared.time_unit, declared.fps)
+    files, background, notes = found.files, background_of(declared.background), found.notes
     first = open_stills(files[0])
     # Only stacks and animations have pages, so that the others need not be opened before their turn.
-    stacked = {p.suffix.lower() for p in files} & STACK or (first.pages > 1 and {first.path.suffix})
+    stacked = first.pages > 1 or {p.suffix.lower() for p in files} & STACK
     opened = [open_stills(p) for p in files] if stacked else [first]
     pages = sum(one.pages for one in opened) if stacked else len(files)
-    notes += [note for one in opened for note in one.notes if note not in notes]
-    times: list[int] | None = None
-    if stamps is not None:
-        assert list_file is not None
-        times = _matched(stamps, files, pages, list_file, notes)
-    elif declared.fps is None and all(one.delays_ms is not None for one in opened):
-        delays = [delay for one in opened for delay in (one.delays_ms or [])]
-        times = [round(1e6 * t) for t in np.concatenate([[0.0], np.cumsum(delays)])[:-1]]
-        unlike = f"{min(delays):g}" if min(delays) == max(delays) else f"{min(delays):g} to {max(delays):g}"
-        notes.append(f"each frame is shown for {unlike} ms, as the file says (--fps for another rate)")
+    delays = [delay for one in opened for delay in one.delays_ms or []]
+    own = [round(1e6 * t) for t in np.cumsum([0.0, *delays])] if len(delays) == pages else None
+    times = None
+    if own is not None and declared.fps is None:
+        shown = f"{min(delays):g}" if min(delays) == max(delays) else f"{min(delays):g} to {max(delays):g}"
+        notes.append(f"each frame is shown for {shown} ms, as the file says (--fps for another rate)")
     elif declared.fps is not None and pages == len(files) and (places := found.places()) is not None:
         notes += found.missing()
         times = [round(int(place) * 1e9 / declared.fps) for place in places]
-    elif declared.fps is None:
-        raise EventDataError(
-            "frames without times",
-            where=str(where),
-            accepted="--fps, --timestamps, or a timestamps.txt beside the images",
-        )
 
     def frames() -> Frames:
-        k = 0
+        number = 0
         for path in files:
             one = open_stills(path)
             for image in one.iterate(background):
-                name = path.name if one.pages == 1 else f"{path.name} page {k}"
-                yield image, None if times is None else times[k], name
-                k += 1
+                yield image, own and own[number], path.name if one.pages == 1 else f"{path.name} page {number}"
+                number += 1
             notes.extend(note for note in one.notes if note not in notes)
 
-    shown = next(first.iterate(background))
+    image = next(first.iterate(background))
     levels = None if first.white is None else (0.0, float(first.white))
-    if shown.dtype == np.uint16 and declared.white_level is None and declared.range is None:
+    if image.dtype == np.uint16 and declared.white_level is None and declared.range is None:
         chosen = [files[int(k)] for k in np.unique(np.linspace(0, len(files) - 1, _LOOKED_AT))]
-        top = max(int(image.max()) for path in chosen for image in open_stills(path).iterate(background))
+        top = max(int(one.max()) for path in chosen for one in open_stills(path).iterate(background))
         # PNG's sBIT allows codes of the full scale, too.
-        if levels is None or top > levels[1]:
-            levels = _white_of(top, notes)
+        levels = levels if levels is not None and top <= levels[1] else _white_of(top, notes)
+    size = image.shape[:2]
+    has = own is not None
     return FrameSource(
-        where,
-        *shown.shape[:2],
-        pages,
-        declared.fps,
-        frames,
-        transfer=first.transfer,
-        levels=levels,
-        notes=notes,
-        zero_time=declared.zero_time,
+        where, *size, pages, frames, has, transfer=first.transfer, levels=levels, notes=notes, times_ns=times
     )
 
 
@@ -271,44 +279,15 @@ def _white_of(top: int, notes: list[str]) -> tuple[float, float] | None:
     return None
 
 
-def _matched(stamps: Stamps, files: list[Path], pages: int, list_file: Path, notes: list[str]) -> list[int]:
-    """Return the time of each frame. Raises EventDataError: more or fewer times than frames, or a frame without."""
-    if stamps.note:
-        notes.append(stamps.note)
-    if stamps.names is None or pages > len(files):
-        if len(stamps.times_ns) != pages:
-            raise EventDataError(
-                "one time stamp per image",
-                where=str(list_file),
-                value=f"{len(stamps.times_ns)} stamps, {pages} images",
-                accepted="as many, or --fps",
-            )
-        return stamps.times_ns
-    by_name = {Path(name).name: t for t, name in zip(stamps.times_ns, stamps.names)}
-    by_name |= {Path(name).stem: t for t, name in zip(stamps.times_ns, stamps.names) if not Path(name).suffix}
-    if missing := [p.name for p in files if p.name not in by_name and p.stem not in by_name]:
-        raise EventDataError(f"no time stamp for image {missing[0]}", where=str(list_file))
-    if len(by_name) > len(files):
-        left = len(stamps.names) - len(files)
-        notes.append(f"{list_file.name}: {left} times of images that are not in the folder are left out")
-    return [by_name.get(p.name, by_name.get(p.stem, 0)) for p in files]
-
-
-def _listed(declared: Declared, count: int | None, notes: list[str], what: str) -> list[int] | None:
-    """Return the times of ``declared.timestamps``. Raises EventDataError: more or fewer than ``count``."""
-    if declared.timestamps is None:
-        return None
-    stamps = read_timestamps(Path(declared.timestamps), declared.time_unit, declared.fps)
-    if stamps.note:
-        notes.append(stamps.note)
-    if count is not None and len(stamps.times_ns) != count:
-        raise EventDataError(
-            f"one time stamp per frame of {what}",
-            where=str(declared.timestamps),
-            value=f"{len(stamps.times_ns)} stamps, {count} frames",
-            accepted="as many, or --fps",
-        )
-    return stamps.times_ns
+def _by_name(stamps: Stamps, found: Series, where: str) -> Stamps:
+    """Return the times of the files, by their names. Raises EventDataError: a file without."""
+    by_name = {name: t for given, t in zip(stamps.names or (), stamps.times_ns) for name in (Path(given).name, given)}
+    missing = [p.name for p in found.files if p.name not in by_name and p.stem not in by_name]
+    if missing:
+        raise EventDataError(f"no time stamp for image {missing[0]}", where=where)
+    if left := len(stamps.times_ns) - len(found.files):
+        found.notes.append(f"{Path(where).name}: {left} times of images that are not in the folder are left out")
+    return replace(stamps, times_ns=[by_name.get(p.name, by_name.get(p.stem, 0)) for p in found.files])
 
 
 def _video(path: Path, declared: Declared) -> FrameSource:
@@ -316,33 +295,14 @@ def _video(path: Path, declared: Declared) -> FrameSource:
 
     below = background_of(declared.background)
     reader = VideoReader(path, range=declared.range, background=below, zero_time=declared.zero_time)
-    listed = _listed(declared, reader.count, reader.notes, path.name)
-    fps = declared.fps or reader.fps
-    if not fps and listed is None and None in reader.times_ns:
-        raise EventDataError("video without times and frame rate", where=str(path), accepted="--fps or --timestamps")
-
-    def frames() -> Frames:
-        for i, (frame, t_ns) in enumerate(reader):
-            yield frame, listed[i] if listed is not None else None if declared.fps else t_ns, f"#{i}"
-
-    return FrameSource(
-        path,
-        reader.height,
-        reader.width,
-        reader.count,
-        fps,
-        frames,
-        "video",
-        reader.transfer,
-        reader.levels,
-        reader.notes,
-        declared.zero_time,
-    )
+    frames = lambda: ((frame, t_ns, f"#{i}") for i, (frame, t_ns) in enumerate(reader))
+    size, timed = (reader.height, reader.width), None not in reader.times_ns
+    return FrameSource(path, *size, reader.count, frames, timed, "video", reader.transfer, reader.levels, reader.notes)
 
 
 def _array(path: Path, declared: Declared) -> FrameSource:
     notes: list[str] = []
-    own: Stamps | None = None
+    own: list[int] | None = None
     with numpy_errors(path):
         if path.suffix.lower() == ".npy":
             check_npy(path)
@@ -356,7 +316,8 @@ def _array(path: Path, declared: Declared) -> FrameSource:
                 called = [f"{k}{unit}" for k in ("timestamps", "times", "time", "ts", "t") for unit in ("", *_ENDINGS)]
                 stamp = next((k for k in called if k in data), None)
                 if stamp is not None and declared.fps is None and declared.timestamps is None:
-                    own = stamps_of_array(stamp, data[stamp], declared.time_unit, str(path))
+                    stamps = stamps_of_array(stamp, data[stamp], declared.time_unit, str(path))
+                    own, notes = stamps.times_ns, [stamps.note] if stamps.note else []
                 elif stamp is not None:
                     notes.append(f"'{stamp}' in the file is not used, because of --fps or --timestamps")
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
@@ -365,75 +326,26 @@ def _array(path: Path, declared: Declared) -> FrameSource:
         raise AssetError(
             "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
         )
-    times = _listed(declared, len(frames), notes, path.name)
-    if own is not None:
-        times = own.times_ns
-        notes += [own.note] if own.note else []
-        if len(times) != len(frames):
-            raise EventDataError(
-                "one time stamp per frame",
-                where=str(path),
-                value=f"{len(times)} stamps, {len(frames)} frames",
-                accepted="as many, or --fps",
-            )
-    if times is None and declared.fps is None:
-        raise EventDataError("frames without times", where=str(path), accepted="--fps or --timestamps")
     levels = None
     if frames.dtype == np.uint16 and declared.white_level is None and declared.range is None:
-        levels = _white_of(int(max(frames[k].max() for k in range(len(frames)))), notes)
+        levels = _white_of(int(max(frame.max() for frame in frames)), notes)
 
     def read() -> Frames:
-        for i in range(len(frames)):
-            frame = frames[i]
+        for i, frame in enumerate(frames):
             frame = frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame
-            frame = np.asarray(frame, np.float32) if frame.dtype.kind == "f" else np.asarray(frame)
-            yield frame, None if times is None else times[i], f"#{i}"
+            yield np.asarray(frame, np.float32 if frame.dtype.kind == "f" else None), None, f"#{i}"
 
-    return FrameSource(
-        path,
-        *frames.shape[1:3],
-        len(frames),
-        declared.fps,
-        read,
-        levels=levels,
-        notes=notes,
-        zero_time=declared.zero_time,
-    )
+    size, has = frames.shape[1:3], own is not None
+    return FrameSource(path, *size, len(frames), read, has, levels=levels, notes=notes, times_ns=own)
 
 
-def _recording(path: Path, declared: Declared) -> FrameSource:
+def _recording(path: Path) -> FrameSource:
     """Frames that a camera recorded beside its events."""
     from blinkgl.io.formats import open_events
 
-    notes: list[str] = []
-    times = _listed(declared, None, notes, path.name)
     file = open_events(path)
     first = next(file.frames(), None)
     if first is None:
         raise EventDataError("events need at least two frames", where=str(path), value="0 frames")
-
-    def frames() -> Frames:
-        i = -1
-        for i, frame in enumerate(file.frames()):
-            if times is not None and i >= len(times):
-                break
-            yield frame.image, None if declared.fps else times[i] if times is not None else frame.t_us * 1000, f"#{i}"
-        if times is not None and i + 1 != len(times):
-            raise EventDataError(
-                f"no time stamp for frame {i}" if i >= len(times) else "more time stamps than frames",
-                where=str(declared.timestamps),
-                value=f"{len(times)} stamps",
-                accepted="one per frame",
-            )
-
-    return FrameSource(
-        path,
-        *first.image.shape[:2],
-        None,
-        declared.fps,
-        frames,
-        "camera",
-        "linear",
-        notes=notes,
-        zero_time=declared.zero_time,
-    )
+    frames = lambda: ((frame.image, frame.t_us * 1000, f"#{i}") for i, frame in enumerate(file.frames()))
+    return FrameSource(path, *first.image.shape[:2], None, frames, True, "camera", "linear")

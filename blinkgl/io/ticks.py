@@ -9,7 +9,6 @@ from itertools import pairwise
 
 _HALF = Fraction(51, 100)
 """Ticks by which a rounded stamp may differ from the time that was rounded."""
-_NTSC = [Fraction(n * 1000, 1001) for n in (24, 30, 48, 60, 120, 240)]
 
 
 def frame_times(
@@ -21,8 +20,7 @@ def frame_times(
     Hz.
 
     Stamps are rounded times. Where one constant rate explains all of them the times are those of that rate: a stated
-    one, else the roundest that does. Where all stamps are near multiples of a stated rate's interval, as in a clip with
-    pauses, they are those multiples. Else they are taken as they are; frames of one stamp share the time up to the next
+    one, else the roundest that does. Else they are taken as they are; frames of one stamp share the time up to the next
     stamp evenly, and the line says so.
 
     Raises nothing: stamps that cannot be times are for the caller to refuse."""
@@ -33,13 +31,7 @@ def frame_times(
     exact = lambda values: [round((offset + value) * 10**9) for value in values]
     if (rate := _constant(steps, tick, rates)) is not None:
         return exact(k / rate for k in range(len(steps))), None
-    repeated = any(a == b for a, b in pairwise(steps))
-    for rate in sorted(set(rates)):
-        grid = [round(step * tick * rate) for step in steps]
-        near = all(abs(n / rate - step * tick) <= _HALF * tick for n, step in zip(grid, steps))
-        if near and rate * tick <= Fraction(1, 2) and all(a < b for a, b in pairwise(grid)):
-            return exact(n / rate for n in grid), None
-    if not repeated:
+    if all(a != b for a, b in pairwise(steps)):
         return exact(step * tick for step in steps), None
     note = f"frames share stamps of {float(tick) * 1000:g} ms: spaced evenly in between (--fps for a constant rate)"
     return exact(tick * step for step in _spread(steps)), note
@@ -50,14 +42,12 @@ def _constant(steps: Sequence[int], tick: Fraction, rates: Sequence[Fraction]) -
     if len(steps) < 3 or steps[-1] <= 0:
         return None
     for rate in rates:
-        if all(abs(k / rate - step * tick) <= tick * (1 if k else 0) for k, step in enumerate(steps)):
+        off = [step - k / (rate * tick) for k, step in enumerate(steps)]
+        if max(off) - min(off) <= 2 * _HALF:  # the first stamp was rounded, too
             return rate
-    for slack in (_HALF, 2 * _HALF):  # the first stamp may have been rounded, too
-        low = max((step - slack) * tick / k for k, step in enumerate(steps) if k)
-        high = min((step + slack) * tick / k for k, step in enumerate(steps) if k)
-        if 0 < low <= high:
-            return next((rate for rate in _NTSC if low <= 1 / rate <= high), None) or _roundest(1 / high, 1 / low)
-    return None
+    low = max((step - _HALF) * tick / k for k, step in enumerate(steps) if k)
+    high = min((step + _HALF) * tick / k for k, step in enumerate(steps) if k)
+    return _roundest(1 / high, 1 / low) if 0 < low <= high else None
 
 
 def _roundest(low: Fraction, high: Fraction) -> Fraction:

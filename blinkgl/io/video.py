@@ -214,7 +214,7 @@ class VideoReader:
             if frame.is_corrupt:
                 damage = damage or "a frame is corrupt"
                 break
-            time = None
+            time = None if pts or count >= self.count else self.times_ns[count]
             if pts and frame.pts is not None:
                 # Packets that gave no frame are passed over, so that the others keep their times.
                 while at < len(pts) and pts[at] < frame.pts:
@@ -307,7 +307,9 @@ class VideoReader:
         if file.format.name == "avi" and stamps:  # its stamps count decoding, which begins earlier
             self._start = min(stamps) * self._tick
         if without:  # some AVI and raw streams: nothing says when, so the frame rate does
-            return _Scan([None] * found, [], None, problem)
+            rate = stream.average_rate or stream.guessed_rate
+            times = [round(k * 10**9 / rate) if rate else None for k in range(found)]
+            return _Scan(times, [], None, problem)
         ticks = sorted(stamps)
         rates = [rate for rate in (stream.average_rate, stream.base_rate, stream.guessed_rate) if rate]
         times, note = frame_times(ticks, self._tick, self._start, rates)

@@ -52,7 +52,7 @@ def test_video(tmp_path):
     assert [t for _, t, _ in open_frames(tmp_path / "v.mp4", Declared(fps=1000))] == [i * 10**6 for i in range(5)]
     for count in (3, 6):
         (tmp_path / "t.txt").write_text("".join(f"{k}\n" for k in range(count)))
-        with pytest.raises(EventDataError, match=f"one time stamp per frame of v.mp4 .got '{count} stamps, 5 frames'"):
+        with pytest.raises(EventDataError, match=f"v.mp4: one time stamp per frame .got '{count} stamps, 5 frames'"):
             open_frames(tmp_path / "v.mp4", Declared(timestamps=tmp_path / "t.txt"))
 
 
@@ -113,7 +113,7 @@ def image_of(shape):
         (
             lambda f: (f / "timestamps.txt").write_text("0\n1\n"),
             None,
-            "one time stamp per image .got '2 stamps, 3 images'",
+            "one time stamp per frame .got '2 stamps, 3 frames'",
         ),
         (lambda f: (f / "timestamps.txt").write_text("0 f0.png\n1 f1.png\n"), None, "no time stamp for image f2.png"),
         (

@@ -62,7 +62,7 @@ class SensorConfig(Config):
     pixel_pitch_um: float | None = Field(
         None, gt=0, le=1000, description="Distance between pixel centres, micrometres."
     )
-    frame_gamma: Literal["linear", "srgb", "pq", "hlg"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
+    frame_gamma: Literal["linear", "srgb"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
         None,
         description="Curve from the codes of the camera's own frames to light: `linear`, `srgb` or an exponent. "
         "Grey images of the sensor's size are taken as its own unless specified.",

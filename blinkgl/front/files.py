@@ -14,13 +14,13 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.front import arguments as check
 from blinkgl.io import formats
 from blinkgl.io.formats import EventFile
-from blinkgl.io.frames import Declared
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from blinkgl.front.sections import EmulatorSettings
+    from blinkgl.io.frames import Declared
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import FrameUse, SimulationReport
@@ -441,6 +441,8 @@ def _options(
 
 def _declared(given: Mapping[str, Any]) -> Declared:
     """Return what is declared of frames. Raises ConfigError."""
+    from blinkgl.io.frames import Declared
+
     fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
     return Declared(
         None if fps is None else check.number(fps, "fps", above=0, most=1e9),
@@ -459,7 +461,7 @@ def _frames(frames: Iterable) -> Iterator:
         try:
             array, *rest = item if isinstance(item, tuple) else (item,)
             array = np.asarray(array)
-            if not 0 <= len(rest) <= 2:
+            if not 0 <= len(rest) <= 2 or (rest and not isinstance(rest[0], (int, float, np.integer, np.floating))):
                 raise ValueError
         except (TypeError, ValueError, OverflowError):
             raise EventDataError(

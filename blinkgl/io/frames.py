@@ -50,7 +50,7 @@ class Declared:
     range: str | None = None
     background: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
             raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
         if self.time_unit != "frames":

@@ -22,7 +22,7 @@ BAND = 4.0
 """Standard deviations of the noise within which a change counts as noise: of a hundred thousand static pixels, a dozen
 exceed it per frame. For two recordings by static cameras, 3 leaves 0.6 and 4.5 times the event camera's events at
 static pixels, 4 leaves 0.4 and 2.2; 5 begins to lose events of motion."""
-_LEAP = 2.0
+_LEAP = 3.0
 """Bands by which the light has to change for a pixel to take it at once, instead of being pushed."""
 MOST_CODES = 10.0
 """Of 255: standard deviation at middle brightness beyond which changes are no camera's noise but the scene's, such as a

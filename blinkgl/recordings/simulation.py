@@ -120,7 +120,7 @@ class SimulationReport:
 
 def frames_to_events(
     frames: Iterable,
-    use: FrameUse | None = None,
+    use: FrameUse = FrameUse(),
     *,
     fps: float | None = None,
     unit: str = "ns",
@@ -160,9 +160,8 @@ def frames_to_events(
     ConfigError : unknown emulator, gamma, unit or interpolation.
     """
     report = report if report is not None else SimulationReport()
-    if use is None:
-        of_codes = {key: given.pop(key) for key in ("gamma", "white_level", "range", "own") if key in given}
-        use = FrameUse(Codes(**of_codes), **given)
+    of_codes = {key: given.pop(key) for key in ("gamma", "white_level", "range", "own") if key in given}
+    use = replace(use, codes=replace(use.codes, **of_codes), **given)
     checked_unit(unit, "unit")
     steps = simulated_steps(
         frames,

@@ -191,7 +191,7 @@ def share(frames, after: int = 0) -> float:
         ([np.full((H, W), 30, np.uint8)] * 10 + [grain(TEXTURE, 4) for _ in range(40)], 11, 0.02),  # a grey one
         ([TEXTURE.astype(np.uint8)] * 20 + [grain(TEXTURE, 4) for _ in range(40)], 21, 0.02),  # a clean title
         ([grain(TEXTURE * (1 + 0.05 * (-1) ** k), 2) for k in range(40)], 1, 0.02),  # flicker
-        ([grain(p, 4) for p in (TEXTURE, SMOOTH[:, :W], TEXTURE[::-1]) for _ in range(20)], 41, 0.1),  # cuts
+        ([grain(p, 4) for p in (TEXTURE, SMOOTH[:, :W], TEXTURE[::-1]) for _ in range(20)], 41, 0.2),  # cuts
         ([np.stack([grain(TEXTURE, 4)] * 3, -1) for _ in range(30)], 1, 0.01),
         ([grain(TEXTURE, 4).astype(np.uint16) * 257 for _ in range(30)], 1, 0.01),
     ],

@@ -173,16 +173,32 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
 
 
 @check.public
-def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
+def read_trajectory(
+    path: str | os.PathLike,
+    *,
+    form: str | None = None,
+    columns: str | None = None,
+    time_unit: str | None = None,
+    maps_from: str | None = None,
+    axes: str | None = None,
+    rate: float | None = None,
+    times: str | os.PathLike | None = None,
+    notes: list[str] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) int64 ns and poses T_world_body (N, 4, 4) float64, with OpenCV's axes, of a table with or
+    without a heading, KITTI's poses, COLMAP's images.txt or NeRF's transforms.json.
 
-    form : "tum" or "euroc"; None: EuRoC if lines contain commas.
-    Raises AssetError with the line: invalid pose, times that do not increase, a gap."""
+    form : "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"; None: by heading and content.
+    columns : names, such as "t x y z qw qx qy qz".   time_unit : "s", "ms", "us", "ns".   maps_from : "camera" or
+    "world".   axes : of the camera, "opencv", "opengl", "ned".   rate : poses per second, or times : a file of times,
+    for a file without them.   notes : gets what was guessed, a line each.
+    Raises AssetError with the line: invalid pose, times that do not increase, a gap; ConfigError."""
     from blinkgl.io import trajectories
 
-    if form not in (None, *trajectories.FORMATS):
-        raise ConfigError("unknown form", where="form", value=form, accepted="tum, euroc or None")
-    return trajectories.read_trajectory(check.path(path, "path"), form)
+    per_second = None if rate is None else check.number(rate, "rate", above=0, most=1e9)
+    given = None if times is None else check.path(times, "times")
+    declared = trajectories.PoseFile(form, columns, time_unit, maps_from, axes, per_second, given)
+    return trajectories.read_trajectory(check.path(path, "path"), declared, notes)
 
 
 @check.public

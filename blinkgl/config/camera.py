@@ -56,7 +56,7 @@ class CameraConfig(Config):
     )
     calibration: str | None = Field(
         None,
-        description="YAML file of Kalibr (camchain), DSEC (cam_to_cam) or EuRoC (sensor); its size, lens, "
+        description="file of Kalibr, DSEC, EuRoC, OpenCV, ROS, COLMAP or Metavision; its size, lens, "
         "distortion, fx, fy, cx and cy replace this key when the run is read",
     )
     calibration_name: str | None = Field(

@@ -331,7 +331,7 @@ def test_a_camera_beside_the_body_that_the_file_is_of(flight):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("T_BS", "T_SB"), "T_BS: not a rigid transform"),
+        (("T_BS", "T_SB"), "no place on a body"),
         (("0.0148655429818", "1.0148655429818"), "T_BS: not a rigid transform"),
         (("0.0148655429818", ".nan"), "T_BS: not a rigid transform"),
         (("0.0, 0.0, 0.0, 1.0]", "0.0, 0.0]"), "T_BS: not a rigid transform"),

@@ -126,9 +126,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "file": {"scene": _FILE},
         "living": {"scene": _LIVING},
         "explicit, alive": {"scene": _ALIVE},
-        "frames, motion": _frames(interpolate="motion", max_px=0.5, gamma="pq"),
-        "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear", range="limited"),
-        "frames, codes": _frames(interpolate="linear", gamma="srgb", white_level=200),
+        "frames, motion": _frames(interpolate="motion", max_px=0.5),
+        "frames, linear": _frames(
+            interpolate="linear", flow="flow_flo", gamma="linear", range="limited", check_flow=False
+        ),
         "frames, part": _frames(
             interpolate="linear", gamma="hlg", range="full", flow=None, first=1, count=4, keep_noise=True
         ),

@@ -280,10 +280,15 @@ def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool
 
 
 def crease_normals(
-    vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    welded: np.ndarray,
+    crease_degrees: float = CREASE_DEGREES,
+    groups: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return (F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point
-    that are joined by edges bent less than ``crease_degrees``."""
+    that are joined by edges bent less than ``crease_degrees``; with (F,) ``groups`` instead by edges between two faces
+    of one smoothing group, 0: of none."""
     cross = _face_cross(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
     corners = vertices[faces]
@@ -298,7 +303,10 @@ def crease_normals(
     order = np.lexsort((high, low))
     same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
     first, second = order[:-1][same], order[1:][same]  # edge numbers 3*face + k
-    smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
+    if groups is None:
+        smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
+    else:
+        smooth = (groups[first // 3] == groups[second // 3]) & (groups[first // 3] > 0)
     first, second = first[smooth], second[smooth]
     f_next, s_next = first - first % 3 + (first % 3 + 1) % 3, second - second % 3 + (second % 3 + 1) % 3
     # The edge's two ends: joined corners are those at the same welded point (faces may be wound either way).

@@ -21,8 +21,8 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.importing.gltf_file import MAX_NODES, Node, buffers_of, index_of, item, needs, nodes_of, parse
-from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE, INVISIBLE_EXTENSIONS, Materials
-from blinkgl.scene.importing.parts import RawMesh
+from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE_EXTENSIONS, Materials
+from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
 from blinkgl.scene.reading import Omissions, contents, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
@@ -292,11 +292,7 @@ class Document:
         colours = np.clip(np.nan_to_num(given[:, :3]), 0, 1)
         if width == 4 and material is not None and material.mask is not None and (given[:, 3] < 1).any():
             self.omissions.add("opacity of vertex colours (left out)")
-        material = material or Material()
-        if len(colours) and not (colours == colours[0]).all():
-            return material, colours
-        factor = colours[0] * material.base_color if len(colours) else material.base_color
-        return replace(material, base_color=tuple(float(c) for c in factor)), None
+        return tinted(material, colours)
 
     def _without_coordinates(self, material: Material | None) -> Material | None:
         """Return the material of a mesh without texture coordinates, without normal map, whose direction is then

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blinkgl.scene.importing.gltf_file import fetch, index_of, item
+from blinkgl.scene.importing.parts import INVISIBLE
 from blinkgl.scene.reading import Omissions
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
 from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
@@ -27,8 +28,6 @@ INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
 """Extensions without visible effect."""
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
-INVISIBLE = Material()
-"""A material that is cut off everywhere."""
 
 
 class _Place(NamedTuple):

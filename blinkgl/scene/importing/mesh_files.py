@@ -1,5 +1,5 @@
-"""Mesh files (obj, ply, stl by :mod:`blinkgl.scene.importing.trimesh_files`; glb, gltf by
-:mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
+"""Mesh files (obj, ply, each by a reader of its own; stl, off, 3mf by :mod:`blinkgl.scene.importing.trimesh_files`;
+glb, gltf by :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
 Sizes that a file declares are checked against limits before memory is allocated, and only files in the file's own
 folder are read.
@@ -21,13 +21,15 @@ from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play as play_clip
 from blinkgl.scene.importing.gltf_file import buffer_contents
+from blinkgl.scene.importing.obj import read_obj
 from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
+from blinkgl.scene.importing.ply import read_ply
 from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".3mf", ".glb", ".gltf")
 ClipOf = Callable[[gltf.Document], Animation]
 
 
@@ -134,13 +136,22 @@ def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, 
         return _of_document(document, play, turn), digest
     if play is not None:
         raise AssetError("only glTF files have animations", where=where, accepted="a gltf or glb file, or no animation")
+    omissions, log = Omissions(path.name), []
+    raws = _reader(suffix)(path, data, max_faces, max_texture if materials else None, omissions, log)
+    raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
+    return _Found(raws, [None] * len(raws), log, omissions, []), digest
+
+
+def _reader(suffix: str) -> Callable[..., list[RawMesh]]:
+    """Return the function that reads a kind of file other than glTF."""
+    if suffix == ".obj":
+        return read_obj
+    if suffix == ".ply":
+        return read_ply
     # Here: trimesh takes half as long to import as everything else that a worker needs, and most scenes do not use it.
     from blinkgl.scene.importing.trimesh_files import read_meshes
 
-    omissions = Omissions(path.name)
-    raws = read_meshes(path, data, suffix[1:], max_faces, max_texture if materials else None, omissions)
-    raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
-    return _Found(raws, [None] * len(raws), [], omissions, []), digest
+    return read_meshes
 
 
 def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:

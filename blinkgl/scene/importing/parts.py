@@ -15,6 +15,8 @@ from blinkgl.scene.types import Material, Part
 # ---------------------------------------------------------------------------------------------------------------------
 # Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
 
+INVISIBLE = Material()
+"""The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere."""
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
@@ -35,6 +37,16 @@ class RawMesh:
     binding: tuple[np.ndarray, np.ndarray] | None = None
     targets: tuple[np.ndarray, np.ndarray | None] | None = None
     colours: np.ndarray | None = None
+
+
+def tinted(material: Material | None, colours: np.ndarray) -> tuple[Material, np.ndarray | None]:
+    """Return (the material, (V, 3) linear factors on it); one colour on all vertices becomes part of the material, with
+    None for the factors."""
+    material = material or Material()
+    if len(colours) and not (colours == colours[0]).all():
+        return material, colours
+    r, g, b = (float(c) for c in (colours[0] * material.base_color if len(colours) else material.base_color))
+    return replace(material, base_color=(r, g, b)), None
 
 
 def transformed(raw: RawMesh, matrix: np.ndarray) -> RawMesh:

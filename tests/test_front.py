@@ -167,7 +167,7 @@ def test_arrays_as_mesh_and_image():
     )
     camera = blinkgl.Camera(32, 32, fov=53.13, pose=(-2, 0, 0))
     scene = blinkgl.Scene(camera, light=blinkgl.Light(unlit=True), background=0.5) + blinkgl.Mesh(
-        **square, material=blinkgl.Material(image, double_sided=True)
+        **square, material=blinkgl.Material(image, both_sides=True)
     )
     frame = blinkgl.render_frame(scene, 0.0, ["images", "depth", "ids"])
     # The camera looks along +x, so that +y, where u is 1, is on its left.

@@ -53,6 +53,13 @@ class ObjectsConfig(Config):
     deform: RandomDeformConfig = RandomDeformConfig()
 
 
+BOTH_SIDES = Field(
+    None,
+    description="faces of files are drawn from both sides, or from their front alone; null: as each file says (glTF's "
+    "doubleSided; both sides for the other formats, which do not say)",
+)
+
+
 class PoolConfig(Config):
     """Source of the random world's objects."""
 
@@ -172,6 +179,7 @@ class RandomSceneConfig(Config):
         0.3, gt=0, le=1e4, description="radius of the empty sphere around the camera centre, m"
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    both_sides: bool | None = BOTH_SIDES
     removed: ClassVar[Any] = {
         "walls": Removed(
             "scene: {kind: explicit} with objects of category: wall",
@@ -349,6 +357,7 @@ class ExplicitSceneConfig(Config):
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    both_sides: bool | None = BOTH_SIDES
     max_faces: ClassVar[Any] = 5_000_000
     fixed: ClassVar[Any] = ("max_faces",)
 
@@ -410,6 +419,7 @@ class FileSceneConfig(Config):
         "remain",
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    both_sides: bool | None = BOTH_SIDES
     lights_gain: Positive = Field(
         1.0,
         description="factor on the file's lights; their lux and candela are divided by 683 lm/W, the factor of "

@@ -1,5 +1,5 @@
 """Conversion of any triangles to a valid :class:`~blinkgl.scene.types.Mesh`: checked, cleaned, with normals and texture
-coordinates, and tested for closedness."""
+coordinates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.shapes.deformer import Deformer, filled
@@ -17,9 +16,6 @@ from blinkgl.scene.types import Mesh, Scene
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
-COARSE_WELD_RELATIVE = (
-    1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part separately
-)
 _MAX_REPEATS = 1e9  # of a texture: float32 has no fraction left, and overflows later
 _MAX_COORDINATE = 1e15  # squares of larger coordinates are inaccurate in float32 and overflow soon after
 
@@ -53,8 +49,8 @@ def make_mesh(
     source : gets (W,) int64, the index of the given vertex of each of the mesh's; then no two of different origin are
     joined.
 
-    Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is reversed. Raises
-    :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
+    Faces without area are dropped and unused vertices removed; no face is turned round. Raises :class:`AssetError`
+    (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
@@ -64,10 +60,7 @@ def make_mesh(
     uvs_given = uvs is not None
     uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
 
-    points, welded = weld(vertices, faces)
-    closed, inside_out = closed_or_nearly(points, welded)  # before slivers are dropped: they close gaps of no width
-    kept = _worth_drawing(vertices, faces, where, label, log)
-    faces, welded = faces[kept], welded[kept]
+    faces = faces[_worth_drawing(vertices, faces, where, label, log)]
     if normals is not None and not _usable_normals(normals, vertices, faces):
         log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
@@ -76,16 +69,11 @@ def make_mesh(
         uvs = None
 
     # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    corner_normals = crease_normals(vertices, faces, welded) if normals is None else normals[faces]
+    corner_normals = crease_normals(vertices, faces, weld(vertices, faces)[1]) if normals is None else normals[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
-    if inside_out:
-        log.append(f"{label}: the mesh was inside out, turned round")
-        faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
-        if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
-            corner_normals = -corner_normals
     corners = None if source is None else origin[faces]
     mesh, first = _from_corners(
-        vertices[faces], corner_normals, corner_uvs, corners, closed=closed, name=name, source_hash=source_hash
+        vertices[faces], corner_normals, corner_uvs, corners, name=name, source_hash=source_hash
     )
     if source is not None and corners is not None:
         source.append(corners.ravel()[first])
@@ -225,58 +213,19 @@ def _components(left: np.ndarray, right: np.ndarray, count: int) -> tuple[int, n
     )
 
 
-def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """Return (closed, inside_out) of a welded mesh.
-
-    Closed: every directed edge occurs as often as its reverse (an oriented surface without a boundary, which also
-    allows solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of
-    one that has.
-    """
+def closedness(points: np.ndarray, welded: np.ndarray) -> bool:
+    """Return whether a welded mesh is closed and wound outwards: every directed edge occurs as often as its reverse (an
+    oriented surface without a boundary, which also allows solids that touch along an edge), around no negative
+    volume."""
     alive = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
-    welded = welded[alive]
-    if not len(welded):
-        return False, False
-    count = len(points)
+    welded, count = welded[alive], len(points)
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
-    if not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
-        return False, False
-    _, shell = _components(start, end, count)
+    if not len(welded) or not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
+        return False
     a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
-    volumes = np.bincount(shell[welded[:, 0]], weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
-    # A sheet made of two coincident layers has no volume and counts as closed.
+    # A sheet of two coincident layers has no volume and counts as closed.
     noise = 1e-9 * float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) ** 3
-    inside_out = bool(volumes.sum() < -noise)
-    volumes = -volumes if inside_out else volumes
-    shells = np.unique(shell[welded[:, 0]])
-    hollow = [s for s in shells if volumes[s] < -noise]
-    if len(hollow) > 64:
-        return False, False
-    boxes = {s: (points[shell == s].min(axis=0), points[shell == s].max(axis=0)) for s in shells} if hollow else {}
-    for s in hollow:
-        low, high = boxes[s]
-        if not any(volumes[o] > 0 and (boxes[o][0] <= low).all() and (boxes[o][1] >= high).all() for o in shells):
-            return False, False
-    return True, inside_out
-
-
-def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """Return :func:`closedness`; when that fails, also over points merged within ``COARSE_WELD_RELATIVE`` of the
-    extent, which closes gaps that no pixel can show."""
-    closed, inside_out = closedness(points, welded)
-    if closed:
-        return closed, inside_out
-    extent = float((points.max(axis=0) - points.min(axis=0)).max())
-    near = (
-        cKDTree(points).query_pairs(extent * COARSE_WELD_RELATIVE, output_type="ndarray")
-        if len(points) < 100_000
-        else []
-    )
-    if len(near) == 0 or len(near) > 4 * len(points):  # nothing to merge, or so fine a mesh that all of it would be
-        return False, False
-    count, label = _components(near[:, 0], near[:, 1], len(points))
-    merged = np.empty((count, 3))
-    merged[label] = points
-    return closedness(merged, label[welded].astype(np.int64))
+    return bool(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 >= -noise)
 
 
 def crease_normals(
@@ -478,7 +427,7 @@ def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:
-    """Return one mesh of several; closed when they are closed together (see :func:`closed_together`)."""
+    """Return one mesh of several."""
     if len(meshes) == 1:
         return replace(meshes[0], name=name or meshes[0].name, source_hash=source_hash or meshes[0].source_hash)
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
@@ -487,18 +436,7 @@ def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = 
         faces=np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.int32),
         normals=np.concatenate([m.normals for m in meshes]),
         uvs=np.concatenate([m.uvs for m in meshes]),
-        closed=closed_together(meshes),
+        closed=all(m.closed for m in meshes),
         name=name,
         source_hash=source_hash,
     )
-
-
-def closed_together(meshes: tuple[Mesh, ...]) -> bool:
-    """Return whether the union of the meshes is closed: files often split one solid by material."""
-    if all(m.closed for m in meshes):
-        return True
-    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    vertices = np.concatenate([m.vertices for m in meshes])
-    faces = np.concatenate([m.faces.astype(np.int64) + o for m, o in zip(meshes, offsets)])
-    closed, inside_out = closed_or_nearly(*weld(vertices, faces))
-    return closed and not inside_out

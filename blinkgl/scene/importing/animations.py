@@ -189,8 +189,11 @@ def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[
         if raw.binding is None:  # follows the node, without joints
             return transformed(raw, document.world(node))
         skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *raw.binding, where=document.path.name)
-        turned = None if raw.normals is None else skin.normals(shape, 0)
-        raw = replace(raw, vertices=skin.positions(shape, 0), normals=turned, binding=None)
+        # Joints that mirror turn faces and normals round.
+        mirrored = skin.mirrored(0)
+        turned = None if raw.normals is None else skin.normals(shape, 0) * np.where(mirrored, -1.0, 1.0)[:, None]
+        faces = np.where(mirrored[raw.faces[:, :1]], raw.faces[:, ::-1], raw.faces)
+        raw = replace(raw, vertices=skin.positions(shape, 0), normals=turned, binding=None, faces=faces)
     return raw
 
 

@@ -139,7 +139,8 @@ class Document:
             material, colours = self._coloured(primitive, material, len(vertices))
             material = self._without_coordinates(material) if uvs is None else material
         binding, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
-        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours)
+        both = material is not None and bool(material.both_sides)
+        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours, both)
 
     def _faces(self, primitive: dict, mesh: int, count: int) -> np.ndarray:
         """Return the faces of a primitive of ``count`` vertices, (F, 3); without indices the vertices' order counts."""

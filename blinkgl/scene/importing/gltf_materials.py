@@ -67,7 +67,7 @@ class Materials:
                 texture=self._texture(info["index"]) if info and self.wanted else None,
                 base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
                 unlit="KHR_materials_unlit" in m.get("extensions", {}),
-                double_sided=m.get("doubleSided", False),
+                both_sides=m.get("doubleSided", False),
             )
             if self.wanted:
                 material, base = self._surface(material, m, pbr, base)

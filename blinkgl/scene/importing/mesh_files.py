@@ -22,7 +22,7 @@ from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play as play_clip
 from blinkgl.scene.importing.gltf_file import buffer_contents
 from blinkgl.scene.importing.obj import read_obj
-from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
+from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.importing.ply import read_ply
 from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
@@ -98,7 +98,7 @@ def load_asset(
         )
     if not parts:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    parts = closed_parts(parts) if has_materials else _one_part(parts, path.stem, digest)
+    parts = parts if has_materials else _white(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
     asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
     given = {"max_faces": max_faces, "max_bytes": max_bytes, "keep_materials": keep_materials, "uv_size": uv_size}
@@ -175,11 +175,14 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
     return found
 
 
-def _one_part(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:
-    """Return white parts as one, unless their deformations cannot be joined."""
-    meshes = tuple(part.mesh for part in parts)
-    whole = joined_mesh(meshes, name, digest)
-    return tuple(Part(mesh, Material()) for mesh in ((whole,) if whole is not None else meshes))
+def _white(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:
+    """Return white parts: one for each kind of sides, unless their deformations cannot be joined."""
+    made: list[Part] = []
+    for both in dict.fromkeys(part.material.both_sides for part in parts):
+        meshes = tuple(part.mesh for part in parts if part.material.both_sides == both)
+        whole = joined_mesh(meshes, name, digest)
+        made += [Part(mesh, Material(both_sides=both)) for mesh in ((whole,) if whole is not None else meshes)]
+    return tuple(made)
 
 
 def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh | None:

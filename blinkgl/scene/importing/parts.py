@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blinkgl.scene.geometry.meshes import closed_together, make_mesh
+from blinkgl.scene.geometry.meshes import make_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.types import Material, Part
@@ -27,7 +27,8 @@ class RawMesh:
 
     binding : (V, k) joints of the node's skin and (V, k) weights; None: no skin.
     targets : morph targets, (n, V, 3) positions, likewise normals or None; None: none.
-    colours : (V, 3) linear factors on the albedo; None: none."""
+    colours : (V, 3) linear factors on the albedo; None: none.
+    both_sides : whether its file draws its faces from both sides; a file that does not say so does."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -37,6 +38,7 @@ class RawMesh:
     binding: tuple[np.ndarray, np.ndarray] | None = None
     targets: tuple[np.ndarray, np.ndarray | None] | None = None
     colours: np.ndarray | None = None
+    both_sides: bool = True
 
 
 def tinted(material: Material | None, colours: np.ndarray) -> tuple[Material, np.ndarray | None]:
@@ -82,6 +84,7 @@ def part_of(
 
     materials : whether it has its own; False: a white one, for any texture. Raises AssetError."""
     material = raw.material if materials and raw.material is not None else Material()
+    material = replace(material, both_sides=raw.both_sides)
     colours = raw.colours if materials else None
     bumped = material.bumps is not None
     # Only per-vertex data of the file needs the indices of the mesh's vertices.
@@ -109,11 +112,3 @@ def part_of(
         mesh, kept = split_mirrored(mesh)
         index = index[kept]
     return Part(mesh if deformer is None else replace(mesh, deformer=deformer(raw, index)), material)
-
-
-def closed_parts(parts: Iterable[Part]) -> tuple[Part, ...]:
-    """Return the parts, each marked closed where they are closed together: one solid, split by material."""
-    parts = tuple(parts)
-    if not closed_together(tuple(part.mesh for part in parts)):
-        return parts
-    return tuple(Part(replace(part.mesh, closed=True), part.material) for part in parts)

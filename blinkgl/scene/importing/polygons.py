@@ -62,6 +62,11 @@ def raw_meshes(
         welded = weld(given.points, at)[1] if groups is None else at
         made = crease_normals(given.points, at, welded, groups=groups)
         normals[missing] = made[missing]
+    # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
+    a, b, c = (given.points[at[:, k]] for k in range(3))
+    behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0
+    for array in (triangles, at, normals):
+        array[behind] = array[behind, ::-1]
     uvs = np.full((len(given.places), 2), np.nan) if given.uvs is None else given.uvs * [1, -1] + [0, 1]
     mapped = np.isfinite(uvs[triangles]).all(axis=(1, 2))
     surface = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]

@@ -22,7 +22,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play
-from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
+from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.reading import reading
@@ -65,8 +65,9 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
             lights_gain=config.lights_gain if own else None,
         )
     light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
-    scene = replace(scene, light=light, objects=objects, background=config.background)
-    return unlit(scene) if config.light.unlit else scene
+    changes: dict = {"unlit": True} if config.light.unlit else {}
+    changes |= {} if config.both_sides is None else {"both_sides": config.both_sides}
+    return dressed(replace(scene, light=light, objects=objects, background=config.background), **changes)
 
 
 def from_document(
@@ -155,11 +156,11 @@ def _object(
     return _parts(raws, baked, node.name, document, deformer), path
 
 
-def unlit(scene: Scene) -> Scene:
-    """Return the scene with radiance = albedo everywhere."""
+def dressed(scene: Scene, **changes: bool) -> Scene:
+    """Return the scene with these ``changes`` to all materials."""
 
     def of(parts):
-        return tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in parts)
+        return tuple(Part(p.mesh, replace(p.material, **changes)) for p in parts)
 
     return replace(scene, objects=tuple(replace(o, parts=of(o.parts)) for o in scene.objects))
 
@@ -188,7 +189,7 @@ def _parts(
         digest = content_hash(raw.vertices.tobytes(), np.ascontiguousarray(raw.faces, np.int64).tobytes())
         given = {"name": name, "where": document.where, "source_hash": digest, "log": document.log}
         parts.append(part_of(raw, **given, deformer=deformer))
-    return closed_parts(parts)
+    return tuple(parts)
 
 
 # ---- glTF

@@ -73,7 +73,7 @@ def test_the_hierarchy_is_composed_and_scale_is_baked(tmp_path):
     builder.node(name="parent", translation=[0, 5, 0], rotation=quarter, scale=[3, 3, 3], children=[child])
     scene = load(tmp_path, builder)
     (o,) = scene.objects
-    assert o.name == "child" and o.instance_id == 1 and o.parts[0].mesh.closed
+    assert o.name == "child" and o.instance_id == 1 and o.parts[0].culled
     # file: box 2x2x3 scaled by 3 -> 6x6x9 about (3, 0, 0), x -> -z, then +5 y; world: (x, y, z) -> (x, -z, y)
     np.testing.assert_allclose(bounds(world(o)), [[-4.5, 0, 2], [4.5, 6, 8]], atol=1e-6)
     assert volume(o.parts[0].mesh) == pytest.approx(6 * 2 * 27, rel=1e-6)
@@ -121,7 +121,7 @@ def test_materials(tmp_path):
         builder.node(mesh=triangle(builder, uvs=uvs, material=m))
     builder.node(mesh=triangle(builder))
     first, second, third = (o.parts[0] for o in load(tmp_path, builder).objects)
-    assert first.material.base_color == (0.5, 0.25, 1) and first.material.double_sided and not first.material.unlit
+    assert first.material.base_color == (0.5, 0.25, 1) and first.material.both_sides and not first.material.unlit
     np.testing.assert_array_equal(first.material.texture.image, pixels)
     assert second.material.unlit and second.material.texture is first.material.texture
     # uv (0, 0) is the image's first pixel, top left, and v grows downwards: as in the file

@@ -170,7 +170,7 @@ def test_bad_material_files(tmp_path, mtl, problem):
         (SQUARE + "f 1/1 2/1 3/1\n", "(got '1'); expected a file with such vertices"),
         (SQUARE + "f 1 2 3.5\n", "a.obj, line 5: a face is corrupt (got '3.5'); expected v, v/vt, v//vn, v/vt/vn"),
         ("v 0 0\n" + SQUARE + "f 1 2 3\n", "a.obj, line 1: numbers are missing, or are none"),
-        (SQUARE + "f 1 2 2\n", "the file has no faces"),
+        (SQUARE + "f 1 2 2\n", "the file has no visible faces"),
         (
             "v 0 0 0\n" * 3 + "f" + " 1 2 3" * (MAX_CORNERS // 3 + 1),
             f"a polygon has too many corners (got {MAX_CORNERS + 1}",

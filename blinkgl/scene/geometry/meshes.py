@@ -114,7 +114,7 @@ def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray 
 
 def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: str, log: list[str]) -> np.ndarray:
     """Return (F,) bool: faces with an area. Raises AssetError where there are none."""
-    kept = _faces_with_area(vertices, faces)
+    kept = faces_with_area(vertices, faces)
     if not kept.any():
         raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
     if (~kept).mean() > 0.1:  # a few slivers are in almost every file
@@ -122,7 +122,7 @@ def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: s
     return kept
 
 
-def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return (F,) bool. A sliver is compared with its own longest edge, so that small meshes are not dropped."""
     corners = vertices[faces]
     height, longest = _height_and_edge(corners)
@@ -191,7 +191,8 @@ def _usable_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     if normals.shape != vertices.shape:
         return False
     length = np.linalg.norm(normals[faces], axis=2)
-    return bool(np.isfinite(length).all() and (length > 1e-6).all())
+    # Directions of any length: those of a file in mm have the square of its scale. Shorter ones are rounding.
+    return bool(np.isfinite(length).all() and (length > 1e-150).all())
 
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

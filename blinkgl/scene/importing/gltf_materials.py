@@ -23,6 +23,9 @@ DRAWN = {
     "KHR_materials_emissive_strength",
     "KHR_texture_transform",
     "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_materials_variants",
+    "EXT_texture_webp",
 }
 INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
 """Extensions without visible effect."""
@@ -118,6 +121,9 @@ class Materials:
         least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
         # Half-transparent surfaces are not drawn: partly opaque ones are cut out, fully opaque ones are drawn.
         if mode == "BLEND":
+            if most == 0:
+                self.omissions.add("a material of opacity 0")
+                return INVISIBLE
             if most < cutoff:
                 self.omissions.add("alpha BLEND (drawn opaque)")
                 return material
@@ -160,9 +166,10 @@ class Materials:
     def _texture(self, index: int, kind: str = "colour") -> Texture | None:
         """Return a texture. kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is
         opaque."""
-        source = item(self.tree, "textures", index, self.where).get("source")
+        texture = item(self.tree, "textures", index, self.where)
+        source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         if source is None:
-            names = ", ".join(self.tree["textures"][index].get("extensions", {})) or "without an image"
+            names = ", ".join(texture.get("extensions", {})) or "without an image"
             self.omissions.add(f"textures of another kind ({names})")
             return None
         if (source, kind) not in self._textures:

@@ -19,7 +19,7 @@ from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play as play_clip
+from blinkgl.scene.importing.animations import Animation, clip_names, play as play_clip, shown
 from blinkgl.scene.importing.gltf_file import buffer_contents
 from blinkgl.scene.importing.obj import read_obj
 from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, part_of, transformed
@@ -97,7 +97,7 @@ def load_asset(
             if len(raw.faces) or len(found.raws) == 1
         )
     if not parts:
-        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+        raise AssetError("the file has no visible faces", where=where, accepted="a mesh with triangles")
     parts = parts if has_materials else _white(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
     asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
@@ -161,11 +161,8 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
     if clips and played is None:
         document.omissions.add("animations (the rest pose is drawn)")
     found = _Found([], [], document.log, document.omissions, clips)
-    for node in (i for i, n in document.nodes.items() if n.mesh is not None):
-        if played is None:
-            raws, world = meshes_at_rest(document, node)
-        else:
-            raws, world = document.raw_meshes(document.nodes[node].mesh), document.world(node)
+    for node in document.nodes:
+        raws, world = shown(document, node, played) or ([], np.eye(4))
         for raw in raws:
             placed = transformed(raw, world)
             found.raws.append(placed if turn is None else transformed(placed, turn))

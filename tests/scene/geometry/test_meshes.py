@@ -207,7 +207,7 @@ def test_normals_that_are_given_are_kept_unless_they_are_none():
     assert np.allclose(mesh.normals, [0.6, 0, 0.8]) and log == []
     kept = M.make_mesh(CUBE.vertices, CUBE.faces[:, ::-1], normals=CUBE.vertices)
     assert ((kept.normals * kept.vertices).sum(axis=1) > 0).all()
-    for row, bad in ((0, 0.0), (3, np.nan), (7, 0.9e-6)):
+    for row, bad in ((0, 0.0), (3, np.nan), (7, 0.9e-150)):
         broken = np.array(CUBE.vertices)
         broken[row] = [bad, 0, 0]
         log.clear()
@@ -217,7 +217,7 @@ def test_normals_that_are_given_are_kept_unless_they_are_none():
         )
     assert (np.abs(M.make_mesh(CUBE.vertices, CUBE.faces, normals=slanted[:5]).normals).max(axis=1) > 0.99).all()
     tiny = np.array(CUBE.vertices)
-    tiny[0] = [1.1e-6, 0, 0]
+    tiny[0] = [1.1e-150, 0, 0]
     assert M.make_mesh(CUBE.vertices, CUBE.faces, normals=tiny).normals.max() == 1
 
 

@@ -151,9 +151,6 @@ def test_interleaved_buffers_and_what_is_no_triangle(tmp_path):
     cross = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
     np.testing.assert_allclose(part.mesh.normals[part.mesh.faces].mean(axis=1), cross, atol=1e-6)
     assert scene.omissions == ("scene.glb asks for what is not drawn: points and lines",)
-    primitives[1]["mode"] = 5
-    with pytest.raises(AssetError, match="triangle strips or fans .got 'mode 5'.; expected mode 4"):
-        load(tmp_path, builder)
 
 
 def animated(interpolation="LINEAR", scale=False):
@@ -397,7 +394,6 @@ def broken(change):
             lambda t: t["nodes"][1].update(translation=[float("nan"), 0, 0]),
             "nodes.1.translation.0: input should be a finite number",
         ),
-        (lambda t: t["nodes"][1].update(scale=[0, 0, 0]), "singular"),
         (lambda t: t["nodes"][1].update(rotation="no"), "no valid glTF"),
         (lambda t: t["meshes"][0]["primitives"][0].update(material=4), "a reference to materials that does not exist"),
         (lambda t: t["accessors"][0].update(bufferView=77), "a reference to bufferViews that does not exist"),

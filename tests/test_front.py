@@ -412,3 +412,14 @@ def test_what_lives_is_what_yaml_makes_of_it(tmp_path):
     assert moved == pytest.approx(0.5 * walker.parts[0].mesh.deformer.speed, rel=1e-3)
     paint = b.Primitive("figure", material=b.Material(color=(1, 0, 0)))
     assert paint.material.tree["color"] == [1, 0, 0]
+
+
+def test_a_closed_renderer_says_so():
+    scene = blinkgl.Scene(blinkgl.Camera(32, 24)) + blinkgl.Primitive("sphere", pose=(3, 0, 0))
+    renderer = blinkgl.Renderer(scene)
+    renderer.close()
+    renderer.close()
+    for use in (renderer.luminance, renderer.image, renderer.frame):
+        with pytest.raises(blinkgl.ConfigError) as error:
+            use(0.1)
+        assert str(error.value) == "Renderer: the renderer is closed; use it before close(), or make a new one"

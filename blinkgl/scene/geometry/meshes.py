@@ -33,13 +33,15 @@ def make_mesh(
     project_degenerate: bool = False,
     log: list[str] | None = None,
     source: list[np.ndarray] | None = None,
+    crease_degrees: float = CREASE_DEGREES,
 ) -> Mesh:
     """Return a valid mesh from raw triangles.
 
     Parameters
     ----------
     vertices : (V, 3) any float, object-local.   faces : (F, 3) any int, counter-clockwise seen from outside.
-    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at ``CREASE_DEGREES`` or more.
+    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at ``crease_degrees`` or
+        more; 0: flat.
     uvs : (V, 2), v down, or None: box projection (:func:`box_project`).
     uv_size : edge of one repeat of projected texture coordinates, in the mesh's units; None: the largest side of the
         bounding box, so that the texture covers the mesh once.
@@ -69,7 +71,10 @@ def make_mesh(
         uvs = None
 
     # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    corner_normals = crease_normals(vertices, faces, weld(vertices, faces)[1]) if normals is None else normals[faces]
+    if normals is None:
+        corner_normals = crease_normals(vertices, faces, weld(vertices, faces)[1], crease_degrees)
+    else:
+        corner_normals = normals[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     corners = None if source is None else origin[faces]
     mesh, first = _from_corners(

@@ -29,8 +29,11 @@ class Animation:
 
     def __init__(self, document: gltf.Document, tracks: list[Track], playing: Playing):
         self.document, self.tracks, self._playing, self._places = document, tracks, playing, document.places
+        self._tries: dict[tuple[int, int], list[np.ndarray]] = {}
         self.skeleton: Skeleton = document.skeleton(Clip(document.rest(), tracks, playing))
-        self._moved = {track.joint for track in tracks if track.path in PATHS}
+        self._moved: dict[int, list[Track]] = {}
+        for track in (track for track in tracks if track.path in PATHS):
+            self._moved.setdefault(track.joint, []).append(track)
 
     def moves(self, node: int) -> bool:
         """Return whether a node or one of its ancestors is moved."""
@@ -46,8 +49,7 @@ class Animation:
 
     def tracks_of(self, node: int) -> list[Track]:
         """Return the tracks that move a node or one of its ancestors."""
-        chain = {self._places[step] for step in self._chain(node)}
-        return [track for track in self.tracks if track.joint in chain and track.path in PATHS]
+        return [track for step in self._chain(node) for track in self._moved.get(self._places[step], ())]
 
     def motion(self, node: int, turn: np.ndarray, before: np.ndarray) -> Motion:
         """Return the function that gives (turn @ T @ before, its rate), ((4, 4), (4, 4) 1/s), of a node's transform T
@@ -59,6 +61,13 @@ class Animation:
             return turn @ world[place] @ before, turn @ rate[place] @ before
 
         return at
+
+    def tries(self, node: int, t0_ns: int, t1_ns: int, count: int = 32) -> list[np.ndarray]:
+        """Return the node's transforms to the file's world at irregular times in [t0, t1], which no period meets."""
+        if (t0_ns, t1_ns) not in self._tries:
+            times = (t0_ns + round((0.618033988749895 * k % 1) * (t1_ns - t0_ns)) for k in range(count))
+            self._tries[t0_ns, t1_ns] = [self.skeleton.at(t)[0] for t in times]
+        return [world[self._places[node]] for world in self._tries[t0_ns, t1_ns]]
 
     @property
     def span_ns(self) -> int:

@@ -13,6 +13,7 @@ Features that are not drawn are collected in :attr:`Document.omissions`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ class Document:
             material = self._without_coordinates(material) if uvs is None else material
         binding, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
         both = material is not None and bool(material.both_sides)
-        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours, both)
+        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours, both, flat=True)
 
     def _faces(self, primitive: dict, mesh: int, count: int) -> np.ndarray:
         """Return the faces of a primitive of ``count`` vertices, (F, 3): separate triangles, a strip or a fan; without
@@ -230,7 +231,7 @@ class Document:
             bind = bind.reshape(-1, 4, 4).swapaxes(1, 2)
         return [places[joint] for joint in joints], bind
 
-    @property
+    @cached_property
     def places(self) -> dict[int, int]:
         """Return node of the file -> its index in :attr:`nodes`, which is that of its joint in :meth:`skeleton`."""
         return {node: place for place, node in enumerate(self.nodes)}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blinkgl.scene.geometry.meshes import make_mesh
+from blinkgl.scene.geometry.meshes import CREASE_DEGREES, make_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.types import Material, Part
@@ -28,7 +28,8 @@ class RawMesh:
     binding : (V, k) joints of the node's skin and (V, k) weights; None: no skin.
     targets : morph targets, (n, V, 3) positions, likewise normals or None; None: none.
     colours : (V, 3) linear factors on the albedo; None: none.
-    both_sides : whether its file draws its faces from both sides; a file that does not say so does."""
+    both_sides : whether its file draws its faces from both sides; a file that does not say so does.
+    flat : whether faces without normals are flat; otherwise they are smooth where they meet at a small angle."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -39,6 +40,7 @@ class RawMesh:
     targets: tuple[np.ndarray, np.ndarray | None] | None = None
     colours: np.ndarray | None = None
     both_sides: bool = True
+    flat: bool = False
 
 
 def tinted(material: Material | None, colours: np.ndarray) -> tuple[Material, np.ndarray | None]:
@@ -102,6 +104,7 @@ def part_of(
         project_degenerate=material.texture is None,
         log=log,
         source=source,
+        crease_degrees=0.0 if raw.flat else CREASE_DEGREES,
     )
     if source is None:
         return Part(mesh, material)

@@ -33,8 +33,6 @@ from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
-_TRIES = 32
-"""Number of times at which it is tried whether a motion is rigid."""
 
 
 def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path) -> Scene:
@@ -202,13 +200,10 @@ def _beyond_a_path(animation: Animation, node: int, t0_ns: int, t1_ns: int) -> b
     tracks = animation.tracks_of(node)
     if any(t.interpolation == "STEP" or (t.path == "scale" and np.ptp(t.values, axis=0).max() > 0) for t in tracks):
         return True
-    motion, _ = _rigid(animation, node, t0_ns)
-    # At irregular times, which no period meets.
-    for k in range(_TRIES if tracks else 0):
-        linear = motion(t0_ns + round(((0.618033988749895 * k) % 1) * (t1_ns - t0_ns)))[0][:3, :3]
-        if np.abs(linear.T @ linear - np.eye(3)).max() > 1e-6:
-            return True
-    return False
+    shapes = animation.tries(node, t0_ns, t1_ns) if tracks else [np.eye(4)]
+    # A shape that only turns keeps the products of its columns.
+    products = np.array([shape[:3, :3].T @ shape[:3, :3] for shape in shapes])
+    return bool((np.ptp(products, axis=0) > 1e-6 * np.abs(products).max()).any())
 
 
 def _rigid(animation: Animation, node: int, t_ns: int) -> tuple[Motion, np.ndarray]:

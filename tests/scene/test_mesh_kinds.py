@@ -120,7 +120,7 @@ def test_materials_of_an_obj(tmp_path):
     (tmp_path / "maps" / "m.mtl").write_text(
         "newmtl a\nKd 1 .5 1\nmap_Kd -s 2 4 1 -o .5 -clamp on my wood.png\n"
         "newmtl b\nmap_Kd ..\\maps\\my wood.png\nKd .8 .8 .8\n"
-        "newmtl c\nmap_Kd gone.png\nKd 0 0 1\nnewmtl d\nTr 1\nnewmtl e\nKd \\\n 1 0 0\n"
+        "newmtl c\nmap_Kd gone.png\nKd 0 0 1\nnewmtl d\nd 0\nnewmtl e\nKd \\\n 1 0 0\n"
     )
     text = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nmtllib maps\\m.mtl\n"
     found = asset(tmp_path, text + "".join(f"usemtl {m}\nf 1/1 2/2 3/3\n" for m in "abcdef"))
@@ -142,7 +142,7 @@ def test_materials_of_an_obj(tmp_path):
         ("newmtl a\nmap_Kd ../../t.png\n", "m.mtl, line 2: refers to a file outside its folder (got '../../t.png')"),
         ("newmtl a\nmap_Kd C:\\t.png\n", ""),
         ("newmtl a\nmap_Kd /t.png\n", "m.mtl, line 2: refers to a file outside its folder (got '/t.png')"),
-        ("newmtl a\nKd red\n", "m.mtl, line 2: numbers are missing, or are none (got 'red')"),
+        ("newmtl a\nKd\n", "m.mtl, line 2: numbers are missing, or are none (got '')"),
     ],
 )
 def test_bad_material_files(tmp_path, mtl, problem):
@@ -167,7 +167,11 @@ def test_bad_material_files(tmp_path, mtl, problem):
             SQUARE + "\nf 1 2 -5\n",
             "a.obj, line 6: a face refers to a vertex that does not exist (got '-5'); expected 1",
         ),
-        (SQUARE + "f 1/1 2/1 3/1\n", "(got '1'); expected a file with such vertices"),
+        (
+            SQUARE + "vt 0 0\nf 1/1 2/1 3/2\n",
+            "line 6: a face refers to a vertex that does not exist (got '2'); expected 1",
+        ),
+        ("f 1 2 3\n", "line 1: a face refers to a vertex that does not exist (got '1'); expected a file with such"),
         (SQUARE + "f 1 2 3.5\n", "a.obj, line 5: a face is corrupt (got '3.5'); expected v, v/vt, v//vn, v/vt/vn"),
         ("v 0 0\n" + SQUARE + "f 1 2 3\n", "a.obj, line 1: numbers are missing, or are none"),
         (SQUARE + "f 1 2 2\n", "the file has no visible faces"),
@@ -287,6 +291,16 @@ def test_bad_plys(tmp_path, text, problem):
     with pytest.raises(AssetError) as error:
         asset(tmp_path, text, "a.ply")
     assert problem in str(error.value) and "\n" not in str(error.value)
+
+
+def test_lines_of_a_ply_may_say_more_than_its_header(tmp_path):
+    """As MeshLab's with colours of corners do; a file without a line for each element is read word by word."""
+    lines = ply() + rows() + "4 0 1 2 3 9 1 1 1\n3 0 4 1 9 1 1 1\n"
+    words = ply() + rows().replace("\n", " ", 3) + "4 0 1 2 3\n3 0 4 1\n"
+    mine, other = (asset(tmp_path, text, "a.ply").parts[0].mesh for text in (lines, words))
+    np.testing.assert_array_equal(mine.vertices[mine.faces], other.vertices[other.faces])
+    with pytest.raises(AssetError, match="truncated: not all of 5 vertex elements"):
+        asset(tmp_path, lines.replace("0 1.2 0", "0 1.2"), "a.ply")
 
 
 def test_offs(tmp_path):

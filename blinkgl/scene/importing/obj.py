@@ -7,6 +7,7 @@ vertices, what MeshLab and Blender write.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -29,9 +30,10 @@ _NOT_DRAWN = {"p": "points and lines", "l": "points and lines"}
 _NOT_DRAWN |= dict.fromkeys(("curv", "curv2", "surf"), "curves and curved surfaces")
 _MAPS = dict.fromkeys(("map_bump", "bump", "norm"), "normal maps") | {"map_ke": "emissive light"}
 _MAPS |= dict.fromkeys(("map_ks", "map_pr", "map_pm"), "shine (drawn matt)") | {"map_d": "transparency (drawn opaque)"}
-_NUMBER = r"\s+[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?=\s)"
+_COMMENT = re.compile(r"(?:^|\s)#")
+_FLOAT = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OPTION = re.compile(
-    rf"(?:-(?:blendu|blendv|cc|boost|texres|clamp|bm|imfchan|type)\s+\S+|-mm\s+\S+\s+\S+|-[ost](?:{_NUMBER}){{1,3}})\s+",
+    rf"(?:-(?:blendu|blendv|cc|boost|texres|clamp|bm|imfchan|type|colorspace)\s+\S+|-mm\s+\S+\s+\S+|-[ost](?:\s+{_FLOAT}(?=\s)){{1,3}})\s+",
     re.IGNORECASE,
 )
 """An option before the name of a texture, with its values."""
@@ -67,6 +69,11 @@ def read_obj(
     line_of = np.repeat(lines, sizes)
     corners = []
     for k, (width, table) in enumerate(zip((0, 2, 3), said.tables.values(), strict=True)):
+        if k and not table and (index[:, k] >= 0).any():
+            log.append(
+                f"{path.stem}: faces have {('texture coordinates', 'normals')[k - 1]} of which the file has none"
+            )
+            index[:, k] = -1
         if len(wrong := np.flatnonzero(index[:, k] >= len(table))):
             raise _beyond(index[wrong[0], k] + 1, len(table), f"{where}, line {line_of[wrong[0]]}")
         # The last row is that of corners that have none.
@@ -112,9 +119,9 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
     tables, known = said.tables, {}
     for line, key, rest in _lines(data):
         if key in tables:
-            tables[key].append(_numbers(rest.partition("#")[0], 1 if key == "vt" else 3, f"{where}, line {line}"))
+            tables[key].append(_numbers(_COMMENT.split(rest)[0], 1 if key == "vt" else 3, f"{where}, line {line}"))
         elif key in ("f", "fo"):
-            words = rest.partition("#")[0].split()
+            words = _COMMENT.split(rest)[0].split()
             for word in words:
                 if (number := known.get(word)) is None:
                     corner = _corner(word, tables, f"{where}, line {line}")
@@ -143,8 +150,8 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
 def _numbers(text: str, least: int, where: str) -> list[float]:
     try:
         row = list(map(float, text.split()))
-    except ValueError:
-        row = []
+    except ValueError:  # such as 1.#IND of old C libraries
+        row = [float(word) if re.fullmatch(_FLOAT, word) else math.nan for word in text.split()]
     if len(row) < least:
         accepted = f"at least {least} number{'s' if least > 1 else ''}"
         raise AssetError("numbers are missing, or are none", where=where, value=text[:40], accepted=accepted)
@@ -182,7 +189,9 @@ def _materials(path: Path, libraries, names, max_texture: int, omissions: Omissi
     entries: dict[str, dict[str, tuple[str, str]]] = {}
     for given, line in dict(libraries).items():
         # A name may have blanks, and a line may have several names.
-        for name in [given] if (path.parent / given.replace("\\", "/")).is_file() else given.split():
+        whole = (path.parent / given.replace("\\", "/")).is_file()
+        for name in [given] if whole else re.split(r"(?<!\\)\s+", given):
+            name = name.replace("\\ ", " ")
             file, own = beside(path.parent, "", name, f"{path}, line {line}", omissions), {}
             for number, key, rest in () if file is None else _lines(contents(file, "material")):
                 if key == "newmtl":
@@ -191,7 +200,7 @@ def _materials(path: Path, libraries, names, max_texture: int, omissions: Omissi
                     own[key.lower()] = rest, f"{file}, line {number}"
     found: dict[str, _Surface] = {}
     for name in names:
-        if name and name not in entries:
+        if name and name not in entries and entries:
             omissions.add(f"the material '{name}', which no MTL file has")
         plain = None, np.ones(2), np.zeros(2)
         found[name] = _surface(path, name, entries[name], max_texture, omissions, log) if name in entries else plain
@@ -203,8 +212,11 @@ def _surface(path: Path, name: str, entries: dict[str, tuple[str, str]], max_tex
         omissions.add(_MAPS[key])
     material = Material(base_color=_colour(*entries.get("kd", ("1", "")), omissions))
     scale, offset, settings = np.ones(2), np.zeros(2), {}
-    # Of two that contradict each other, d counts.
-    opacity = 1 - _numbers(*_of(entries, "tr", "0"))[0] if "d" not in entries else _numbers(*_of(entries, "d", "1"))[0]
+    # Tr is 1 - d by some exporters and d by others: it hides nothing.
+    rest, where = entries.get("d", ("1", ""))
+    opacity = _numbers(rest.removeprefix("-halo"), 1, where)[0]
+    if "tr" in entries and "d" not in entries and 0 < _numbers(entries["tr"][0], 1, entries["tr"][1])[0] < 1:
+        omissions.add("transparency (drawn opaque)")
     if opacity < 1:
         omissions.add(f"the material '{name}' of opacity 0" if opacity <= 0 else "transparency (drawn opaque)")
     if opacity <= 0:
@@ -227,11 +239,6 @@ def _surface(path: Path, name: str, entries: dict[str, tuple[str, str]], max_tex
                 log.append(f"{path.stem}: the grey Kd of '{name}' does not darken its texture")
                 material = replace(material, base_color=(1.0, 1.0, 1.0))
     return material, scale, offset
-
-
-def _of(entries: dict[str, tuple[str, str]], key: str, default: str) -> tuple[str, int, str]:
-    rest, where = entries.get(key, (default, ""))
-    return rest.removeprefix("-halo"), 1, where
 
 
 def _colour(rest: str, where: str, omissions: Omissions) -> tuple[float, float, float]:

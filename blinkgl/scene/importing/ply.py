@@ -103,7 +103,7 @@ def _elements(data: bytes, max_faces: int, where: str) -> tuple[dict[str, dict[s
     orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
     if form not in orders:
         raise AssetError("the mesh is of an unknown PLY format", where=where, value=form, accepted=", ".join(orders))
-    body = _Body(data[head.end() :], orders[form])
+    body = _Body(data[head.end() :], orders[form], sum(count for _, count, _ in declared))
     return {name: body.columns(count, properties, name, where) for name, count, properties in declared}, textures
 
 
@@ -118,11 +118,19 @@ def _count(name: str, digits: str, max_faces: int, available: int, where: str) -
 
 
 class _Body:
-    """What follows the header as ``items``: bytes, or for ASCII the numbers. at : the first that is not read yet."""
+    """What follows the header as ``items``: bytes, or for ASCII the numbers. at : the first that is not read yet.
+    lines : where each line of an ASCII file with a line for each of its ``rows`` begins, and the end; None: of others.
+    Such a line may have more numbers than its header says, as MeshLab writes them."""
 
-    def __init__(self, data: bytes, order: str):
-        self.order, self.at = order, 0
-        self.items = np.frombuffer(data, np.uint8) if order else np.array([float(word) for word in data.split()])
+    def __init__(self, data: bytes, order: str, rows: int):
+        self.order, self.at, self.lines = order, 0, None
+        if order:
+            self.items = np.frombuffer(data, np.uint8)
+            return
+        lines = [words for line in data.splitlines() if (words := line.split())]
+        self.items = np.array([float(word) for words in lines for word in words])
+        if len(lines) == rows:
+            self.lines = np.cumsum([0, *map(len, lines)])
 
     def width(self, kind: str) -> int:
         """Return the number of items of one value."""
@@ -142,13 +150,19 @@ class _Body:
         truncated = AssetError(f"the mesh is truncated: not all of {count} {name} elements are there", where=where)
         widths = [self.width(length or kind) for _, length, kind in properties]
         inner = [self.width(kind) if length else 0 for _, length, kind in properties]
-        at, end = self.at, len(self.items)
-        if at + count * sum(widths) > end:
+        at, end, begins = self.at, len(self.items), None
+        if self.lines is not None:
+            begins, self.lines = self.lines[: count + 1], self.lines[count:]
+        short = at + count * sum(widths) > end if begins is None else bool((np.diff(begins) < sum(widths)).any())
+        if short:
             raise truncated
-        starts = at + np.cumsum([0, *widths[:-1]])[:, None] + np.arange(count) * sum(widths)
+        first = at + np.arange(count) * sum(widths) if begins is None else begins[:-1]
+        starts = first + np.cumsum([0, *widths[:-1]])[:, None]
         lengths = np.zeros_like(starts)
         # Rows with lists are found only by walking from one to the next.
         for row in range(count if any(inner) else 0):
+            if begins is not None:
+                at, end = begins[row : row + 2].tolist()
             for k, width in enumerate(widths):
                 starts[k, row] = at
                 at += width
@@ -160,8 +174,10 @@ class _Body:
                         given = self.values(starts[k, row : row + 1], properties[k][1] or "")[0]
                     lengths[k, row] = max(int(given), 0)
                     at += int(lengths[k, row]) * inner[k]
+            if at > end:
+                raise truncated
         self.at, found = at if any(inner) else at + count * sum(widths), {}
-        if self.at > end:
+        if starts.max(initial=0) >= max(len(self.items), 1):
             raise truncated
         for k, (key, length, kind) in enumerate(properties):
             if length is None:

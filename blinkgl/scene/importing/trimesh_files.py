@@ -58,11 +58,11 @@ def _raw_mesh(mesh: trimesh.Trimesh, wanted: bool) -> RawMesh:
 
 def _off(data: bytes, max_faces: int, wanted: bool, where: str, log: list[str]) -> list[RawMesh]:
     """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces."""
-    rows = [words for line in data.decode("latin-1").splitlines() if (words := line.partition("#")[0].split())]
-    kind = rows[0].pop(0).upper() if rows else ""
-    if not re.fullmatch("(ST)?C?N?OFF", kind) or "BINARY" in rows[0]:
-        raise AssetError("the mesh is no OFF file of text", where=where, value=kind[:20], accepted="OFF, COFF, NOFF")
-    rows = rows if rows[0] else rows[1:]
+    text = re.sub(r"#.*", "", data.decode("latin-1"))
+    head = re.match(r"\s*((?:ST)?C?N?OFF)(?!\s*BINARY)", text, re.IGNORECASE)
+    if head is None:
+        raise AssetError("the mesh is no OFF file of text", where=where, value=text[:20], accepted="OFF, COFF, NOFF")
+    kind, rows = head[1].upper(), [words for line in text[head.end() :].splitlines() if (words := line.split())]
     number, count = (int(word) for word in rows[0][:2])
     vertices, faces = rows[1 : 1 + max(number, 0)], rows[1 + number : 1 + number + count]
     sizes = np.array([int(row[0]) for row in faces], np.int64)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,14 +42,18 @@ _OPTION = re.compile(
 
 @dataclass
 class _Statements:
-    """What the lines of a file say. tables : rows of v, vt and vn.   distinct : the corners, as indices from 0, -1 for
-    none, and their numbers.   used : numbers of all faces' corners.   faces : line, corners, material and smoothing
-    group (0: off) of each face.   libraries : names and lines of MTL files.   grouped : whether it says ``s``."""
+    """What the lines of a file say. tables : numbers of v, vt and vn, one row after the other, and how many each row
+    has.   distinct : corners as three indices from 0, -1 for none.   used : numbers of all faces' corners.   faces :
+    line, corners, material and smoothing group (0: off) of each face.   materials : numbers of names.   libraries :
+    names and lines of MTL files.   grouped : whether it says ``s``."""
 
-    tables: dict[str, list[list[float]]] = field(default_factory=lambda: {"v": [], "vt": [], "vn": []})
-    distinct: dict[tuple[int, ...], int] = field(default_factory=dict)
-    used: list[int] = field(default_factory=list)
-    faces: list[tuple[int, int, str, int]] = field(default_factory=list)
+    tables: dict[str, tuple[array, array]] = field(
+        default_factory=lambda: {key: (array("d"), array("q")) for key in ("v", "vt", "vn")}
+    )
+    distinct: array = field(default_factory=lambda: array("q"))
+    used: array = field(default_factory=lambda: array("q"))
+    faces: array = field(default_factory=lambda: array("q"))
+    materials: dict[str, int] = field(default_factory=dict)
     libraries: list[tuple[str, int]] = field(default_factory=list)
     grouped: bool = False
 
@@ -63,38 +68,40 @@ def read_obj(
     materials and textures outside the file's folder."""
     where = str(path)
     said = _statements(data, where, omissions)
-    lines, sizes, names, smoothing = zip(*said.faces, strict=True)
-    sizes = np.array(sizes)
-    index = np.array(list(said.distinct)).reshape(-1, 3)[said.used]
-    line_of = np.repeat(lines, sizes)
-    corners = []
-    for k, (width, table) in enumerate(zip((0, 2, 3), said.tables.values(), strict=True)):
-        if k and not table and (index[:, k] >= 0).any():
+    lines, sizes, surfaces, smoothing = np.array(said.faces).reshape(-1, 4).T
+    index = np.array(said.distinct).reshape(-1, 3)[np.array(said.used, np.int64)]
+    tables = [_rows(*table, width) for table, width in zip(said.tables.values(), (6, 2, 3), strict=True)]
+    for k, table in enumerate(tables):
+        if k and len(table) == 1 and (index[:, k] >= 0).any():
             log.append(
                 f"{path.stem}: faces have {('texture coordinates', 'normals')[k - 1]} of which the file has none"
             )
             index[:, k] = -1
-        if len(wrong := np.flatnonzero(index[:, k] >= len(table))):
-            raise _beyond(index[wrong[0], k] + 1, len(table), f"{where}, line {line_of[wrong[0]]}")
-        # The last row is that of corners that have none.
-        if width:
-            corners.append(np.array([*((*row, 0.0)[:width] for row in table), (np.nan,) * width])[index[:, k]])
-    numbers = {name: k for k, name in enumerate(dict.fromkeys(names) if max_texture is not None else [""])}
-    surfaces = np.array([numbers.get(name, 0) for name in names])
-    materials: list[Material | None] = [None]
+        if len(wrong := np.flatnonzero(index[:, k] >= len(table) - 1)):
+            line = np.repeat(lines, sizes)[wrong[0]]
+            raise _beyond(index[wrong[0], k] + 1, len(table) - 1, f"{where}, line {line}")
+    vertices, uvs, normals = tables
+    uvs, materials, colours = uvs[index[:, 1]], [None], None
     if max_texture is not None:
-        found = _materials(path, said.libraries, numbers, max_texture, omissions, log)
-        materials = [found[name][0] for name in numbers]
-        scale, offset = (np.array([found[name][k] for name in numbers])[np.repeat(surfaces, sizes)] for k in (1, 2))
-        corners[0] = corners[0] * scale + offset
-    colours, vertices = None, said.tables["v"]
-    if max_texture is not None and all(len(row) >= 6 for row in vertices):
-        colours = linear_from_srgb(np.clip(np.nan_to_num([row[3:6] for row in vertices]), 0, 1))[index[:, 0]]
-    points = np.array([row[:3] for row in vertices])
-    groups = np.array(smoothing) if said.grouped else None
-    uvs, normals = corners
-    given = Polygons(points, index[:, 0], sizes, uvs, normals, colours, surfaces, groups, np.array(lines))
+        found = _materials(path, said.libraries, said.materials, max_texture, omissions, log)
+        materials = [found[name][0] for name in said.materials]
+        scale, offset = (np.array([one[k] for one in found.values()])[np.repeat(surfaces, sizes)] for k in (1, 2))
+        uvs = uvs * scale + offset
+        if min(said.tables["v"][1], default=0) >= 6:
+            colours = linear_from_srgb(np.clip(np.nan_to_num(vertices[index[:, 0], 3:]), 0, 1))
+    surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
+    given = Polygons(vertices[:-1, :3], index[:, 0], sizes, uvs, normals[index[:, 2]], colours, surfaces, groups, lines)
     return raw_meshes(given, materials, max_faces, where, log)
+
+
+def _rows(values: array, counts: array, width: int) -> np.ndarray:
+    """Return (n + 1, width) numbers, 0 where a row has fewer; the last row, of corners without any, is NaN."""
+    numbers, have = np.array(values), np.array(counts, np.int64)
+    rows, starts = np.zeros((len(have) + 1, width)), np.cumsum(have) - have
+    for k in range(width):
+        rows[:-1][have > k, k] = numbers[starts[have > k] + k]
+    rows[-1] = np.nan
+    return rows
 
 
 def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
@@ -108,28 +115,32 @@ def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
         if line.endswith("\\"):
             begun += line[:-1] + " "
             continue
-        key, _, rest = (begun + line).strip().replace("\t", " ").partition(" ")
+        words = (begun + line if begun else line).split(None, 1)
         begun = ""
-        if key and not key.startswith("#"):
-            yield number, key, rest.strip()
+        if words and words[0][0] != "#":
+            yield number, words[0], words[1].rstrip() if len(words) > 1 else ""
 
 
 def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
     said, material, smoothing, unknown = _Statements(), "", 0, {}
-    tables, known = said.tables, {}
+    known: dict[str, int] = {}
     for line, key, rest in _lines(data):
-        if key in tables:
-            tables[key].append(_numbers(_COMMENT.split(rest)[0], 1 if key == "vt" else 3, f"{where}, line {line}"))
+        if key in said.tables:
+            row = _numbers(rest, 1 if key == "vt" else 3, where, line)
+            values, counts = said.tables[key]
+            values.extend(row)
+            counts.append(len(row))
         elif key in ("f", "fo"):
-            words = _COMMENT.split(rest)[0].split()
+            words = (_COMMENT.split(rest)[0] if "#" in rest else rest).split()
             for word in words:
                 if (number := known.get(word)) is None:
-                    corner = _corner(word, tables, f"{where}, line {line}")
-                    number = said.distinct.setdefault(corner, len(said.distinct))
+                    number = len(said.distinct) // 3
+                    said.distinct.extend(_corner(word, said.tables, f"{where}, line {line}"))
                     if "-" not in word:  # what a relative index means depends on its line
                         known[word] = number
                 said.used.append(number)
-            said.faces.append((line, len(words), material, smoothing))
+            surface = said.materials.setdefault(material, len(said.materials))
+            said.faces.extend((line, len(words), surface, smoothing))
         elif key == "usemtl":
             material = rest
         elif key == "s":
@@ -147,21 +158,24 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
     return said
 
 
-def _numbers(text: str, least: int, where: str) -> list[float]:
+def _numbers(text: str, least: int, where: str, line: int) -> list[float]:
     try:
         row = list(map(float, text.split()))
-    except ValueError:  # such as 1.#IND of old C libraries
+    except ValueError:  # a comment, or such as 1.#IND of old C libraries
+        text = _COMMENT.split(text)[0]
         row = [float(word) if re.fullmatch(_FLOAT, word) else math.nan for word in text.split()]
     if len(row) < least:
         accepted = f"at least {least} number{'s' if least > 1 else ''}"
-        raise AssetError("numbers are missing, or are none", where=where, value=text[:40], accepted=accepted)
+        raise AssetError(
+            "numbers are missing, or are none", where=f"{where}, line {line}", value=text[:40], accepted=accepted
+        )
     return row
 
 
-def _corner(word: str, tables: dict[str, list[list[float]]], where: str) -> tuple[int, ...]:
+def _corner(word: str, tables: dict[str, tuple[array, array]], where: str) -> list[int]:
     """Return the indices of a corner from 0, -1 for what it has not. Those of later lines are checked at the end."""
     out = [-1, -1, -1]
-    for k, (part, table) in enumerate(zip(word.split("/"), tables.values(), strict=False)):
+    for k, (part, (_, table)) in enumerate(zip(word.split("/"), tables.values(), strict=False)):
         if not part and k > 0:
             continue
         if not re.fullmatch(r"-?\d+", part):
@@ -170,7 +184,7 @@ def _corner(word: str, tables: dict[str, list[list[float]]], where: str) -> tupl
         out[k] = index - 1 if index > 0 else len(table) + index
         if index == 0 or out[k] < 0:
             raise _beyond(part, len(table), where)
-    return tuple(out)
+    return out
 
 
 def _beyond(given: object, count: int, where: str) -> AssetError:
@@ -180,13 +194,15 @@ def _beyond(given: object, count: int, where: str) -> AssetError:
 
 
 # ---- MTL
+_Entry = tuple[str, str, int]
+"""The rest of a line of an MTL file, the file and the line."""
 _Surface = tuple[Material | None, np.ndarray, np.ndarray]
 """A material, and the scale and offset of its texture coordinates."""
 
 
 def _materials(path: Path, libraries, names, max_texture: int, omissions: Omissions, log) -> dict[str, _Surface]:
     """Return the materials of these ``names``. Raises AssetError for files outside the folder."""
-    entries: dict[str, dict[str, tuple[str, str]]] = {}
+    entries: dict[str, dict[str, _Entry]] = {}
     for given, line in dict(libraries).items():
         # A name may have blanks, and a line may have several names.
         whole = (path.parent / given.replace("\\", "/")).is_file()
@@ -197,7 +213,7 @@ def _materials(path: Path, libraries, names, max_texture: int, omissions: Omissi
                 if key == "newmtl":
                     own = entries.setdefault(rest, {})
                 else:
-                    own[key.lower()] = rest, f"{file}, line {number}"
+                    own[key.lower()] = rest, str(file), number
     found: dict[str, _Surface] = {}
     for name in names:
         if name and name not in entries and entries:
@@ -207,32 +223,32 @@ def _materials(path: Path, libraries, names, max_texture: int, omissions: Omissi
     return found
 
 
-def _surface(path: Path, name: str, entries: dict[str, tuple[str, str]], max_texture, omissions, log) -> _Surface:
+def _surface(path: Path, name: str, entries: dict[str, _Entry], max_texture, omissions, log) -> _Surface:
     for key in (key for key in entries if key in _MAPS):
         omissions.add(_MAPS[key])
-    material = Material(base_color=_colour(*entries.get("kd", ("1", "")), omissions))
-    scale, offset, settings = np.ones(2), np.zeros(2), {}
+    numbers = {}
+    for key in (key for key in ("d", "tr") if key in entries):
+        rest, file, line = entries[key]
+        numbers[key] = _numbers(rest.removeprefix("-halo"), 1, file, line)[0]
     # Tr is 1 - d by some exporters and d by others: it hides nothing.
-    rest, where = entries.get("d", ("1", ""))
-    opacity = _numbers(rest.removeprefix("-halo"), 1, where)[0]
-    if "tr" in entries and "d" not in entries and 0 < _numbers(entries["tr"][0], 1, entries["tr"][1])[0] < 1:
-        omissions.add("transparency (drawn opaque)")
+    opacity, scale, offset = numbers.get("d", 0.5 if 0 < numbers.get("tr", 1) < 1 else 1), np.ones(2), np.zeros(2)
     if opacity < 1:
         omissions.add(f"the material '{name}' of opacity 0" if opacity <= 0 else "transparency (drawn opaque)")
     if opacity <= 0:
         return INVISIBLE, scale, offset
+    material = Material(base_color=_colour(*entries.get("kd", ("1", "", 0)), omissions))
     if "map_kd" in entries:
-        rest, where = entries["map_kd"]
+        (rest, file, line), settings = entries["map_kd"], {}
         while option := _OPTION.match(rest):
             key, *settings[key.lower()] = option[0].split()
             rest = rest[option.end() :]
-        for key, numbers in (("-s", scale), ("-o", offset)):
-            numbers[:] = [*map(float, settings.pop(key, ())), *numbers][:2]
+        for key, values in (("-s", scale), ("-o", offset)):
+            values[:] = [*map(float, settings.pop(key, ())), *values][:2]
         wrap: tuple[Wrap, Wrap] = ("clamp", "clamp") if settings.pop("-clamp", []) == ["on"] else REPEAT
         if settings:
             omissions.add("options of textures: " + ", ".join(settings))
-        inner = os.path.relpath(os.path.dirname(where.rpartition(", line ")[0]), path.parent)
-        if (image := beside(path.parent, inner, rest, where, omissions)) is not None:
+        inner = os.path.relpath(os.path.dirname(file), path.parent)
+        if (image := beside(path.parent, inner, rest, f"{file}, line {line}", omissions)) is not None:
             material = replace(material, texture=texture_of(image, max_texture), wrap=wrap)
             if len(set(material.base_color)) == 1 != material.base_color[0]:
                 # Exporters write a grey that no one chose beside a texture; a colour is a choice.
@@ -241,11 +257,11 @@ def _surface(path: Path, name: str, entries: dict[str, tuple[str, str]], max_tex
     return material, scale, offset
 
 
-def _colour(rest: str, where: str, omissions: Omissions) -> tuple[float, float, float]:
+def _colour(rest: str, file: str, line: int, omissions: Omissions) -> tuple[float, float, float]:
     """Return the linear colour of a Kd: an sRGB code, or one number for a grey."""
     if rest.startswith(("spectral", "xyz")):
         omissions.add("colours given as a spectrum or as XYZ (drawn white)")
         return 1.0, 1.0, 1.0
-    code = _numbers(rest, 1, where)
+    code = _numbers(rest, 1, file, line)
     r, g, b = linear_from_srgb(np.clip(np.nan_to_num(code[:3] if len(code) > 2 else code[:1] * 3), 0, 1)).tolist()
     return r, g, b

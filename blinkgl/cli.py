@@ -81,8 +81,7 @@ def generate(
         bool | None,
         typer.Option(
             "--both-sides/--one-side",
-            help="Draw the faces of scene and mesh files from both sides, or from their front alone (default: as each "
-            "file says).",
+            help="Draw faces of files from both sides, or from their front alone (default: as each file says).",
         ),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,

@@ -31,8 +31,8 @@ class MaterialConfig(Config):
     unlit: bool = Field(False, description="radiance = albedo, independent of light")
     both_sides: bool | None = Field(
         None,
-        description="draw faces from behind, too, with the normal reversed; null: as the mesh's file says (glTF), else "
-        "unless it is a closed primitive",
+        description="draw faces from behind, too, with the normal reversed; null: as the mesh's file says, or unless "
+        "the primitive is closed",
     )
     metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="fraction that is metal")
     roughness: Annotated[float, Field(ge=0, le=1)] = Field(

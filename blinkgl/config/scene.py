@@ -55,8 +55,7 @@ class ObjectsConfig(Config):
 
 BOTH_SIDES = Field(
     None,
-    description="faces of files are drawn from both sides, or from their front alone; null: as each file says (glTF's "
-    "doubleSided; both sides for the other formats, which do not say)",
+    description="false: faces of files are drawn from their front alone; null: as each [file says](scenes.md#sides)",
 )
 
 

@@ -87,7 +87,7 @@ def read_obj(
         materials = [found[name][0] for name in said.materials]
         scale, offset = (np.array([one[k] for one in found.values()])[np.repeat(surfaces, sizes)] for k in (1, 2))
         uvs = uvs * scale + offset
-        if min(said.tables["v"][1], default=0) >= 6:
+        if set(said.tables["v"][1]) == {6}:
             colours = linear_from_srgb(np.clip(np.nan_to_num(vertices[index[:, 0], 3:]), 0, 1))
     surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
     given = Polygons(vertices[:-1, :3], index[:, 0], sizes, uvs, normals[index[:, 2]], colours, surfaces, groups, lines)
@@ -122,7 +122,7 @@ def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
 
 
 def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
-    said, material, smoothing, unknown = _Statements(), "", 0, {}
+    said, material, smoothing = _Statements(), "", 0
     known: dict[str, int] = {}
     for line, key, rest in _lines(data):
         if key in said.tables:
@@ -150,9 +150,7 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
         elif key in _NOT_DRAWN:
             omissions.add(_NOT_DRAWN[key])
         elif key not in _WITHOUT_EFFECT:
-            unknown[key[:20]] = None
-    if unknown:
-        omissions.add("unknown statements: " + ", ".join(list(unknown)[:5]) + (", …" if len(unknown) > 5 else ""))
+            omissions.add("statements that OBJ does not know")
     if not said.faces:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
     return said

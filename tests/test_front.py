@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.scene.build import build_scene
-from tests.scene.gltf_files import arm_file
+from tests.scene.gltf_files import GltfBuilder, arm_file
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -423,3 +424,28 @@ def test_a_closed_renderer_says_so():
         with pytest.raises(blinkgl.ConfigError) as error:
             use(0.1)
         assert str(error.value) == "Renderer: the renderer is closed; use it before close(), or make a new one"
+
+
+def test_sides_are_what_the_file_says_unless_overruled(tmp_path):
+    """A single-sided box around the camera, which shows its outside alone."""
+    builder = GltfBuilder()
+    builder.node(mesh=builder.mesh(*(lambda box: (box.vertices, box.faces))(trimesh.creation.box((6, 6, 6)))))
+    (tmp_path / "box.glb").write_bytes(builder.glb())
+    camera = blinkgl.Camera(16, 12)
+
+    def seen(body, **keys):
+        with blinkgl.Renderer(blinkgl.Scene(camera, **keys) + body) as renderer:
+            return bool(np.isfinite(renderer.frame(0.1, ["depth"]).depth).all())
+
+    for given, expected in ((None, False), (True, True), (False, False)):
+        assert seen(blinkgl.Mesh(tmp_path / "box.glb"), both_sides=given) == expected
+        painted = blinkgl.Mesh(tmp_path / "box.glb", material=blinkgl.Material(both_sides=given))
+        assert seen(painted) == expected and seen(painted, both_sides=False if given else None) == expected
+    box = trimesh.creation.box((6, 6, 6))
+    for faces in (box.faces, box.faces[:, ::-1]):  # arrays do not say
+        assert seen(blinkgl.Mesh(vertices=box.vertices, faces=faces))
+    assert not seen(blinkgl.Primitive("cuboid", extents=(6, 6, 6)))
+    with pytest.raises(
+        blinkgl.ConfigError, match="double_sided: this key was removed .got True.; expected both_sides: true"
+    ):
+        blinkgl.Material(double_sided=True)

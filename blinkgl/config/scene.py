@@ -70,11 +70,10 @@ class PoolConfig(Config):
         "fish swims, a flag flies",
     )
     variants: int = Field(24, ge=1, le=10_000, description="random shapes per primitive kind (aspect ratios, sides)")
-    folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
+    folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, off, 3mf, glb, gltf")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for "
-        "obj, ply, stl",
+        description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for others",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
     removed: ClassVar[Any] = {
@@ -230,12 +229,11 @@ class MeshConfig(Config):
         {},
         description="sizes, numbers of faces and motion of the primitive: see [primitives](#primitives)",
     )
-    file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
+    file: str | None = Field(None, description="obj, ply, stl, off, 3mf, glb or gltf file")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
         description="upward axis of the file, which becomes the world's z: with y, the file's (x, y, z) is drawn "
-        "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for "
-        "obj, ply, stl",
+        "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for others",
     )
     project_uvs: ClassVar[Any] = False
     uv_size: ClassVar[Any] = 1.0

@@ -225,7 +225,7 @@ class Primitive(_Object):
 class Mesh(_Object):
     """A body from a file, ``Mesh("chair.glb")``, or from triangles, ``Mesh(vertices=v, faces=f)``.
 
-    file : obj, ply, stl, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
+    file : obj, ply, stl, off, 3mf, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
     vertices : (V, 3) m, body axes.   faces : (F, 3) indices, counter-clockwise seen from outside.
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,

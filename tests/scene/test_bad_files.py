@@ -263,6 +263,7 @@ PLY = (
             '{"asset": {"version": "2.0"}, "buffers": [{"uri": "' + "x" * 5000 + '", "byteLength": 4}]}',
             "refers to a file that is missing",
         ),
+        ("a.gltf", '{"asset": {"version": "2.0", "minVersion": "2.1"}}', "no glTF 2.0 (got 'minVersion 2.1')"),
         ("a.gltf", '{"asset": []}', "asset: input should be a valid dictionary"),
         ("a.gltf", "[]", "its JSON: input should be a valid dictionary"),
     ],

@@ -218,7 +218,8 @@ def shown(document: gltf.Document, node: int, animation: Animation | None) -> tu
     if animation is None:
         raws, world = meshes_at_rest(document, node)
     else:
-        raws, world = document.raw_meshes(n.mesh or 0), document.world(node)
+        assert n.mesh is not None
+        raws, world = document.raw_meshes(n.mesh), document.world(node)
         grows = any(track.path == "scale" for track in animation.tracks_of(node))
         if (grows or (n.skin is not None and raws)) and np.linalg.matrix_rank(world[:3, :3]) < 3:
             world = np.eye(4)  # a rest pose without size, from which no motion can start

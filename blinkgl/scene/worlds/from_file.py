@@ -121,7 +121,7 @@ def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t
     if not made and not any(node.mesh is not None for node in document.nodes.values()):
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
     if not made:
-        document.omissions.add("anything: all of its meshes are hidden, or have no area")
+        document.omissions.add("the whole file: all of its meshes are hidden or without area")
     return tuple(made)
 
 

@@ -14,6 +14,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.importing.parts import Z_UP, transformed
 from blinkgl.scene.worlds.from_file import from_document, split_rigid
 from tests.scene.gltf_files import GltfBuilder, triangle
@@ -22,6 +23,7 @@ from tests.shared_data import shared
 SETTINGS = CameraConfig(width=64, height=48, fov=70)
 CAMERA = SETTINGS.model
 T1 = 10**9
+HALF = math.sqrt(0.5)
 BOX = trimesh.creation.box(extents=(1, 2, 3))
 
 
@@ -448,3 +450,46 @@ def test_our_reader_agrees_with_trimesh_on_real_files():
         assert ours.shape == corners.shape, path.name
         order = lambda a: a[np.lexsort(np.round(a, 4).T)]
         np.testing.assert_allclose(order(ours), order(corners), atol=2e-4, err_msg=path.name)
+
+
+def test_a_scene_of_which_nothing_is_visible_is_empty(tmp_path):
+    """Scale 0 and opacity 0 hide; that all is hidden is said. An object of it would be nothing, and is refused."""
+    for node, material in (({"scale": [0, 0, 0]}, {}), ({}, {"alphaMode": "MASK"}), ({}, {"alphaMode": "BLEND"})):
+        builder = with_camera(GltfBuilder())
+        clear = {"baseColorFactor": [1, 1, 1, 0 if material else 1]}
+        builder.tree["materials"] = [{"pbrMetallicRoughness": clear, **material}]
+        builder.node(mesh=triangle(builder, material=0), **node)
+        scene = load(tmp_path, builder)
+        assert scene.objects == () and "all of its meshes are hidden or without area" in scene.omissions[0]
+        with pytest.raises(AssetError, match="the file has no visible faces"):
+            load_asset(tmp_path / "scene.glb")
+
+
+def test_an_animated_camera_below_a_growing_node_stays_rigid(tmp_path):
+    """Its place follows the scale, its axes do not."""
+    builder = with_camera(GltfBuilder())
+    camera = next(i for i, node in enumerate(builder.tree["nodes"]) if "camera" in node)
+    builder.tree["nodes"][camera].update(translation=[1, 0, 0])
+    builder.tree["scenes"][0]["nodes"] = [builder.node(mesh=triangle(builder)), builder.node(children=[camera])]
+    times = builder.array(np.array([0, 1], "f4"), "SCALAR")
+    turns = builder.array(np.array([[0, 0, 0, 1], [0, HALF, 0, HALF]], "f4"), "VEC4")
+    sizes = builder.array(np.array([[1, 1, 1], [3, 3, 3]], "f4"), "VEC3")
+    builder.tree["animations"] = [
+        {
+            "samplers": [{"input": times, "output": turns}, {"input": times, "output": sizes}],
+            "channels": [
+                {"sampler": k, "target": {"node": len(builder.tree["nodes"]) - 1, "path": path}}
+                for k, path in enumerate(("rotation", "scale"))
+            ],
+        }
+    ]
+    path = load(tmp_path, builder).camera_path
+    for t in (0.0, 0.3, 0.8):
+        T, D, h = path.pose(round(t * 1e9)), path.derivative(round(t * 1e9)), 1e-6
+        a, s = math.pi / 2 * t, 1 + 2 * t
+        np.testing.assert_allclose(T[:3, 3], Z_UP[:3, :3] @ [s * math.cos(a), 0, -s * math.sin(a)], atol=1e-6)
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+        ahead, behind = (path.pose(round((t + k) * 1e9)) for k in (h, -h if t else 0.0))
+        np.testing.assert_allclose(D, (ahead - behind) / (2 * h if t else h), atol=2e-5)
+    v, w = path.speed_bound(0, T1)
+    assert v >= math.hypot(2, 3 * math.pi / 2) - 1e-6 and math.pi / 2 <= w < 2.5

@@ -107,6 +107,7 @@ def test_normals_of_an_obj(tmp_path):
     assert at_ridge(roof + "s 1\n" + faces.format("s 2\n")) == {left, right}
     assert at_ridge(roof + "s off\n" + faces.format("")) == {left, right}
     assert at_ridge(roof + faces.format("")) == {left, right}  # 90 degrees are an edge
+    assert at_ridge("v 1e9 nan 0\n" + roof + "f 2 3 4 5\nf 5 4 7 6\n") == {left, right}  # a point without a face
     given = roof + "vn 1 0 0\nvn 0 0 5\nf 1//2 2//2 3//1 4//1\nf 4//1 3//1 6//2 5//2\n"
     assert at_ridge(given) == {(1, 0, 0)}
     # smooth over the border of two materials

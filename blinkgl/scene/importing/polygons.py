@@ -59,8 +59,10 @@ def raw_meshes(
     missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false
     if missing.any():
         groups = None if given.smoothing is None else given.smoothing[owner]
-        welded = weld(given.points, at)[1] if groups is None else at
-        made = crease_normals(given.points, at, welded, groups=groups)
+        used, inner = np.unique(at, return_inverse=True)  # a point that no face has may lie anywhere
+        points, inner = given.points[used], inner.reshape(at.shape)
+        welded = weld(points, inner)[1] if groups is None else inner
+        made = crease_normals(points, inner, welded, groups=groups)
         normals[missing] = made[missing]
     # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
     a, b, c = (given.points[at[:, k]] for k in range(3))

@@ -70,20 +70,19 @@ def raw_meshes(
     for array in (triangles, at, normals):
         array[behind] = array[behind, ::-1]
     uvs = np.full((len(given.places), 2), np.nan) if given.uvs is None else given.uvs * [1, -1] + [0, 1]
-    mapped = np.isfinite(uvs[triangles]).all(axis=(1, 2))
-    surface = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
-    raws = []
-    for number, material in enumerate(materials):
-        for with_uvs in (True, False):
-            chosen = np.flatnonzero((surface == number) & (mapped == with_uvs))
-            if not len(chosen) or material is INVISIBLE:
-                continue
-            corners, drawn, tint = triangles[chosen].ravel(), material, None
-            if given.colours is not None:
-                drawn, tint = tinted(drawn, given.colours[corners])
-            faces = np.arange(len(corners)).reshape(-1, 3)
-            shape = given.points[at[chosen]].reshape(-1, 3), faces, normals[chosen].reshape(-1, 3)
-            raws.append(RawMesh(*shape, uvs[corners] if with_uvs else None, drawn, colours=tint))
+    surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
+    kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
+    order, raws = np.argsort(kind, kind="stable"), []
+    for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():
+        (number, bare), corners, tint = divmod(int(kind[chosen[0]]), 2), triangles[chosen].ravel(), None
+        drawn = materials[number]
+        if drawn is INVISIBLE:
+            continue
+        if given.colours is not None:
+            drawn, tint = tinted(drawn, given.colours[corners])
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        shape = given.points[at[chosen]].reshape(-1, 3), faces, normals[chosen].reshape(-1, 3)
+        raws.append(RawMesh(*shape, None if bare else uvs[corners], drawn, colours=tint))
     return raws
 
 

@@ -107,7 +107,7 @@ def _check_3mf(data: bytes, max_faces: int, where: str) -> None:
     """Check what the archive says about its sizes before anything is unpacked."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(info.file_size for info in archive.infolist())
-    if size > MAX_BYTES or size > 1000 * len(data):
+    if size > MAX_BYTES or size > 100 * len(data):
         raise AssetError("the mesh is too large when it is unpacked", where=where, value=f"{size / 1e6:.0f} MB")
     _limit(_model_of(data).count(b"<triangle "), max_faces, where)
 

@@ -175,7 +175,7 @@ def test_bad_material_files(tmp_path, mtl, problem):
         ("f 1 2 3\n", "line 1: a face refers to a vertex that does not exist (got '1'); expected a file with such"),
         (SQUARE + "f 1 2 3.5\n", "a.obj, line 5: a face is corrupt (got '3.5'); expected v, v/vt, v//vn, v/vt/vn"),
         ("v 0 0\n" + SQUARE + "f 1 2 3\n", "a.obj, line 1: numbers are missing, or are none"),
-        (SQUARE + "f 1 2 2\n", "the file has no visible faces"),
+        (SQUARE + "f 1 2 2\n", "the file has no faces"),
         (
             "v 0 0 0\n" * 3 + "f" + " 1 2 3" * (MAX_CORNERS // 3 + 1),
             f"a polygon has too many corners (got {MAX_CORNERS + 1}",

@@ -22,7 +22,7 @@ from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, play as play_clip, shown
 from blinkgl.scene.importing.gltf_file import buffer_contents
 from blinkgl.scene.importing.obj import read_obj
-from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, part_of, transformed
+from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.importing.ply import read_ply
 from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
@@ -53,7 +53,9 @@ class Asset:
 
     def normalised(self) -> Asset:
         """Return it with the bounding box centred on the origin and bounding radius 1; a deforming one by its whole
-        region."""
+        region. Raises AssetError where nothing of it is visible."""
+        if not self.parts:
+            raise AssetError("nothing of the file is visible", where=self.name, accepted="a mesh with visible faces")
         meshes = normalise(tuple(p.mesh for p in self.parts), self.name)
         return replace(self, parts=tuple(Part(m, p.material) for m, p in zip(meshes, self.parts)))
 
@@ -97,7 +99,7 @@ def load_asset(
             if len(raw.faces) or len(found.raws) == 1
         )
     if not parts:
-        raise AssetError("the file has no visible faces", where=where, accepted="a mesh with triangles")
+        found.omissions.add(WHOLE)
     parts = parts if has_materials else _white(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
     asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
@@ -161,6 +163,8 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
     if clips and played is None:
         document.omissions.add("animations (the rest pose is drawn)")
     found = _Found([], [], document.log, document.omissions, clips)
+    if not any(node.mesh is not None for node in document.nodes.values()):
+        raise AssetError("the file has no faces", where=document.where, accepted="a mesh with triangles")
     for node in document.nodes:
         raws, world = shown(document, node, played) or ([], np.eye(4))
         for raw in raws:

@@ -17,6 +17,7 @@ from blinkgl.scene.types import Material, Part
 
 INVISIBLE = Material()
 """The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere."""
+WHOLE = "the whole file: all of it is hidden, transparent or without area"
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 

@@ -52,6 +52,8 @@ def raw_meshes(
     triangles."""
     _check(given, max_faces, where)
     triangles, owner, lost = triangulate(given.points, given.places, given.sizes)
+    if not len(triangles):
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
     if lost:
         log.append(f"{Path(where).stem}: {lost} of {len(given.sizes)} faces without three different corners left out")
     at = given.places[triangles]

@@ -21,7 +21,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, Motion, clip_names, play, shown
-from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, part_of, transformed
+from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import AffinePath, StaticPath, nearest_rotation
 from blinkgl.scene.reading import reading
@@ -121,7 +121,7 @@ def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t
     if not made and not any(node.mesh is not None for node in document.nodes.values()):
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
     if not made:
-        document.omissions.add("the whole file: all of its meshes are hidden or without area")
+        document.omissions.add(WHOLE)
     return tuple(made)
 
 

@@ -453,16 +453,18 @@ def test_our_reader_agrees_with_trimesh_on_real_files():
 
 
 def test_a_scene_of_which_nothing_is_visible_is_empty(tmp_path):
-    """Scale 0 and opacity 0 hide; that all is hidden is said. An object of it would be nothing, and is refused."""
+    """Scale 0 and opacity 0 hide; that all is hidden is said. A pool, whose objects have a size, refuses it."""
     for node, material in (({"scale": [0, 0, 0]}, {}), ({}, {"alphaMode": "MASK"}), ({}, {"alphaMode": "BLEND"})):
         builder = with_camera(GltfBuilder())
         clear = {"baseColorFactor": [1, 1, 1, 0 if material else 1]}
         builder.tree["materials"] = [{"pbrMetallicRoughness": clear, **material}]
         builder.node(mesh=triangle(builder, material=0), **node)
         scene = load(tmp_path, builder)
-        assert scene.objects == () and "all of its meshes are hidden or without area" in scene.omissions[0]
-        with pytest.raises(AssetError, match="the file has no visible faces"):
-            load_asset(tmp_path / "scene.glb")
+        assert scene.objects == () and "all of it is hidden, transparent or without area" in scene.omissions[0]
+        asset = load_asset(tmp_path / "scene.glb")
+        assert asset.parts == () and asset.omissions == scene.omissions
+        with pytest.raises(AssetError, match="scene: nothing of the file is visible"):
+            asset.normalised()
 
 
 def test_an_animated_camera_below_a_growing_node_stays_rigid(tmp_path):

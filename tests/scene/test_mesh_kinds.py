@@ -69,12 +69,18 @@ def test_polygons_keep_their_area_and_winding():
             axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
             points = np.column_stack([x, y, np.full(n, 0.3)])[::way] @ axes.T
             places = np.insert(np.arange(n), 2, 2)  # corner 2 twice
-            triangles, owner, lost = triangulate(points, places, np.array([n + 1]))
+            triangles, owner, repeated = triangulate(points, places, np.array([n + 1]))
             a, b, c = np.moveaxis(points[places[triangles]], 1, 0)
             cross = np.cross(b - a, c - a) / 2
             up = np.cross(axes[:, 0], axes[:, 1]) * way
-            assert len(triangles) == n - 2 and lost == 0 and (owner == 0).all()
+            assert len(triangles) == n - 2 and repeated == 1 and (owner == 0).all()
             assert (cross @ up > -1e-12).all() and (cross @ up).sum() == pytest.approx(outline(x, y), rel=1e-9)
+
+
+def test_repeated_corners_are_said(tmp_path):
+    found = asset(tmp_path, SQUARE + "f 1 2 2 3 4 1\nf 1 1 2\nf 1 2\n")
+    assert found.log == ("a: 3 repeated corners and 2 faces of fewer than three left out",)
+    assert area(found.parts[0]) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("first", range(4))

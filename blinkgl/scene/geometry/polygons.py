@@ -7,7 +7,7 @@ import numpy as np
 
 
 def triangulate(points: np.ndarray, places: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return ((T, 3) numbers of corners, (T,) the polygon of each triangle, the number of polygons without a triangle).
+    """Return ((T, 3) numbers of corners, (T,) the polygon of each triangle, the number of corners left out).
 
     points : (V, 3).   places : (C,) index in ``points`` of all corners, polygon after polygon.   sizes : (P,) corners
     of each polygon. A corner at the place of the one before it is left out. Triangles have their polygon's winding."""
@@ -37,7 +37,7 @@ def triangulate(points: np.ndarray, places: np.ndarray, sizes: np.ndarray) -> tu
             owners.append(np.full(len(clipped), owner))
     found, owner = np.concatenate(triangles), np.concatenate(owners)
     order = np.argsort(owner, kind="stable")  # as in the file
-    return found[order], owner[order], len(sizes) - len(np.unique(owner))
+    return found[order], owner[order], len(places) - len(corners)
 
 
 def _fans(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -51,11 +51,12 @@ def raw_meshes(
     log : gets a line where polygons have no triangle. Raises AssetError: indices that do not exist, too many corners or
     triangles."""
     _check(given, max_faces, where)
-    triangles, owner, lost = triangulate(given.points, given.places, given.sizes)
+    triangles, owner, repeated = triangulate(given.points, given.places, given.sizes)
     if not len(triangles):
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    if lost:
-        log.append(f"{Path(where).stem}: {lost} of {len(given.sizes)} faces without three different corners left out")
+    lost = len(given.sizes) - len(np.unique(owner))
+    if repeated or lost:
+        log.append(f"{Path(where).stem}: {repeated} repeated corners and {lost} faces of fewer than three left out")
     at = given.places[triangles]
     normals = np.full((len(triangles), 3, 3), np.nan) if given.normals is None else given.normals[triangles]
     missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false

@@ -115,7 +115,7 @@ def _objects(
             assets[key] = _asset(*given, animation, f"{where}.animation")
             log += [line for line in assets[key].log if line not in log]
             omissions.update(dict.fromkeys(assets[key].omissions))
-        parts = _parts(assets[key], item, None if own else materials[item.material], config.light.unlit)
+        parts = _parts(assets[key], item, None if own else materials[item.material], config)
         if item.deform is not None:
             if animation is not None:
                 raise ConfigError(
@@ -127,13 +127,17 @@ def _objects(
     return objects
 
 
-def _parts(asset: Asset, item: ObjectConfig, material: Material | None, unlit: bool) -> list[Part]:
+def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: ExplicitSceneConfig) -> list[Part]:
     """Return an asset's parts at an object's size. material : replaces its own."""
     matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
     parts = []
     for part in asset.parts:
         worn = part.material if material is None else material
-        worn = replace(worn, unlit=worn.unlit or unlit)
+        sides = part.material.both_sides  # of a file, or None
+        sides = sides if sides is None or config.both_sides is None else config.both_sides
+        if material is not None and material.both_sides is not None:
+            sides = material.both_sides
+        worn = replace(worn, unlit=worn.unlit or config.light.unlit, both_sides=sides)
         mesh = transform_mesh(part.mesh, matrix)
         if material is not None and worn.bumps is not None and mesh.deformer is None:
             mesh, _ = split_mirrored(mesh)  # a deforming mesh keeps its seams: its joints count its vertices
@@ -348,7 +352,7 @@ def _material(
         texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
     rough = _map(config, "metallic_roughness_map", base, where, maps)
     shines = config.metallic > 0 or config.roughness < 1 or rough is not None
-    plain = texture, config.color, config.uv_scale, config.unlit, config.double_sided
+    plain = texture, config.color, config.uv_scale, config.unlit, config.both_sides
     return Material(
         *plain,
         gloss=Gloss(config.metallic, config.roughness, rough) if shines else None,

@@ -14,6 +14,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from blinkgl.camera import CAMERA_MODELS, CameraModel, focal_length
@@ -182,6 +183,24 @@ def calibrated(camera: Any, base: Path) -> Any:
                 accepted=f"{getattr(seen, key)}, or nothing",
             )
     return {**own, **camera_keys(seen)}
+
+
+def place_by_calibration(camera: Any, base: Path) -> list[list[float]] | None:
+    """Return T_rig_sensor, four rows of four, of a ``camera:`` table whose calibration says where it is, the rig being
+    the file's first camera; None: it says nothing. Raises ConfigError."""
+    if not isinstance(camera, dict) or not isinstance(camera.get("calibration"), str):
+        return None
+    from blinkgl.config.camchain import read_camchain
+
+    chain = list(read_camchain(base / camera["calibration"]).items())
+    number = next((k for k, (name, _) in enumerate(chain) if name == camera.get("calibration_name")), 0)
+    links = [one.T_cam_before for _, one in chain[1 : number + 1]]
+    if not links or any(link is None for link in links):
+        return None
+    T = np.eye(4)
+    for link in links:  # from the axes of the camera before to its own
+        T = link @ T
+    return np.linalg.inv(T).tolist()
 
 
 def camera_keys(camera: CameraModel) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import Field
 
 from blinkgl.config.base import Config
-from blinkgl.config.camera import calibrated
+from blinkgl.config.camera import calibrated, place_by_calibration
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import (
     Table,
@@ -65,7 +65,13 @@ def expanded(tree: Table, base: Path) -> Table:
         said = {key: each_option(table[key], meaning) for key, meaning in meanings.items() if key in table}
         return {**table, **said}
 
-    return with_groups(tree, lambda table: with_sections(spelled_out(table), spelled_out))
+    def placed(table: Table) -> Table:
+        made, place = spelled_out(table), None
+        if "place" not in table:
+            place = place_by_calibration(table.get("camera"), base)
+        return made if place is None else {**made, "place": {"matrix": place}}
+
+    return with_groups(tree, lambda table: with_sections(spelled_out(table), placed))
 
 
 def _recipe(events: Any) -> Any:

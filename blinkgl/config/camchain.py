@@ -62,10 +62,12 @@ _COLMAP: dict[str, tuple[str | None, str]] = {
 @dataclass(frozen=True, eq=False)
 class Calibrated:
     """A camera of a calibration file. camera : its model.   T_cam_before : (4, 4) float64 rigid, from the axes of the
-    previous camera of the chain to its own (Kalibr's T_cn_cnm1); None where it is not given."""
+    previous camera of the chain to its own (Kalibr's T_cn_cnm1).   T_cam_imu : (4, 4) rigid, from the inertial unit's
+    axes to its own; None where they are not given."""
 
     camera: CameraModel
     T_cam_before: np.ndarray | None = None
+    T_cam_imu: np.ndarray | None = None
 
 
 def read_camchain(path: str | Path) -> dict[str, Calibrated]:
@@ -100,8 +102,10 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
         if dsec and isinstance(places, dict) and k:
             key = f"T_{k}{k - 1}"
             given = places.get(key)
-        if given is not None:
-            found[name] = Calibrated(one.camera, _rigid(given, f"{where}: {name}.{key}"))
+        before = None if given is None else _rigid(given, f"{where}: {name}.{key}")
+        unit = next((k for k in ("T_cam_imu", "T_imu_cam") if tables[name].get(k) is not None), None)
+        T = None if unit is None else _rigid(tables[name][unit], f"{where}: {name}.{unit}")
+        found[name] = Calibrated(one.camera, before, np.linalg.inv(T) if T is not None and unit == "T_imu_cam" else T)
     rectified_ = {name: _camera(tables[name], f"{where}: {name}", "camera_matrix") for name in names if name not in raw}
     return found | rectified_
 

@@ -185,22 +185,29 @@ def calibrated(camera: Any, base: Path) -> Any:
     return {**own, **camera_keys(seen)}
 
 
-def place_by_calibration(camera: Any, base: Path) -> list[list[float]] | None:
-    """Return T_rig_sensor, four rows of four, of a ``camera:`` table whose calibration says where it is, the rig being
-    the file's first camera; None: it says nothing. Raises ConfigError."""
-    if not isinstance(camera, dict) or not isinstance(camera.get("calibration"), str):
-        return None
+def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:
+    """Return what the calibration of a sensor's ``camera:`` says of places and the table does not: ``place`` on the
+    rig, whose origin is the file's first camera, and ``imu`` with its position and rotation. Raises ConfigError."""
+    from scipy.spatial.transform import Rotation
+
     from blinkgl.config.camchain import read_camchain
 
+    camera, said = table.get("camera"), {}
+    if not isinstance(camera, dict) or not isinstance(camera.get("calibration"), str):
+        return said
     chain = list(read_camchain(base / camera["calibration"]).items())
     number = next((k for k, (name, _) in enumerate(chain) if name == camera.get("calibration_name")), 0)
     links = [one.T_cam_before for _, one in chain[1 : number + 1]]
-    if not links or any(link is None for link in links):
-        return None
-    T = np.eye(4)
-    for link in links:  # from the axes of the camera before to its own
-        T = link @ T
-    return np.linalg.inv(T).tolist()
+    if "place" not in table and links and all(link is not None for link in links):
+        T = np.eye(4)
+        for link in links:  # from the axes of the camera before to its own
+            T = np.asarray(link) @ T
+        said["place"] = {"matrix": np.linalg.inv(T).tolist()}
+    imu, place = table.get("imu"), chain[number][1].T_cam_imu if chain else None
+    if isinstance(imu, dict) and place is not None and not {"position", "rotation"} & set(imu):
+        turned = Rotation.from_matrix(place[:3, :3]).as_euler("xyz", degrees=True)
+        said["imu"] = {**imu, "position": place[:3, 3].tolist(), "rotation": turned.tolist()}
+    return said
 
 
 def camera_keys(camera: CameraModel) -> dict[str, Any]:

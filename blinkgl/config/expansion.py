@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import Field
 
 from blinkgl.config.base import Config
-from blinkgl.config.camera import calibrated, place_by_calibration
+from blinkgl.config.camera import calibrated, placed_by_calibration
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import (
     Table,
@@ -66,10 +66,7 @@ def expanded(tree: Table, base: Path) -> Table:
         return {**table, **said}
 
     def placed(table: Table) -> Table:
-        made, place = spelled_out(table), None
-        if "place" not in table:
-            place = place_by_calibration(table.get("camera"), base)
-        return made if place is None else {**made, "place": {"matrix": place}}
+        return {**spelled_out(table), **placed_by_calibration(table, base)}
 
     return with_groups(tree, lambda table: with_sections(spelled_out(table), placed))
 

@@ -151,15 +151,19 @@ def test_a_calibration_places_its_cameras(tmp_path):
             "intrinsics": [50.0, 50.0, 31.5, 23.5]}  # fmt: skip
     chain = {
         "cam0": lens,
-        "cam1": lens | {"T_cn_cnm1": turned.tolist()},
+        "cam1": lens | {"T_cn_cnm1": turned.tolist(), "T_cam_imu": turned.tolist()},
         "cam2": lens | {"T_cn_cnm1": shifted.tolist()},
     }
     (tmp_path / "k.yaml").write_text(yaml.safe_dump(chain))
     sensors = [{"name": n, "camera": {"calibration": "k.yaml", "calibration_name": n}} for n in chain]
     sensors.append({**sensors[2], "name": "own", "place": {"position": [1, 0, 0]}})
+    sensors[1]["imu"] = {"rate": 100}
     (tmp_path / "run.yaml").write_text(yaml.safe_dump({"sensors": sensors}))
     made = load_run(tmp_path / "run.yaml").sequence(0)
     places = [sensor.place.T for sensor in made.sensors]
     expected = [np.eye(4), np.linalg.inv(turned), np.linalg.inv(shifted @ turned)]
     np.testing.assert_allclose(places[:3], expected, atol=1e-9)
     np.testing.assert_allclose(places[3][:3, 3], (1, 0, 0))
+    unit = made.sensors[1].imu
+    np.testing.assert_allclose(unit.position, turned[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_euler("xyz", unit.rotation, degrees=True).as_matrix(), turned[:3, :3])

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from blinkgl.machine import event_options as of_events
+
 
 def simulate(
     source: Annotated[
@@ -94,6 +96,14 @@ def compare(
     frame_delay_ms: Annotated[float, typer.Option(help="Offset added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval without frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Start both at their first event.")] = False,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of both, if the files do not give it.")] = None,
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
     judge: Annotated[
         bool,
         typer.Option(
@@ -103,6 +113,7 @@ def compare(
 ) -> int:
     """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against
     brightness."""
+    from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
 
     return command.run(
@@ -117,6 +128,16 @@ def compare(
         interval_ms=interval_ms,
         zero_time=zero_time,
         judge=judge,
+        reading=EventReading.of(
+            time_unit=time_unit,
+            size=size,
+            origin=origin,
+            columns=columns,
+            polarity=polarity,
+            stream=stream,
+            damaged=damaged,
+            sort=sort,
+        ),
     )
 
 
@@ -156,12 +177,21 @@ def calibrate(
     frame_delay_ms: Annotated[
         float | None, typer.Option(help="Offset added to the frame times, ms (default: estimated).")
     ] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, if the recording does not give it.")] = None,
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
     starts: Annotated[int, typer.Option(min=1, max=20, help="Starting points of the search.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulations and the search.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
     """Fit an emulator to a camera's recording; writes a sensor file, and a page that shows how close the fit is."""
+    from blinkgl.io.reading import EventReading
     from blinkgl.show import calibrate as command
 
     return command.run(
@@ -182,35 +212,65 @@ def calibrate(
         seed=seed,
         overwrite=overwrite,
         quiet=quiet,
+        events=EventReading.of(
+            time_unit=time_unit,
+            size=size,
+            origin=origin,
+            columns=columns,
+            polarity=polarity,
+            stream=stream,
+            damaged=damaged,
+            sort=sort,
+        ),
     )
 
 
 def convert(
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
-            ".mat, .txt, .csv, .npz, .npy.",
-        ),
+        typer.Argument(metavar="IN", help="Event file, of any format of docs/formats.md."),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending selects the format.")],
-    size: Annotated[
-        str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not give it (default: guessed).")
-    ] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not give it.")] = None,
     zero_time: Annotated[
         bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")
     ] = False,
-    time_unit: Annotated[
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
+    write_unit: Annotated[
         str,
-        typer.Option("--time-unit", help="For .txt and .csv: s (six decimals), or us (integers; .csv as faery's)."),
+        typer.Option(
+            "--write-unit", help="Times of a .txt or .csv OUT: s (six decimals), or us (integers; .csv as faery's)."
+        ),
     ] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
     """Convert an event file from one format to another."""
+    from blinkgl.io.reading import EventReading
     from blinkgl.show import convert as command
 
-    return command.run(source, target, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
+    return command.run(
+        source,
+        target,
+        reading=EventReading.of(
+            time_unit=time_unit,
+            size=size,
+            origin=origin,
+            columns=columns,
+            polarity=polarity,
+            stream=stream,
+            damaged=damaged,
+            sort=sort,
+        ),
+        zero_time=zero_time,
+        write_unit=write_unit,
+        overwrite=overwrite,
+    )
 
 
 def import_(

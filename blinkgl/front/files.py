@@ -5,6 +5,7 @@ Each function imports what it needs when it is called, so that reading an event 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -14,6 +15,7 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.front import arguments as check
 from blinkgl.io import formats
 from blinkgl.io.formats import EventFile
+from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
@@ -27,30 +29,60 @@ if TYPE_CHECKING:
 _SIDE = 65535
 
 
+class EventOptions(TypedDict, total=False):
+    """Declarations about an event file; :func:`blinkgl.open_events` describes them."""
+
+    time_unit: str | None
+    size: tuple[int, int] | None
+    origin: str | None
+    columns: str | Iterable[str] | None
+    polarity: str | Iterable[float] | None
+    stream: int | None
+    damaged: str
+    sort: bool
+
+
+def _reading(declared: EventOptions) -> EventReading:
+    given: dict[str, Any] = dict(declared)
+    if given.get("size") is not None:
+        given["size"] = _size(given["size"])
+    return EventReading.of(**given)
+
+
 @check.public
-def open_events(path: str | os.PathLike) -> EventFile:
+def open_events(path: str | os.PathLike, **declared: Unpack[EventOptions]) -> EventFile:
     """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
     ``height``, ``width`` in px, None if the file does not contain them (``file.sized()`` computes them), times in µs.
     Formats and endings: docs/formats.md. For .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
-    ``file.imu()``, its inertial unit.
+    ``file.imu()``, its inertial unit. ``file.said`` lists what was guessed, and after reading what was left out.
 
-    Raises AssetError: missing file, unknown ending, or content of another format."""
-    return formats.open_events(check.path(path, "path"))
+    time_unit : "s", "ms", "us" or "ns".   size : (height, width), px.   origin : "top" or "bottom", the row of y = 0.
+    columns : order of a table's columns, "x,y,t,p".   polarity : numbers of OFF and ON, (-1, 1).   stream : of several.
+    damaged : "refuse", or "keep" what is whole.   sort : put events in order of time. Default: as the file says; what
+    it does not say is guessed.
+    Raises AssetError: missing file, unknown ending, or content of another format; ConfigError."""
+    return formats.open_events(check.path(path, "path"), _reading(declared))
 
 
 @check.public
-def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
-    """Return all :class:`Events` of a file, t in µs, in memory.
+def read_events(path: str | os.PathLike, *, truth: bool = False, **declared: Unpack[EventOptions]) -> Events:
+    """Return all :class:`Events` of a file, t in µs, in memory. A guess, or something left out, is a warning.
 
     truth : also read their causes (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
-    Raises AssetError and EventDataError (decreasing times …)."""
-    with open_events(path) as file:
+    declared : as of :func:`open_events`. Raises AssetError and EventDataError (decreasing times …)."""
+    with formats.open_events(check.path(path, "path"), _reading(declared)) as file:
         events = file.read()
+    _warn(file)
     if not check.one_of(truth, "truth", bool, "True or False"):
         return events
     from blinkgl.io.event_labels import with_truth
 
     return with_truth(events, 0, check.path(path, "path").parent)
+
+
+def _warn(file: EventFile) -> None:
+    for line in file.said:
+        warnings.warn(f"{file.path}: {line}", stacklevel=4)
 
 
 @check.public
@@ -61,14 +93,14 @@ def write_events(
     width: int,
     *,
     t_offset_us: int = 0,
-    time_unit: str = "s",
+    write_unit: str = "s",
     overwrite: bool = True,
 ) -> int:
     """Write events, or chunks in order, of a sensor of height x width px, and return their number. The file appears
     complete or not at all.
 
     path : its ending names the format (docs/formats.md).   t_offset_us : DSEC's, µs.
-    time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
+    write_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
     path, height, width = (
         check.path(path, "path"),
         check.whole(height, "height", 1, _SIDE),
@@ -81,7 +113,7 @@ def write_events(
         height,
         width,
         t_offset_us=offset,
-        time_unit=time_unit,
+        write_unit=write_unit,
         overwrite=overwrite,
     )
 
@@ -104,23 +136,26 @@ def convert(
     source: str | os.PathLike,
     target: str | os.PathLike,
     *,
-    size: tuple[int, int] | None = None,
     zero_time: bool = False,
-    time_unit: str = "s",
+    write_unit: str = "s",
     overwrite: bool = True,
+    **declared: Unpack[EventOptions],
 ) -> int:
-    """Copy events from one file format to another, in pieces. Returns the number of events.
+    """Copy events from one file format to another, in pieces. Returns the number of events. A guess, or something left
+    out, is a warning.
 
-    size : (height, width), px, if ``source`` does not contain it.   time_unit : as of :func:`write_events`.
-    zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
-    return formats.convert(
+    write_unit : as of :func:`write_events`.   zero_time : count times from the first event.   declared : of ``source``,
+    as of :func:`open_events`. Raises AssetError, OutputError, EventDataError, ConfigError."""
+    file, count = formats.convert(
         check.path(source, "source"),
         check.path(target, "target"),
-        size=None if size is None else _size(size),
+        _reading(declared),
         zero_time=bool(zero_time),
-        time_unit=time_unit,
+        write_unit=write_unit,
         overwrite=overwrite,
-    )[1]
+    )
+    _warn(file)
+    return count
 
 
 def _size(size: Any) -> tuple[int, int]:
@@ -209,6 +244,7 @@ def compare(
     interval_ms: float = 20.0,
     zero_time: bool = False,
     judge: bool = False,
+    **declared: Unpack[EventOptions],
 ) -> Comparison:
     """Compare two event files over their common time: ``rows()`` is a table, ``to_dict()`` numbers.
 
@@ -216,7 +252,7 @@ def compare(
     frames : video or folder of images that both are compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
     judge : also compute how well a classifier separates b from a, and the halves of each: ``told_apart``, ``halves``.
-    Raises AssetError, EventDataError, ConfigError."""
+    declared : of both files, as of :func:`open_events`. Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
 
     return comparison.compare(
@@ -227,6 +263,7 @@ def compare(
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
         judge=bool(judge),
+        reading=_reading(declared),
     )
 
 

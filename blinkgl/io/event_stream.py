@@ -1,7 +1,7 @@
 """Event Stream (.es) by Marcireau, version 2, of a DVS: one byte of time and polarity, then x and y, 16 bits each.
 
 The byte is (time since the event before, µs) << 1 | polarity; 0xff: 127 µs pass without an event, 0xfe: padding.
-(neuromorphic-paris/event_stream, the format's page.) y is as the file has it."""
+(neuromorphic-paris/event_stream, the format's page.) y counts from the bottom."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import check_size
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -23,7 +24,9 @@ _DVS = 1
 class EventStreamReader:
     """Size and events of an .es file. Raises AssetError: not version 2, not of a DVS, truncated."""
 
-    def __init__(self, path: str | os.PathLike):
+    origin = "bottom"
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path = Path(path)
         with open(path, "rb") as file:
             header = file.read(_HEADER)

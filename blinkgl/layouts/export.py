@@ -13,13 +13,14 @@ from blinkgl.layouts.event_kubric import EventKubric
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
+from blinkgl.layouts.rosbag import RosBag
 from blinkgl.layouts.source import Source, sources_of
 from blinkgl.layouts.tapvid import TapVid
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The available layouts.
 
-_ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric())
+_ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag())
 LAYOUTS: dict[str, Layout] = {row.name: row for row in _ROWS}
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.clip import (
     PLAIN,
     Clip,
@@ -130,6 +131,7 @@ def calibrate(
     starts: int = 3,
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
+    events: EventReading = AS_FILE,
 ) -> Calibration:
     """Fit an emulator to a recording.
 
@@ -137,7 +139,8 @@ def calibrate(
     (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   reading : how they are interpreted.
     still : a static scene in constant light, without frames: only noise.
     emulator : a name, or the initial configuration; ``fixed``: keys that keep their values.
-    starts : of the search.   progress : called with (current activity, fraction).
+    starts : of the search.   progress : called with (current activity, fraction).   events : what is declared of the
+    recording.
 
     Raises EventDataError, one line: no frames, frames of another size, saturated, not of this recording's time or
     clock; too few events. ConfigError: an emulator without parameters to fit, an unknown key, interpolation.
@@ -148,14 +151,16 @@ def calibrate(
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
     if progress:
         progress("reading", 0.0)
-    events, size = read_recording(recording, least=LEAST_EVENTS)
+    read, size, said = read_recording(recording, events, least=LEAST_EVENTS)
     given = None
     if not still:
         frames = _own_frames(recording) if frames is None else frames
         timed, exposures = timed_frames(frames, fps=fps, timestamps=timestamps)
         given, reading = list(timed), replace(reading, exposures=exposures, name=os.fspath(frames))
     search = dict(emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    return calibrate_events(events, size, given, reading, name=os.fspath(recording), **search)
+    result = calibrate_events(read, size, given, reading, name=os.fspath(recording), **search)
+    result.warnings.extend(said)
+    return result
 
 
 def calibrate_events(

@@ -21,6 +21,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import RECORDING, open_frames
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
 from blinkgl.recordings.decoding import Decoder, noise_of
@@ -422,10 +423,12 @@ def polarity_counts(events: Events, size: tuple[int, int]) -> tuple[np.ndarray, 
     return count(1), count(0)
 
 
-def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, tuple[int, int]]:
-    """Return all events of a file, and the (height, width) of its sensor. Raises EventDataError: fewer than
-    ``least``."""
-    with open_events(path) as file:
+def read_recording(
+    path: str | os.PathLike, reading: EventReading = AS_FILE, *, least: int = 0
+) -> tuple[Events, tuple[int, int], list[str]]:
+    """Return all events of a file, the (height, width) of its sensor, and what was guessed or left out, a line each.
+    Raises EventDataError: fewer than ``least``."""
+    with open_events(path, reading) as file:
         file = file.sized()
         events = file.read()
     if len(events) < least:
@@ -436,7 +439,7 @@ def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, 
             accepted=f"{least:,} or more",
         )
     assert file.height is not None and file.width is not None
-    return events, (file.height, file.width)
+    return events, (file.height, file.width), file.said
 
 
 def timed_frames(

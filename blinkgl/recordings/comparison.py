@@ -18,6 +18,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -87,6 +88,8 @@ class Comparison:
     """how well a judge distinguishes b from a; None: not requested, or there is no b"""
     halves: tuple[Judgement, ...] = ()
     """how well it distinguishes the halves of each recording, a's first"""
+    said: tuple[str, ...] = ()
+    """what was guessed or left out when the files were read, a line each"""
 
     @property
     def same_size(self) -> bool:
@@ -193,6 +196,7 @@ def compare(
     interval_ms: float = 20.0,
     zero_time: bool = False,
     judge: bool = False,
+    reading: EventReading = AS_FILE,
 ) -> Comparison:
     """Compare event file ``a`` with event file ``b``, with ``frames``, or with both, over their common time; alone,
     ``a`` is described.
@@ -204,14 +208,14 @@ def compare(
     as intensities, as for a DAVIS's frames.
     frame_delay_ms : added to the frames' times; a stamp of the exposure's start is before its centre. zero_time : count
     both recordings from their first event. judge : also train a classifier to distinguish them
-    (:mod:`~blinkgl.recordings.judge`), which holds their events in memory.
+    (:mod:`~blinkgl.recordings.judge`), which holds their events in memory. reading : what is declared of both.
 
     Raises EventDataError: frames of another size than a recording, no common time, too few events for a judge.
     AssetError: unreadable.
     """
     if b is not None and frames is None and not _is_event_file(b):
         b, frames = None, b
-    files = [open_events(p).sized() for p in ((a,) if b is None else (a, b))]
+    files = [open_events(p, reading).sized() for p in ((a,) if b is None else (a, b))]
     spans = [_span(f) for f in files]
     shifts = [s[0] if zero_time else 0 for s in spans]
     start, stop = max(s[0] - d for s, d in zip(spans, shifts)), min(s[1] - d for s, d in zip(spans, shifts))
@@ -232,6 +236,7 @@ def compare(
             accepted="recordings that overlap (seconds shown), or --zero-time",
         )
     result = _accumulate(files, shifts, edges, changes)
+    result.said = tuple(f"{file.path}: {line}" for file in files for line in file.said)
     if judge:
         result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))
     return result

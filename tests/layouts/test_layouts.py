@@ -399,3 +399,62 @@ def test_a_lens_that_distorts_has_its_rectify_map_and_truth_that_is_rectified(tm
     calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
     assert calibration["intrinsics"]["cam0"]["distortion_coeffs"] == pytest.approx([-0.2, 0.05, 0, 0])
     assert list(dsec_sequence(folder, HEIGHT, WIDTH))
+
+
+def messages(path):
+    """Topic -> [(time, message)], by rosbags' own deserialisation."""
+    rosbags = pytest.importorskip("rosbags.highlevel", reason="optional extra [formats]")
+    found = {}
+    with rosbags.AnyReader([path]) as bag:
+        for connection, t_ns, data in bag.messages():
+            found.setdefault(connection.topic, []).append((t_ns, bag.deserialize(data, connection.msgtype)))
+    return found
+
+
+def test_rosbag_on_the_topics_of_esim(data, sequence, tmp_path):
+    """Events, images, depth, flow in px/s, poses and the inertial unit, at their own times."""
+    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    path = exported(data, tmp_path, "rosbag") / "train/sequence_000000.bag"
+    found, events = messages(path), read_events(sequence / "events.h5")
+    assert set(found) == {"/imu", "/pose"} | {
+        f"/cam0/{name}" for name in ("events", "image_raw", "camera_info", "depthmap", "optic_flow")
+    }
+    with open_events(path) as file:
+        assert (file.height, file.width) == (HEIGHT, WIDTH) and file.said == []
+        same([getattr(file.read(), k) for k in "xytp"], events)
+    rows = [e for _, message in found["/cam0/events"] for e in message.events]
+    assert [(e.x, e.y, e.ts.sec * 10**6 + e.ts.nanosec // 1000, int(e.polarity)) for e in rows] == list(
+        zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist())
+    )
+    times, labels = np.loadtxt(sequence / "images/timestamps.txt", dtype="int64"), label_times(sequence)
+    for topic, at in (("image_raw", times), ("camera_info", times), ("depthmap", labels[:, 0])):
+        assert [t for t, _ in found[f"/cam0/{topic}"]] == (at * 1000).tolist()
+    for k, (_, image) in enumerate(found["/cam0/image_raw"]):
+        grey = cv2.imread(str(sequence / f"images/{k:06d}.png"), 0)
+        assert image.encoding == "mono8" and np.abs(image.data.reshape(HEIGHT, WIDTH).astype(int) - grey).max() <= 1
+    for k, (_, depth) in enumerate(found["/cam0/depthmap"]):
+        values = depth.data.view("<f4").reshape(HEIGHT, WIDTH)
+        np.testing.assert_array_equal(values, np.load(sequence / f"depth/{k:06d}.npy"))
+    for k, (t_ns, flow) in enumerate(found["/cam0/optic_flow"]):
+        true = np.load(sequence / f"flow/forward_npy/{k:06d}.npy")
+        speed = np.where(true[..., 2] > 0, true[..., 0] * 10, np.nan)  # 100 ms
+        np.testing.assert_allclose(flow.flow_x.reshape(HEIGHT, WIDTH), speed, rtol=1e-6)
+        assert t_ns == labels[k, 0] * 1000
+    poses = np.load(sequence / "poses.npz")
+    for (t_ns, message), t, T in zip(found["/pose"], poses["t_ns"], poses["T_world_cam"], strict=True):
+        q, p = message.pose.orientation, message.pose.position
+        np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), T[:3, :3], atol=1e-12)
+        assert (t_ns, [p.x, p.y, p.z]) == (t, T[:3, 3].tolist())
+    K = found["/cam0/camera_info"][0][1].K
+    np.testing.assert_array_equal(K.reshape(3, 3), poses["K"])
+    imu = read_imu(sequence)
+    np.testing.assert_array_equal([m.linear_acceleration.x for _, m in found["/imu"]], imu["acceleration"][:, 0])
+
+
+def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
+    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    path = exported(stereo.parents[1], tmp_path, "rosbag") / "train/sequence_000000.bag"
+    with open_events(path) as file:
+        assert file.said == ["2 topics of events: /cam0/events is read (--stream for another)"]
+        same([getattr(file.read(), k) for k in "xytp"], read_events(stereo / "left/events.h5"))
+    assert export_layout(bare, tmp_path / "bare", "rosbag").said == ()

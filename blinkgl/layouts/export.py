@@ -63,6 +63,8 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
             said += row.write(source, folder / place)
         for split in row.splits:
             (folder / split).mkdir(exist_ok=True)
+    held = {place.split("/")[0] for place in places}
+    said += [f"nothing in {split}/, which its loaders open" for split in row.filled if split not in held]
     return Exported(len(sources), tuple(said), row.opened_by(out))
 
 

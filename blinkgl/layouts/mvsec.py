@@ -44,7 +44,7 @@ class Mvsec(Layout):
                 for eye, one in eyes.items():
                     write(one, file, f"davis/{eye}")
         _flow(source, folder / f"{source.name}_gt_flow_dist.npz")
-        return []
+        return [] if source.right else [f"{source.name}: no davis/right, which some loaders open (rig: stereo)"]
 
 
 def _data(source: Source, file: h5py.File, group: str) -> None:

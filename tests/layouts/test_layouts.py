@@ -97,7 +97,7 @@ def test_dsec(data, sequence, tmp_path):
     events, found = read_events(sequence / "events.h5"), list(dsec_sequence(folder, HEIGHT, WIDTH))
     assert len(found) == 4
     for (number, start, end, flow, valid, before, during), k in zip(found, range(4)):
-        assert (number, start, end) == (2 * k, *label_times(sequence)[k])
+        assert (number, start, end) == (2 * k + 2, *label_times(sequence)[k])
         same(before, events.window(2 * start - end, start))
         same(during, events.window(start, end))
         true, _ = read_flow_npy(sequence / f"flow/forward_npy/{k:06d}.npy")
@@ -116,6 +116,23 @@ def test_dsec(data, sequence, tmp_path):
     assert (tmp_path / "dsec/test").is_dir(), "bflow's provider asserts both splits"
 
 
+def test_what_loaders_will_miss_is_said(data, stereo, tmp_path):
+    """A split that they open, a second camera, a second label; training sequences never land in test/."""
+    one = generate(tmp_path / "one", {**RECIPE, "time": {**RECIPE["time"], "duration": 0.1}})
+    said = {
+        "eraft": ["nothing in test/, which its loaders open"],
+        "mvsec": ["sequence_000000: no davis/right, which some loaders open (rig: stereo)"],
+        "dsec": [],
+    }
+    for layout, lines in said.items():
+        found = [s for s in export_layout(data, tmp_path / layout, layout).said if "published loaders expect" not in s]
+        assert found == lines and not list((tmp_path / layout).glob("test/*"))
+    assert not [s for s in export_layout(stereo, tmp_path / "two", "mvsec").said if "davis/right" in s]
+    assert "sequence_000000: one label, and bflow's loader opens two or more" in (
+        export_layout(one, tmp_path / "one_dsec", "dsec").said
+    )
+
+
 def test_dsecs_provider_is_named_where_it_finds_what_it_asserts(data, stereo, tmp_path):
     """It asserts a folder of disparities: a monocular data set is not for it."""
     opened_by = [export_layout(one, tmp_path / one.name, "dsec").opened_by for one in (data, stereo)]
@@ -124,11 +141,11 @@ def test_dsecs_provider_is_named_where_it_finds_what_it_asserts(data, stereo, tm
 
 
 def test_eraft(data, sequence, tmp_path):
-    folder = exported(data, tmp_path, "eraft") / "test/sequence_000000"
+    folder = exported(data, tmp_path, "eraft") / "train/sequence_000000"
     events, found = read_events(sequence / "events.h5"), list(eraft_sequence(folder, HEIGHT, WIDTH))
-    assert [number for number, *_ in found] == [2, 4, 6]
+    assert [number for number, *_ in found] == [2, 4, 6, 8]
     for number, t, before, after in found:
-        assert t == label_times(sequence)[number // 2, 0]
+        assert t == label_times(sequence)[number // 2 - 1, 0]
         same(before, events.window(t - 100_000, t))
         same(after, events.window(t, t + 100_000))
         assert (folder / f"flow/forward/{number:06d}.png").is_file()
@@ -357,10 +374,10 @@ def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_pa
     poses = np.load(stereo / "left/poses.npz")
     eyes = {eye: read_events(stereo / eye / "events.h5") for eye in ("left", "right")}
     found = list(dsec_disparity(folder, HEIGHT, WIDTH))
-    assert len(found) == 1
-    for disparity, windows in found:
-        t = label_times(stereo / "left")[1, 0]
-        depth = 2.0 - poses["T_world_cam"][2, 0, 3]  # the wall's face is at x = 2
+    assert len(found) == 2, "the first of three, which the provider drops, is of no label"
+    for k, (disparity, windows) in enumerate(found):
+        t = label_times(stereo / "left")[k, 0]
+        depth = 2.0 - poses["T_world_cam"][k + 1, 0, 3]  # the wall's face is at x = 2
         assert disparity == pytest.approx(poses["K"][0, 0] * 0.1 / depth, abs=0.5 / 256 + 1e-5)
         for eye, window in windows.items():
             same(window, eyes[eye].window(t - 50_000, t))

@@ -15,7 +15,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import CameraFrame, G, ImuSamples, check_events, check_size, events_of, joined, refuse_causes
+from blinkgl.io.columns import CameraFrame, CheckedWriter, G, ImuSamples, events_of, joined
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
@@ -45,7 +45,6 @@ class Aedat4Reader:
             self.said.append(f"{len(found)} streams of events: {shown}; {self._number} is read (--stream for another)")
         events = self._streams[self._number]
         self.height, self.width = events["height"], events["width"]
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events, packet by packet, joined to about ``size``."""
@@ -129,38 +128,30 @@ def _damage(path: Path) -> Iterator[None]:
         raise AssetError(f"damaged AEDAT4 file: {text}", where=str(path)) from error
 
 
-class Aedat4Writer:
-    """Writes one stream of events by dv-processing. Raises OutputError: it is not installed; EventDataError as
-    :func:`~blinkgl.io.columns.check_events`."""
+class Aedat4Writer(CheckedWriter):
+    """Writes one stream of events by dv-processing. Raises OutputError: it is not installed."""
+
+    kind = "AEDAT4"
 
     def __init__(self, path: str | os.PathLike, height: int, width: int):
+        super().__init__(path, height, width)
         try:
             import dv_processing as dv
         except ImportError:
-            raise OutputError(
-                "AEDAT4 is written by the package dv-processing",
-                where=str(path),
-                accepted=f"run {install('dv-processing')}",
-            ) from None
-        self.path, self._size, self._count, self._last, self._dv = Path(path), (height, width), 0, None, dv
+            accepted = f"run {install('dv-processing')}"
+            raise OutputError("AEDAT4 is written by the package dv-processing", accepted=accepted) from None
         settings = dv.io.MonoCameraWriter.EventOnlyConfig("BlinkGL", (width, height))
+        self._store = dv.EventStore
         with output_errors(path):
             self._file = dv.io.MonoCameraWriter(os.fspath(path), settings)
 
-    def append(self, events: Events) -> None:
-        refuse_causes(events, "AEDAT4", str(self.path))
-        height, width = self._size
-        self._last = check_events(events, str(self.path), self._count, height=height, width=width, after=self._last)
-        self._count += len(events)
-        store = self._dv.EventStore()
+    def _write(self, events: Events) -> None:
+        store = self._store()
         for x, y, t, p in zip(*(getattr(events, k).tolist() for k in "xytp"), strict=True):
             store.push_back(t, x, y, bool(p))
-        with output_errors(self.path):
-            self._file.writeEvents(store)
+        self._file.writeEvents(store)
 
     def close(self, t_end_us: int | None = None) -> None:
+        """Finish the file, which the library does when its writer goes."""
         with output_errors(self.path):
-            self._file = None  # the library finishes a file when its writer goes
-
-    def abort(self) -> None:
-        self._file = None
+            self._file = None

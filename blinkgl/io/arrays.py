@@ -15,10 +15,10 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.clock import named_unit
-from blinkgl.io.columns import check_events
+from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.io.tables import Table, TableReader, named_columns, slot_of, table_of_rows
+from blinkgl.io.tables import Table, TableReader, named_columns, slot_of, table_of_columns, table_of_rows
 from blinkgl.types.events import Events
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -149,10 +149,11 @@ def _table(arrays: Mapping[str, Any], where: str, reading: EventReading) -> Tabl
         columns["cause"] = arrays["cause"]
     sides = [_declared(arrays[side], side, where) for side in ("height", "width") if side in arrays]
     unit = str(arrays["time_unit"]) if "time_unit" in arrays else None
-    return Table(
+    return table_of_columns(
         columns,
-        named["t"],
-        named_unit(f"[{unit}]") if unit else None,
+        where,
+        heading=named["t"],
+        unit=named_unit(f"[{unit}]") if unit else None,
         size=(sides[0], sides[1]) if len(sides) == 2 else None,
     )
 
@@ -169,18 +170,14 @@ class MatReader(TableReader):
         super().__init__(Path(path), reading, [_table(arrays, os.fspath(path), reading)])
 
 
-class ArrayWriter:
+class ArrayWriter(CheckedWriter):
     """Collects events and writes on close."""
 
     def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
-        self.path, self._size, self._chunks = Path(path), (height, width), []
-        self._count, self._last = 0, None
+        super().__init__(path, height, width)
+        self._chunks: list[Events] = []
 
-    def append(self, events: Events) -> None:
-        self._last = check_events(
-            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
-        )
-        self._count += len(events)
+    def _write(self, events: Events) -> None:
         self._chunks.append(events.copy())
 
     def close(self, t_end_us: int | None = None) -> None:
@@ -196,9 +193,6 @@ class ArrayWriter:
                 for k in table.dtype.names:
                     table[k] = getattr(e, k)
                 np.save(file, table, allow_pickle=False)
-
-    def abort(self) -> None:
-        self._chunks = []
 
 
 def _declared(value: np.ndarray, name: str, path) -> int:

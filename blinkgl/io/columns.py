@@ -7,16 +7,21 @@ file's first.
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.io.atomic import output_errors
 from blinkgl.types.events import Cause, Events
 
-MAX_SIDE = 65536
+MAX_SIDE, MAX_PIXELS = 65536, 1 << 25
 _MAX_TIME = 1 << 62
 """µs; sums and differences of two such times still fit int64."""
 
@@ -147,21 +152,67 @@ def joined(pieces: Iterable[Events], least: int) -> Iterator[Events]:
         yield Events.concatenate(pending)
 
 
-def refuse_causes(events: Events, kind: str, where: str) -> None:
-    """Raise OutputError for events with causes, for a format that cannot store them."""
-    if events.cause is not None:
-        raise OutputError(
-            f"{kind} cannot hold the causes of events",
-            where=where,
-            accepted=".h5, .npz or .npy, or events without causes",
-        )
+class CheckedWriter:
+    """Base of writers of event files: checks what it is given, counts, and closes ``_file``. A subclass has
+    :meth:`_write`.
+
+    height, width : px, None: not known.   limits : times that the format holds, [least, most) µs, and what they are.
+    kind : name of a format that cannot store the causes of events; "": it can."""
+
+    kind = ""
+    limits: tuple[int, int, str] | None = None
+
+    def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
+        self.path, self._size, self._count, self._last = Path(path), (height, width), 0, None
+        self._file: Any = None
+        self.t_end_us: int | None = None
+
+    def append(self, events: Events) -> None:
+        """Add events. Raises OutputError: causes, which the format cannot store, or the disk refuses; EventDataError as
+        :func:`check_events`, and times that the format cannot hold."""
+        where, (height, width) = str(self.path), self._size
+        if self.kind and events.cause is not None:
+            raise OutputError(
+                f"{self.kind} cannot hold the causes of events",
+                where=where,
+                accepted=".h5, .npz or .npy, or events without causes",
+            )
+        if not len(events):
+            return
+        if self.limits is not None:
+            least, most, problem = self.limits
+            if events.t[0] < least or events.t[-1] >= most:
+                value = int(events.t[0] if events.t[0] < least else events.t[-1])
+                raise EventDataError(problem, where=where, value=value, accepted=f"{least} to less than {most} µs")
+        self._last = check_events(events, where, self._count, height=height, width=width, after=self._last)
+        with output_errors(self.path):
+            self._write(events)
+        self._count += len(events)
+
+    def _write(self, events: Events) -> None:
+        raise NotImplementedError
+
+    def close(self, t_end_us: int | None = None) -> None:
+        """Finish the file."""
+        with output_errors(self.path):
+            self._file.close()
+
+    def abort(self) -> None:
+        """Stop without finishing; never raises."""
+        with contextlib.suppress(Exception):
+            self._file.close()
 
 
 def check_size(height: int | None, width: int | None, where: str) -> None:
-    """Raise AssetError when a sensor's declared size (None: not declared) is impossible."""
-    if not all(n is None or 0 < n <= MAX_SIDE for n in (height, width)):
+    """Raise AssetError when a sensor's declared size (None: not declared) is impossible, before anything of that size
+    is made."""
+    sides = [side for side in (height, width) if side is not None]
+    if not all(0 < side <= MAX_SIDE for side in sides) or (len(sides) == 2 and sides[0] * sides[1] > MAX_PIXELS):
         raise AssetError(
-            "impossible sensor size", where=where, value=f"{width}x{height}", accepted=f"1 to {MAX_SIDE} px a side"
+            "impossible sensor size",
+            where=where,
+            value=f"{width}x{height}",
+            accepted=f"1 to {MAX_SIDE} px a side and at most {MAX_PIXELS} px: --size WIDTHxHEIGHT",
         )
 
 

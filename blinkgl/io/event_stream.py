@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.columns import check_size
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
@@ -40,7 +39,6 @@ class EventStreamReader:
                 accepted="version 2, type 1 (DVS)",
             )
         self.width, self.height = (int.from_bytes(header[i : i + 2], "little") for i in (16, 18))
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events, decoded from ``size`` bytes at a time."""

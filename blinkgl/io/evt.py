@@ -22,7 +22,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
@@ -34,12 +34,14 @@ _MAX_TIME = 1 << 34
 """µs, 4.8 hours: the longest time that is filled with TIME_HIGH words."""
 
 
-class EvtWriter:
+class EvtWriter(CheckedWriter):
     """Streams events into an EVT3 file with a header that names format and geometry.
 
     Raises EventDataError for times outside [0, 2^34) µs or out of order, and coordinates
     outside the sensor or the format's 11 bits.
     """
+
+    kind, limits = "EVT3", (0, _MAX_TIME, "EVT3 times count from the recording's start; --zero-time shifts them")
 
     def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
         if max(height or 0, width or 0) > _MAX_SIDE:
@@ -49,10 +51,9 @@ class EvtWriter:
                 value=(height, width),
                 accepted="at most 2048 px a side",
             )
-        self.path, self.height, self.width = Path(path), height, width
+        super().__init__(path, height, width)
         # time written so far, and the row; -1: none yet
         self._state = np.array([0, -1], np.int64)
-        self._count = 0
         known = height is not None and width is not None
         size, geometry = (f";height={height};width={width}", f"% geometry {width}x{height}\n") if known else ("", "")
         header = f"% evt 3.0\n% format EVT3{size}\n{geometry}% integrator_name BlinkGL\n% end\n"
@@ -60,37 +61,12 @@ class EvtWriter:
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
             self._file.write(header.encode())
 
-    def append(self, events: Events) -> None:
-        refuse_causes(events, "EVT3", str(self.path))
-        if not len(events):
-            return
-        t = events.t
-        if t[0] < 0 or t[-1] >= _MAX_TIME:
-            raise EventDataError(
-                "EVT3 times count from the recording's start",
-                where=str(self.path),
-                value=int(t[0] if t[0] < 0 else t[-1]),
-                accepted="0 to less than 2^34 µs; use --zero-time to shift",
-            )
-        check_events(
-            events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0])
-        )
+    def _write(self, events: Events) -> None:
         # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us passed.
+        t = events.t
         words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
         n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
-        self._count += len(t)
-        with output_errors(self.path):
-            self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
-
-    def close(self, t_end_us: int | None = None) -> None:
-        with output_errors(self.path):
-            self._file.close()
-
-    def abort(self) -> None:
-        try:
-            self._file.close()
-        except OSError:
-            pass
+        self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
 
 
 class EvtReader:
@@ -118,7 +94,6 @@ class EvtReader:
         sizes = {k: re.search(rf"{k}=(\d{{1,9}})\b", header) for k in ("height", "width")}
         self.height = int(geometry.group(2)) if geometry else int(sizes["height"].group(1)) if sizes["height"] else None
         self.width = int(geometry.group(1)) if geometry else int(sizes["width"].group(1)) if sizes["width"] else None
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``words`` words at a time."""

@@ -19,7 +19,6 @@ from typing import BinaryIO
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.columns import check_size
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
 
@@ -56,7 +55,6 @@ class DatReader:
         self.height, self.width = sides.get("height"), sides.get("width")
         version = re.search(r"^% Version (\d)", header, re.M)
         self._places = _LONG if version and version[1] == "2" else _SHORT
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, count: int = 1 << 20) -> Iterator[Events]:
         """Yield all events."""

@@ -277,6 +277,7 @@ class EventFile:
             largest = np.maximum(largest, (int(events.y.max()), int(events.x.max())))
         fits = (s for s in SENSORS if s[0] > largest[0] and s[1] > largest[1])
         height, width = next(fits, tuple(int(v) + 1 for v in largest))
+        check_size(height, width, str(self.path))
         return replace(self, height=height, width=width, guessed_size=True)
 
 
@@ -302,6 +303,7 @@ def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Eve
     reader = FORMATS[kind].open(path, reading)
     kind = getattr(reader, "version", kind)  # a .raw file says whether it is EVT2, EVT2.1 or EVT3
     height, width = reading.size or (reader.height, reader.width)
+    check_size(height, width, str(path))
     file = EventFile(path, kind, height, width, getattr(reader, "t_offset_us", 0), reading, _reader=reader)
     if reading.size and reader.height and (reader.height, reader.width) != reading.size:
         file.told["size"] = f"the file says {reader.width}x{reader.height}; --size is used"

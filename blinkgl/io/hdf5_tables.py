@@ -18,7 +18,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.hdf5 import attribute, check_storage, hdf5_errors, open_hdf5
 from blinkgl.io.mvsec import EVENTS
 from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.io.tables import RowColumn, Table, TableReader, named_columns, table_of_rows
+from blinkgl.io.tables import Table, TableReader, named_columns, table_of_columns, table_of_records, table_of_rows
 from blinkgl.types.events import Events
 
 
@@ -29,9 +29,7 @@ class Hdf5TableReader(TableReader):
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            tables = list(_tables(self._file, self.path, reading))
-            # Columns with names before arrays of four columns, which may be anything.
-            tables.sort(key=lambda table: isinstance(table.columns["t"], RowColumn))
+            tables = [table for named in (True, False) for table in _tables(self._file, self.path, reading, named)]
             if not tables:
                 raise AssetError(
                     "no columns of events",
@@ -51,78 +49,55 @@ class Hdf5TableReader(TableReader):
         self._file.close()
 
 
-def _tables(file: h5py.File, path: Path, reading: EventReading) -> Iterator[Table]:
-    """Yield the tables of events, in the order of the groups' names, ``events`` and the root first."""
-    groups: list[str] = []
+def _tables(file: h5py.File, path: Path, reading: EventReading, named: bool) -> Iterator[Table]:
+    """Yield the tables of events, in the order of the groups' names, ``events`` and the root first: columns and fields
+    with names, or (not ``named``) arrays of four columns, which may be anything."""
+    groups = [""]
     file.visititems(lambda name, found: groups.append(name) if isinstance(found, h5py.Group) else None)
-    for name in sorted(["", *groups], key=lambda name: (name != "events", name != "", name)):
+    for name in sorted(groups, key=lambda name: (name != "events", name != "", name)):
         group = file[name] if name else file
         held = {key: group[key] for key in group if isinstance(group[key], h5py.Dataset)}
-        named = named_columns(held, reading)
-        if set("txyp") <= set(named):
-            yield _of_columns(file, group, {slot: held[key] for slot, key in named.items()}, named["t"], path)
+        columns = named_columns(held, reading)
+        if set("txyp") <= set(columns):
+            if named:
+                yield _of_columns(file, group, {slot: held[key] for slot, key in columns.items()}, columns["t"], path)
             continue
         for key, data in held.items():
-            place = f"{name}/{key}".lstrip("/")
-            fields = data.dtype.names
-            if fields and len(data.shape) == 1 and set("txyp") <= set(order := named_columns(fields, reading)):
+            place, size = f"{name}/{key}".lstrip("/"), _size(file, group, path)
+            fields = named_columns(data.dtype.names or (), reading)
+            if named and len(data.shape or ()) == 1 and set("txyp") <= set(fields):
                 check_storage(data, place, path)
-                columns = {slot: _Field(data, field) for slot, field in order.items()}
-                yield Table(columns, order["t"], place=place, size=_size(file, group, path))
-            elif len(data.shape) == 2 and data.shape[1] in (4, len(reading.columns or ())) and data.dtype.kind in "iuf":
+                yield table_of_records(data, fields, place=place, size=size)
+            rows = data.dtype.kind in "iuf" and len(data.shape or ()) == 2
+            if not named and rows and data.shape[1] in (4, len(reading.columns or ())):
                 check_storage(data, place, path)
                 if place in EVENTS:
                     asked = reading if reading.columns else EventReading(columns=("x", "y", "t", "p"))
                     yield table_of_rows(data, str(path), asked, place=place, unit="s", size=(260, 346))
                 else:
-                    yield table_of_rows(data, str(path), reading, place=place, size=_size(file, group, path))
+                    yield table_of_rows(data, str(path), reading, place=place, size=size)
 
 
 def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, path: Path) -> Table:
+    if isinstance(group.get("cause"), h5py.Dataset):
+        columns["cause"] = group["cause"]
     for data in columns.values():
-        if data.shape is None or len(data.shape) not in (1, 2) or data.dtype.shape or data.dtype.kind not in "iufb":
+        if data.dtype.shape or data.dtype.kind not in "iufb":
             raise AssetError(
                 f"dataset '{data.name}' holds no column of numbers", where=str(path), value=f"{data.dtype} {data.shape}"
             )
         check_storage(data, data.name, path)
-    if "cause" in group and isinstance(group["cause"], h5py.Dataset) and len(group["cause"].shape or ()) == 1:
-        columns["cause"] = group["cause"]
-        check_storage(columns["cause"], "cause", path)
     units = next((attribute(columns["t"], key, path) for key in ("unit", "units") if key in columns["t"].attrs), None)
-    # A table of milliseconds, as DSEC and BlinkFlow have, counts µs.
-    unit = "us" if "ms_to_idx" in file and columns["t"].dtype.kind in "iu" else None
-    return Table(
-        {slot: _flat(data) for slot, data in columns.items()},
-        f"t [{units}]" if isinstance(units, str) else heading,
-        unit,
-        _number(file, "t_offset", path) or 0,
-        _size(file, group, path),
-        columns["t"].parent.name.strip("/"),
+    return table_of_columns(
+        columns,
+        str(path),
+        heading=f"t [{units}]" if isinstance(units, str) else heading,
+        # A table of milliseconds, as DSEC and BlinkFlow have, counts µs.
+        unit="us" if "ms_to_idx" in file and columns["t"].dtype.kind in "iu" else None,
+        offset=_number(file, "t_offset", path) or 0,
+        size=_size(file, group, path),
+        place=columns["t"].parent.name.strip("/"),
     )
-
-
-def _flat(data: h5py.Dataset) -> Any:
-    """Return a column; MATLAB's vectors have two axes."""
-    if len(data.shape) == 1:
-        return data
-    return _Field(data, None) if 1 in data.shape else data
-
-
-class _Field:
-    """A field of records, or a vector of two axes, as a column."""
-
-    def __init__(self, data: h5py.Dataset, field: str | None):
-        self._data, self._field = data, field
-        self.shape = (max(data.shape),) if len(data.shape) == 2 else data.shape
-        self.dtype = data.dtype[field] if field else data.dtype
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, part: slice) -> np.ndarray:
-        if self._field:
-            return self._data[part][self._field]
-        return (self._data[part, 0] if self._data.shape[1] == 1 else self._data[0, part])[:]
 
 
 def _number(holder: Any, name: str, path: Path) -> Any:

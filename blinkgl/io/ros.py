@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.columns import check_size, events_of, joined
+from blinkgl.io.columns import events_of, joined
 from blinkgl.io.evt import START, decode
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.extras import install
@@ -84,7 +84,6 @@ class BagReader:
             for _, _, (height, width) in self._messages(bag):
                 self.height, self.width = (height, width) if height and width else (None, None)
                 break
-        check_size(self.height, self.width, str(path))
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[Any]:

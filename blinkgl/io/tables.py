@@ -7,7 +7,7 @@ People write the same table under many names (``t ts timestamps t_us``, ``x xs``
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
-from blinkgl.io.columns import check_size, events_of, microseconds
+from blinkgl.io.columns import events_of, microseconds
 from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
 
@@ -72,12 +72,13 @@ def order_line(order: Iterable[str]) -> str:
 
 @dataclass
 class Table:
-    """Four columns in a file.   columns : "x", "y", "t", "p" and perhaps "cause" -> (N,) numbers that can be sliced.
-    heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to t, in its unit.
-    size : (height, width), px, None: not in the file.   place : where it lies in the file.   said : lines for the user,
-    of guesses."""
+    """Four columns in a file.   read : rows of a slice, "x", "y", "t", "p" and perhaps "cause" -> (N,) numbers.
+    count : rows.   heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to
+    t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   said :
+    lines for the user, of guesses."""
 
-    columns: Mapping[str, Any]
+    read: Callable[[slice], dict[str, np.ndarray]]
+    count: int
     heading: str = "t"
     unit: str | None = None
     offset: int | float = 0
@@ -86,9 +87,41 @@ class Table:
     said: tuple[str, ...] = ()
 
 
+def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Table:
+    """Return the table of columns that can be sliced: (N,), or vectors of two axes, as MATLAB has them. Raises
+    AssetError: columns of different lengths, or no numbers."""
+    lengths = {slot: max(column.shape, default=0) for slot, column in columns.items() if _is_vector(column)}
+    if len(lengths) != len(columns) or len(set(lengths.values())) != 1:
+        shapes = {slot: getattr(column, "shape", None) for slot, column in columns.items()}
+        raise AssetError("event columns differ in length", where=where, value=shapes)
+
+    def read(part: slice) -> dict[str, np.ndarray]:
+        flat = {slot: column for slot, column in columns.items() if len(column.shape) == 1}
+        wide = {slot: column for slot, column in columns.items() if slot not in flat}
+        ranks = {slot: column[0, part] if column.shape[0] == 1 else column[part, 0] for slot, column in wide.items()}
+        return {slot: column[part] for slot, column in flat.items()} | ranks
+
+    return Table(read, lengths["t"], **known)
+
+
+def _is_vector(column: Any) -> bool:
+    shape = column.shape
+    return shape is not None and (len(shape) == 1 or (len(shape) == 2 and 1 in shape))
+
+
+def table_of_records(records: Any, named: Mapping[str, str], **known: Any) -> Table:
+    """Return the table of an array (N,) of records, whose fields ``named`` gives."""
+
+    def read(part: slice) -> dict[str, np.ndarray]:
+        rows = records[part]
+        return {slot: rows[name] for slot, name in named.items()}
+
+    return Table(read, len(records), named["t"], **known)
+
+
 def table_of_rows(rows: Any, where: str, reading: EventReading, **known: Any) -> Table:
     """Return the table of an array (N, K) without names: K columns as declared, or four by :func:`guessed_order`."""
-    order, said = reading.columns, ()
+    order, said = reading.columns or (), ()
     if not order or reading.named:
         if rows.shape[1] != 4:
             raise AssetError("columns without names", where=where, value=rows.shape, accepted="--columns x,y,t,p")
@@ -98,79 +131,65 @@ def table_of_rows(rows: Any, where: str, reading: EventReading, **known: Any) ->
         raise AssetError(
             f"--columns names {len(order)} columns", where=where, value=rows.shape, accepted="one for each"
         )
-    return Table({slot: RowColumn(rows, k) for k, slot in enumerate(order) if slot != "_"}, said=said, **known)
 
+    def read(part: slice) -> dict[str, np.ndarray]:
+        columns = np.ascontiguousarray(rows[part].T)  # contiguous, because each is read several times
+        return {slot: column for slot, column in zip(order, columns, strict=True) if slot != "_"}
 
-class RowColumn:
-    """Column ``k`` of rows that may lie in a file."""
-
-    def __init__(self, rows: Any, k: int):
-        self._rows, self._k, self.shape, self.dtype = rows, k, rows.shape[:1], rows.dtype
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, part: Any) -> np.ndarray:
-        return np.ascontiguousarray(self._rows[part, self._k])
+    return Table(read, len(rows), said=said, **known)
 
 
 class TableReader:
     """Events of a table. height, width : px, None where the file does not give them.   unit : of its times, read,
-    declared or guessed.   said : lines for the user."""
+    declared or guessed.   said : lines for the user.   unread : rows left out so far, with ``damaged="keep"``."""
 
     def __init__(self, path: Path, reading: EventReading, tables: list[Table]):
-        self.path, self._keep, self._polarity = path, reading.keep, reading.polarity
+        self.path, self._keep, self._polarity, self.unread = path, reading.keep, reading.polarity, 0
         number = reading.stream or 0
         if not 0 <= number < len(tables):
-            raise AssetError(
-                "no such stream", where=str(path), value=number, accepted=f"--stream 0 to {len(tables) - 1}"
-            )
+            accepted = f"--stream 0 to {len(tables) - 1}"
+            raise AssetError("no such stream", where=str(path), value=number, accepted=accepted)
         self._table = table = tables[number]
         self.said = [*table.said]
         if len(tables) > 1:
-            self.said.append(
-                f"{len(tables)} streams of events: {number} ({table.place}) is read (--stream for another)"
-            )
+            more = f"{len(tables)} streams of events: {number} ({table.place}) is read (--stream for another)"
+            self.said.append(more)
         self.height, self.width = table.size or (None, None)
-        check_size(self.height, self.width, str(path))
-        shapes = {slot: tuple(column.shape) for slot, column in table.columns.items()}
-        if any(len(shape) != 1 for shape in shapes.values()) or len(set(shapes.values())) != 1:
-            raise AssetError("event columns differ in length", where=str(path), value=shapes)
-        self.count, self.causes = next(iter(shapes.values()))[0], "cause" in table.columns
-        self.unit = self._unit(table, reading.time_unit)
+        first = table.read(slice(0, 1))
+        self.count, self.causes = table.count, "cause" in first
+        if reading.time_unit:
+            self.unit = TimeUnit(reading.time_unit, "declared")
+        elif said := table.unit or named_unit(table.heading):
+            self.unit = TimeUnit(said, "read")
+        else:
+            self.unit = self._guessed() if first["t"].dtype.kind in "iufb" else TimeUnit("us", "read")
 
-    def _unit(self, table: Table, declared: str | None) -> TimeUnit:
-        if declared:
-            return TimeUnit(declared, "declared")
-        if said := table.unit or named_unit(table.heading):
-            return TimeUnit(said, "read")
-        t = table.columns["t"]
-        if t.dtype.kind not in "iufb" or not self.count:
-            return TimeUnit("us", "read")  # no numbers: refused by the first event
-        sample = (
-            np.concatenate([t[:_SAMPLE], t[max(self.count - _SAMPLE, _SAMPLE) :]]).astype(np.float64) + table.offset
-        )
-        good = sample[np.isfinite(sample)]
-        return guessed_event_unit(good, self.count) if len(good) else TimeUnit("us", "read")
+    def _guessed(self) -> TimeUnit:
+        ends = (slice(0, _SAMPLE), slice(max(self.count - _SAMPLE, _SAMPLE), self.count))
+        t = np.concatenate([self._table.read(part)["t"] for part in ends]).astype(np.float64) + self._table.offset
+        t = t[np.isfinite(t)]
+        return guessed_event_unit(t, self.count) if len(t) else TimeUnit("us", "read")
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events in pieces of ``size``. Raises EventDataError, naming the event, for values that are none."""
-        where, self.unread = str(self.path), 0
+        where, self.unread, unit = str(self.path), 0, self.unit.nanoseconds
+        offset = int(microseconds(np.array([self._table.offset]), where, 0, unit)[0])
         for first in range(0, self.count, size):
-            columns = {slot: np.asarray(column[first : first + size]) for slot, column in self._table.columns.items()}
-            yield from self._events(columns, where, first)
+            columns = self._table.read(slice(first, min(self.count, first + size)))
+            if self._keep:
+                columns = self._whole(columns)
+            t = microseconds(columns["t"], where, first, unit)
+            x, y, p, cause = columns["x"], columns["y"], columns["p"], columns.get("cause")
+            polarity = self._polarity
+            yield events_of(x, y, t, p, where, first, cause=cause, offset=offset, signed=True, polarity=polarity)
 
-    def _events(self, columns: dict[str, np.ndarray], where: str, first: int) -> Iterator[Events]:
-        offset, unit = self._table.offset, self.unit.nanoseconds
+    def _whole(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the rows that an event can be; count the others."""
         whole = np.ones(len(columns["t"]), bool)
-        if self._keep:  # what no event can be is left out, and counted
-            for slot, column in columns.items():
-                if column.dtype.kind == "f":
-                    whole &= np.isfinite(column) & ((column % 1 == 0) | (slot == "t"))
-                if slot in "xy":
-                    whole &= (column >= 0) & (column < 65536)
-            columns = {slot: column[whole] for slot, column in columns.items()}
-            self.unread += int(len(whole) - np.count_nonzero(whole))
-        shift = int(microseconds(np.array([offset]), where, 0, unit)[0]) if offset else 0
-        t = microseconds(columns.pop("t"), where, first, unit)
-        yield events_of(**columns, t=t, where=where, first=first, offset=shift, signed=True, polarity=self._polarity)
+        for slot, column in columns.items():
+            if column.dtype.kind == "f":
+                whole &= np.isfinite(column) & ((column % 1 == 0) | (slot == "t"))
+            if slot in "xy":
+                whole &= (column >= 0) & (column < 65536)
+        self.unread += int(np.count_nonzero(~whole))
+        return {slot: column[whole] for slot, column in columns.items()}

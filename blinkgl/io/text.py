@@ -21,7 +21,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
-from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import guessed_order, order_line, slot_of
 from blinkgl.machine.kernels import kernel
@@ -74,7 +74,6 @@ class TextReader:
                 sample, count = self._sample(file)
         except (OSError, EOFError) as error:
             raise AssetError(f"cannot read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
-        check_size(self.height, self.width, str(path))
         self._order = reading.columns or self._order
         if not self._order:
             self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
@@ -127,8 +126,8 @@ class TextReader:
     def chunks(self, size: int = 1 << 22) -> Iterator[Events]:
         """Yield all events, from about ``size`` bytes of text at a time."""
         places = np.array([_PLACES[slot] for slot in self._order])
-        off, on = self._reading.polarity or (0.0, 1.0)
-        pair = np.array([off, on, -1.0 if self._reading.polarity is None else off])  # undeclared, -1 is OFF, too
+        off, on = (int(v) for v in self._reading.polarity or (0, 1))
+        pair = np.array([off, on, -1 if self._reading.polarity is None else off])  # undeclared, -1 is OFF, too
         self.unread = 0
         with self._open() as file:
             file.seek(self._start)
@@ -183,10 +182,12 @@ def _row(line: bytes) -> list[float] | None:
         return None
 
 
-class TextWriter:
+class TextWriter(CheckedWriter):
     """Writes ``t x y p``. ``separator`` "," makes a CSV that begins with a line of column names. write_unit : "s"
     writes seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with the sensor's
     size in its first line."""
+
+    kind, limits = "text", (0, 1 << 62, "negative time")
 
     def __init__(
         self,
@@ -199,39 +200,19 @@ class TextWriter:
     ):
         if write_unit not in ("s", "us"):
             raise EventDataError("unit of time", where=str(path), value=write_unit, accepted="s or us")
-        self.path, self._separator, self._micro = Path(path), ord(separator), write_unit == "us"
-        self._size, self._count, self._last = (height, width), 0, None
+        super().__init__(path, height, width)
+        self._separator, self._micro = ord(separator), write_unit == "us"
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
             if separator == ",":
-                sizes = ("", "") if height is None or width is None else (f"@{width}", f"@{height}")
-                unit = "[us]" if self._micro and height is None else ""
-                heading = f"t{unit},x{sizes[0]},y{sizes[1]},on\n" if self._micro else "t,x,y,p\n"
-                self._file.write(heading.encode())
+                sized = "t[us],x,y,on\n" if height is None else f"t,x@{width},y@{height},on\n"
+                self._file.write((sized if self._micro else "t,x,y,p\n").encode())
 
-    def append(self, events: Events) -> None:
-        refuse_causes(events, "text", str(self.path))
-        if len(events) and events.t[0] < 0:
-            raise EventDataError("negative time", where=str(self.path), value=int(events.t[0]), accepted=">= 0 µs")
-        self._last = check_events(
-            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
-        )
-        self._count += len(events)
+    def _write(self, events: Events) -> None:
         # 13 digits of seconds, point, 6, two coordinates of 5, polarity, separators, newline
         buffer = np.empty(len(events) * 40, np.uint8)
         n = _print(events.x, events.y, events.t, events.p, self._separator, self._micro, buffer)
-        with output_errors(self.path):
-            self._file.write(buffer[:n].data)
-
-    def close(self, t_end_us: int | None = None) -> None:
-        with output_errors(self.path):
-            self._file.close()
-
-    def abort(self) -> None:
-        try:
-            self._file.close()
-        except OSError:
-            pass
+        self._file.write(buffer[:n].data)
 
 
 @kernel
@@ -296,48 +277,19 @@ def _scaled(mantissa, exponent):
 @kernel
 def _separates(c):
     # Space, tab, comma, semicolon, carriage return.
-    return c == 32 or c == 9 or c == 44 or c == 59 or c == 13
+    return c == 32 or c == 44 or c == 9 or c == 59 or c == 13
 
 
 @kernel
-def _line(buffer, i, places, shift, pair, values):
-    """Parse one line; return (its number of fields, -1: not an event; the index of its end)."""
-    field = 0
-    while buffer[i] != 10:
-        c = buffer[i]
-        if _separates(c):
-            i += 1
-            continue
-        # The rest of a comment line is skipped.
-        if (c == 35 or c == 37) and field == 0:
-            while buffer[i] != 10:
-                i += 1
-            return 0, i
-        if field == len(places):
-            return -1, i
-        place = places[field]
-        field += 1
-        letter = c | 32
-        if place == 4 or (place == 3 and (letter == 116 or letter == 102)):
-            # A column to ignore; or True and False.
-            values[place] = 1 if letter == 116 else 0
-            while not (_separates(buffer[i]) or buffer[i] == 10):
-                i += 1
-            if place == 3 and not (pair[0] == 0.0 and pair[1] == 1.0):
-                values[3] = np.int64(pair[values[3]])
-            continue
-        mantissa, exponent, _, i = _number(buffer, i)
-        if i < 0:
-            return -1, i
-        c = buffer[i]
-        if not (_separates(c) or c == 10):
-            return -1, i
-        # Times are multiplied by 10^shift: that makes microseconds.
-        values[place], ok = _scaled(mantissa, exponent + (shift if place == 0 else 0))
-        if not ok or (place > 0 and exponent < 0 and values[place] * 10.0**-exponent != mantissa):
-            # Coordinates between pixels are refused as well: rectified events are not raw events.
-            return -1, i
-    return field, i
+def _word(buffer, i, place, pair):
+    """Return (value, next index) of a field that is no number: an ignored one, or True and False. Next index -1:
+    neither."""
+    letter = buffer[i] | 32
+    if place != 4 and not (place == 3 and (letter == 116 or letter == 102)):
+        return np.int64(0), -1
+    while not (_separates(buffer[i]) or buffer[i] == 10):
+        i += 1
+    return pair[1 if letter == 116 else 0], i
 
 
 @kernel
@@ -349,27 +301,56 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep):
     n, line, i, bad, lost = 0, 0, 0, -1, 0
     values = np.zeros(5, np.int64)
     while i < len(buffer):
-        begin = i
-        fields, i = _line(buffer, i, places, shift, pair, values)
-        good = fields == len(places)
-        if good:
+        field, good = 0, True
+        while buffer[i] != 10:
+            c = buffer[i]
+            if _separates(c):
+                i += 1
+                continue
+            # The rest of a comment line is skipped.
+            if (c == 35 or c == 37) and field == 0:
+                while buffer[i] != 10:
+                    i += 1
+                break
+            if field == len(places):
+                good = False
+                break
+            place = places[field]
+            field += 1
+            begin = i
+            mantissa, exponent, _, i = _number(buffer, i)
+            c = buffer[i]
+            if i < 0 or not (_separates(c) or c == 10):
+                values[place], i = _word(buffer, begin, place, pair)
+                if i < 0:
+                    good, i = False, begin
+                    break
+                continue
+            # Times are multiplied by 10^shift: that makes microseconds.
+            values[place], ok = _scaled(mantissa, exponent + (shift if place == 0 else 0))
+            if not ok or (place > 0 and exponent < 0 and values[place] * 10.0**-exponent != mantissa):
+                # Coordinates between pixels are refused as well: rectified events are not raw events.
+                good = False
+                break
+        if field != 0 or not good:
             on = values[3] == pair[1]
             good = (
-                0 <= values[1] <= 65535
+                good
+                and field == len(places)
+                and 0 <= values[1] <= 65535
                 and 0 <= values[2] <= 65535
                 and (on or values[3] == pair[0] or values[3] == pair[2])
             )
             if good:
                 t[n], x[n], y[n], p[n] = values[0], values[1], values[2], on
                 n += 1
-        if not good and fields != 0:
-            bad = line if bad < 0 else bad
-            lost += 1
-            if not keep:
-                return n, bad, lost
-            i = begin
-            while buffer[i] != 10:
-                i += 1
+            else:
+                bad = line if bad < 0 else bad
+                lost += 1
+                if not keep:
+                    return n, bad, lost
+                while buffer[i] != 10:
+                    i += 1
         i += 1
         line += 1
     return n, bad, lost

@@ -418,15 +418,15 @@ def test_evt3_without_its_time_high_words(tmp_path):
 def test_prophesees_dat(tmp_path):
     """Version 2 and 1; a counter that wraps; a cut; independent packing."""
     t = np.array([5, 4_294_967_290, 2**32 + 94, 2**32 + 3 * 10**9, 2 * 2**32 + 7], np.int64)
-    x, y, p = np.array([3, 300, 16000, 0, 5]), np.array([9, 200, 12000, 1, 5]), np.array([1, 0, 1, 0, 0])
-    head = b"% Data file containing Event2D events.\n% Version 2\n% Height 16384\n% Width 16384\n"
+    x, y, p = np.array([3, 300, 16000, 0, 5]), np.array([9, 200, 1999, 1, 5]), np.array([1, 0, 1, 0, 0])
+    head = b"% Data file containing Event2D events.\n% Version 2\n% Height 2000\n% Width 16384\n"
     body = b"".join(
         struct.pack("<II", int(a) % 2**32, int(b) | int(c) << 14 | int(d) << 28) for a, b, c, d in zip(t, x, y, p)
     )
     (tmp_path / "e.dat").write_bytes(head + bytes([12, 8]) + body)
     with open_events(tmp_path / "e.dat") as file:
         events = file.read()
-        assert (file.format, file.height, file.width, file.said) == ("dat", 16384, 16384, [])
+        assert (file.format, file.height, file.width, file.said) == ("dat", 2000, 16384, [])
     assert [events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist()] == [
         x.tolist(), y.tolist(), t.tolist(), p.tolist(),
     ]  # fmt: skip
@@ -512,6 +512,18 @@ def test_filters_that_would_end_the_process_are_not_run(name):
         AssetError, match=r"packed by an HDF5 filter that is not run here .*expected gzip, shuffle, lzf"
     ):
         read(shared(f"field/attack/hdf5_filters/{name}"))
+
+
+def test_a_sensor_of_gigabytes(tmp_path):
+    """Said by the file, declared, or guessed from one stray event: nothing of its size is made."""
+    np.savez(tmp_path / "e.npz", x=E.x, y=E.y, t_us=E.t, p=E.p, height=65535, width=65535)
+    for declared in ({}, {"size": "60000x60000"}):
+        with pytest.raises(AssetError, match=r"impossible sensor size .*at most 33554432 px: --size WIDTHxHEIGHT"):
+            read(tmp_path / "e.npz", **declared)
+    assert len(read(tmp_path / "e.npz", size="346x260")[0]) == len(E)
+    (tmp_path / "e.txt").write_text("t_us x y p\n1 65535 65535 1\n")
+    with open_events(tmp_path / "e.txt") as file, pytest.raises(AssetError, match="got '65536x65536'"):
+        file.sized()
 
 
 def test_a_small_mat_that_unpacks_to_gigabytes(tmp_path):

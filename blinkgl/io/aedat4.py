@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -100,12 +101,50 @@ class Aedat4Reader:
     def _packets(self, kind: str) -> Iterator[Any]:
         number = self._number if kind == "events" else self._first(kind)
         with _damage(self.path):
-            for packet in _decoder(self.path):
+            packets, sound = iter(_decoder(self.path)), _check_claims(self.path)
+            while True:
+                next(sound, None)
+                packet = next(packets, None)
+                if packet is None:
+                    return
                 if packet["stream_id"] == number:
                     yield packet[kind]
 
 
+_HEADER = 18
+"""Bytes of the magic and of the header's length, which follows it."""
+
+
+def _check_claims(path: Path) -> Iterator[None]:
+    """Yield before each packet of a file, once it is known to lie in the file. The decoder sets aside as much memory as
+    a packet claims. (iniVation, "AEDAT 4.0": packets of a stream's number, a length and so many bytes; the header is a
+    FlatBuffer, whose second field says where the table behind the packets lies.)
+
+    Raises AssetError: the header or a packet is longer than the rest of the file."""
+    total = path.stat().st_size
+    with open(path, "rb") as file:
+        begin = file.read(_HEADER)
+        length = int.from_bytes(begin[-4:], "little") if len(begin) == _HEADER else 0
+        if length > total - _HEADER:
+            raise AssetError(f"a header of {length} bytes", where=str(path), accepted=f"at most {total - _HEADER}")
+        header, end = file.read(length), total
+        with contextlib.suppress(struct.error):
+            table = struct.unpack_from("<I", header)[0]
+            place = struct.unpack_from("<H", header, table - struct.unpack_from("<i", header, table)[0] + 6)[0]
+            end = struct.unpack_from("<q", header, table + place)[0] if place else end
+        while len(packet := file.read(8)) == 8 and file.tell() - 8 != end:
+            size = int.from_bytes(packet[4:], "little")
+            if size > total - file.tell():
+                at = file.tell() - 8
+                raise AssetError(
+                    f"a packet at byte {at} of {size} bytes", where=str(path), accepted=f"at most {total - at}"
+                )
+            yield
+            file.seek(size, os.SEEK_CUR)
+
+
 def _decoder(path: Path) -> Any:
+    next(_check_claims(path), None)
     # Imported here: few programs read such files.
     import aedat
 

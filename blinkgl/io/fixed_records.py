@@ -32,7 +32,8 @@ _SHORT, _LONG = (0x1FF, 9, 0xFF, 17), (0x3FFF, 14, 0x3FFF, 28)
 
 def _records(file: BinaryIO, path: Path, dtype: np.dtype, count: int) -> Iterator[np.ndarray]:
     while data := file.read(count * dtype.itemsize):
-        yield np.frombuffer(data, dtype, len(data) // dtype.itemsize)
+        if len(data) >= dtype.itemsize:
+            yield np.frombuffer(data, dtype, len(data) // dtype.itemsize)
         if stray := len(data) % dtype.itemsize:
             raise AssetError(f"truncated: {stray} stray bytes after the last event", where=str(path))
 

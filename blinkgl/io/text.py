@@ -9,12 +9,14 @@ whole file. Written: seconds with six decimals, or integer µs (exact both).
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import os
 import re
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 
@@ -45,35 +47,32 @@ class TextReader:
         self._start = self._lines = 0  # bytes and lines before the first event
         self._order: tuple[str, ...] = ()
         unit = None
-        try:
-            with self._open() as file:
-                while line := file.readline(_LONGEST_LINE + 1):
-                    if len(line) > _LONGEST_LINE:
-                        raise AssetError(
-                            f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes",
-                            where=str(path),
-                            value=line[:40],
-                        )
-                    text = line.decode("utf-8-sig", "replace").strip()
-                    comment = text[:1] in ("#", "%")
-                    # Two integers before the first event are the sensor's size.
-                    size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
-                    if size and self.width is None:
-                        self.width, self.height = int(size[1]), int(size[2])
-                    elif text and (comment or _is_heading(text)):
-                        names = _names(text.lstrip("#% "))
-                        order = tuple(slot_of(name.partition("@")[0]) for name in names)
-                        named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
-                        if not self._order and named:
-                            self._order, unit = order, self._heading(dict(zip(order, names)))
-                        elif not comment and not reading.columns:
-                            self._refuse_heading(text)
-                    elif text:
-                        break
-                    self._start, self._lines = file.tell(), self._lines + 1
-                sample, count = self._sample(file)
-        except (OSError, EOFError) as error:
-            raise AssetError(f"cannot read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
+        with self._open() as file:
+            while line := file.readline(_LONGEST_LINE + 1):
+                if len(line) > _LONGEST_LINE:
+                    raise AssetError(
+                        f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes",
+                        where=str(path),
+                        value=line[:40],
+                    )
+                text = line.decode("utf-8-sig", "replace").strip()
+                comment = text[:1] in ("#", "%")
+                # Two integers before the first event are the sensor's size.
+                size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
+                if size and self.width is None:
+                    self.width, self.height = int(size[1]), int(size[2])
+                elif text and (comment or _is_heading(text)):
+                    names = _names(text.lstrip("#% "))
+                    order = tuple(slot_of(name.partition("@")[0]) for name in names)
+                    named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
+                    if not self._order and named:
+                        self._order, unit = order, self._heading(dict(zip(order, names)))
+                    elif not comment and not reading.columns:
+                        self._refuse_heading(text)
+                elif text:
+                    break
+                self._start, self._lines = file.tell(), self._lines + 1
+            sample, count = self._sample(file)
         self._order = reading.columns or self._order
         if not self._order:
             self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
@@ -84,9 +83,15 @@ class TextReader:
         elif len(sample) and sample.shape[1] == len(self._order):
             self.unit = guessed_event_unit(sample[:, self._order.index("t")], count)
 
-    def _open(self) -> BinaryIO:
-        """Return the file, unpacked."""
-        return gzip.open(self.path) if self.path.suffix.lower() == ".gz" else open(self.path, "rb")  # type: ignore[return-value]
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        """Give the file, unpacked. Raises AssetError: unreadable, damaged."""
+        try:
+            with gzip.open(self.path) if self.path.suffix.lower() == ".gz" else open(self.path, "rb") as file:
+                yield cast(BinaryIO, file)
+        except (OSError, EOFError, zlib.error) as error:
+            problem = f"cannot read: {getattr(error, 'strerror', None) or error}"
+            raise AssetError(problem, where=str(self.path)) from error
 
     def _heading(self, names: dict[str, str]) -> str | None:
         """Return the unit that the name of t states; take the sizes that faery adds to the names of x and y."""

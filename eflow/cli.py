@@ -271,7 +271,7 @@ def predict(
         sort=sort,
     )
     file = infer.open_sized(events, reading)
-    for line in (*file.said, *doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width)):
+    for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)
     outputs = Outputs(out, video, npy, infer.read_truth(truth, file.height, file.width) if truth else None)
     shape = (file.height, file.width)
@@ -283,6 +283,8 @@ def predict(
         predictor = infer.Predictor(model, *shape, **options)
     reads = ("old", "new") if model is None else model.reads
     show_flows(file, predictor, reads, asked, outputs, typer.echo)
+    for line in file.said:
+        typer.echo(f"{events}: {line}", err=True)
 
 
 @app.command()

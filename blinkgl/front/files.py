@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 
@@ -267,7 +267,7 @@ def compare(
     )
 
 
-class ReadingOptions(TypedDict, total=False):
+class ReadingOptions(EventOptions, total=False):
     """Options of frames beside a recording; :func:`blinkgl.calibrate` describes them."""
 
     gamma: str | float
@@ -299,7 +299,8 @@ def calibrate(
     constant light, without frames: only noise is fitted.   fps : of the frames, Hz.   timestamps : file of the frames'
     times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
     "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: estimated.
-    starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
+    starts : of the search.   time_unit, size … : of the recording, as of :func:`open_events`.   Raises AssetError,
+    EventDataError, ConfigError."""
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
@@ -327,6 +328,7 @@ def calibrate(
         timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
         starts=check.whole(starts, "starts", 1, 20),
         seed=check.seed(seed),
+        events=_reading(cast(EventOptions, {k: v for k, v in reading.items() if k in EventOptions.__annotations__})),
     )
 
 

@@ -1,5 +1,6 @@
 """Exports are opened by the published loaders' own code, where it is: BLINKGL_LOADERS is a folder with checkouts named
-bflow, DSEC, E-RAFT and ETAP (github.com: uzh-rpg/bflow, uzh-rpg/DSEC, uzh-rpg/E-RAFT, tub-rip/ETAP).
+bflow, DSEC, E-RAFT, ETAP, co-tracker and Spike-FlowNet (github.com: uzh-rpg/bflow, uzh-rpg/DSEC, uzh-rpg/E-RAFT,
+tub-rip/ETAP, facebookresearch/co-tracker, chan8972/Spike-FlowNet). BlinkFlow's loader is not public any more.
 
 Each loader runs in a process of its own, because their packages share names. Replaced are only what an installation
 without a network lacks: imageio's FreeImage plug-in reads PNG files by OpenCV, and packages that draw are empty."""
@@ -43,7 +44,7 @@ imageio.imread = lambda path, format=None: cv2.imread(str(path), cv2.IMREAD_UNCH
 class Absent(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     # Stands for packages that draw, augment or train.
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torchvision", "pytorch_lightning", "wandb", "kornia", "pandas"):
+        if name.split(".")[0] in ("torchvision", "pytorch_lightning", "wandb", "kornia", "pandas", "mediapy"):
             return importlib.machinery.ModuleSpec(name, self, is_package=True)
     def create_module(self, spec):
         module = types.ModuleType(spec.name)
@@ -230,3 +231,53 @@ def test_etaps_scripts_and_loader(export):
         """,
     )
     assert "1 (24, 10, 512, 512) (24, 3, 512, 512)" in said and said.rstrip().endswith("True"), said
+
+
+def test_cotrackers_loader_of_tap_vid(export):
+    checkout("co-tracker")
+    recipe = {
+        "camera": {"width": 96, "height": 64},
+        "time": {"duration": 0.5, "label_rate": 20},
+        "labels": {"images": True},
+        "tracks": {"points": 40},
+    }
+    path = next(export("tapvid", recipe).rglob("*.pkl"))
+    said = loaded(
+        "co-tracker",
+        path,
+        """
+        from cotracker.datasets.tap_vid_datasets import TapVidDataset
+        data = TapVidDataset(out, resize_to=None)
+        got = data[0]
+        visible = got.trajectory[got.visibility]
+        print(len(data), tuple(got.video.shape), tuple(got.trajectory.shape), tuple(got.query_points.shape))
+        print(float(visible.min()) >= -1, float(visible[:, 0].max()) <= 96, float(visible[:, 1].max()) <= 64)
+        """,
+    )
+    assert "1 (11, 3, 64, 96) (11, 40, 2)" in said and "False" not in said, said
+
+
+def test_spike_flownets_encoding_of_mvsec(export, tmp_path):
+    """Its encoder counts the events of every image's interval, its test takes flow_dist of the ground truth."""
+    checkout("Spike-FlowNet")
+    recipe = {
+        "camera": {"width": 346, "height": 260},
+        "time": {"duration": 0.2, "label_rate": 20},
+        "labels": {"flow": ["forward"], "images": True},
+    }
+    out = export("mvsec", recipe)
+    said = loaded(
+        "Spike-FlowNet",
+        out,
+        f"""
+        import glob, os, runpy, h5py
+        path = glob.glob(out + "/train/*_data.hdf5")[0]
+        sys.argv = ["x", "--save-dir", "{tmp_path}", "--save-env", "made", "--data-path", path]
+        h5py.File(path)  # the encoder closes its own before it reads
+        runpy.run_path("{checkout("Spike-FlowNet")}/encoding/split_coding.py")
+        counts = [np.load(f).sum() for f in sorted(glob.glob("{tmp_path}/made/count_data/*.npy"))]
+        label = h5py.File(path.replace("_data", "_gt"))["davis"]["left"]
+        print(len(counts), min(counts[1:]) > 0, label["flow_dist"].shape, len(label["flow_dist_ts"]))
+        """,
+    )
+    assert said.rstrip().splitlines()[-1].endswith("True (4, 2, 260, 346) 4"), said

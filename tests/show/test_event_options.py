@@ -85,6 +85,15 @@ def test_refusals_name_the_option_and_write_nothing(ns, tmp_path, capsys):
         assert not (tmp_path / "o.h5").exists()
 
 
+def test_errors_of_the_output_name_it_and_no_hidden_file(tmp_path, capsys):
+    np.savez(tmp_path / "e.npz", x=E.x, y=E.y, t_us=E.t + 2**40, p=E.p)
+    assert run(["convert", str(tmp_path / "e.npz"), str(tmp_path / "o.raw")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(
+        f"error: {tmp_path}/o.raw: EVT3 times count from the recording's start; --zero-time shifts them"
+    )
+
+
 def test_compare_says_what_it_took(ns, tmp_path, capsys):
     assert run(["compare", ns, *OPTIONS, "--out", str(tmp_path / "c")]) == 0
     assert "left out: events outside 80x60" in capsys.readouterr().err

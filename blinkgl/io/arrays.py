@@ -119,7 +119,8 @@ class ArrayReader(TableReader):
                     wanted = [
                         n for n in archive.names if slot_of(n) != "_" or n in _KNOWN or n in reading.named.values()
                     ]
-                    arrays = {name: archive[name] for name in wanted or archive.names}
+                    whole = set("txyp") <= set(named_columns(wanted, reading))
+                    arrays = {name: archive[name] for name in (wanted if whole else archive.names)}
             super().__init__(path, reading, [_table(arrays, str(path), reading)])
 
 
@@ -134,10 +135,13 @@ def _table(arrays: Mapping[str, Any], where: str, reading: EventReading) -> Tabl
         if titles := [field[2] for field in table.dtype.fields.values() if len(field) > 2]:
             arrays["time_unit"] = np.array(titles[0])
     named = named_columns(arrays, reading)
+    sides = [_declared(arrays[side], side, where) for side in ("height", "width") if side in arrays]
+    unit = named_unit(f"[{arrays['time_unit']}]") if "time_unit" in arrays else None
+    known: dict[str, Any] = {"unit": unit, "size": (sides[0], sides[1]) if len(sides) == 2 else None}
     rows = next((a for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 2 and a.shape[1] >= 4), None)
     if missing := [slot for slot in "txyp" if slot not in named]:
         if rows is not None and rows.dtype.kind in "iuf":
-            return table_of_rows(rows, where, reading)
+            return table_of_rows(rows, where, reading, **known)
         raise AssetError(
             f"no column '{missing[0]}'",
             where=where,
@@ -147,15 +151,7 @@ def _table(arrays: Mapping[str, Any], where: str, reading: EventReading) -> Tabl
     columns = {slot: np.asarray(arrays[name]) for slot, name in named.items()}
     if isinstance(arrays.get("cause"), np.ndarray):
         columns["cause"] = arrays["cause"]
-    sides = [_declared(arrays[side], side, where) for side in ("height", "width") if side in arrays]
-    unit = str(arrays["time_unit"]) if "time_unit" in arrays else None
-    return table_of_columns(
-        columns,
-        where,
-        heading=named["t"],
-        unit=named_unit(f"[{unit}]") if unit else None,
-        size=(sides[0], sides[1]) if len(sides) == 2 else None,
-    )
+    return table_of_columns(columns, where, heading=named["t"], **known)
 
 
 class MatReader(TableReader):

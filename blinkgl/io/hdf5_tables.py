@@ -93,7 +93,7 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
         str(path),
         heading=f"t [{units}]" if isinstance(units, str) else heading,
         # A table of milliseconds, as DSEC and BlinkFlow have, counts µs.
-        unit="us" if "ms_to_idx" in file and columns["t"].dtype.kind in "iu" else None,
+        unit="us" if ("ms_to_idx" in file or "ms_to_idx" in group) and columns["t"].dtype.kind in "iu" else None,
         offset=_number(file, "t_offset", path) or 0,
         size=_size(file, group, path),
         place=columns["t"].parent.name.strip("/"),

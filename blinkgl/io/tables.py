@@ -36,8 +36,10 @@ _SAMPLE = 1 << 16
 def slot_of(name: str) -> str:
     """Return which column a name means, "x", "y", "t" or "p"; "_": none of them. Units are no part of it: ``t_us``,
     ``timestamp [ns]``, ``x [px]``."""
-    bare = re.sub(r"[\s_]*[\[(<{].*$|_(s|ms|us|µs|ns|px)$", "", name.strip().lower())
-    return _SLOT.get(bare, "_")
+    bare = re.sub(r"[\s_]*[\[(<{].*$", "", name.strip().lower()).removeprefix("events_").removeprefix("event_")
+    return _SLOT.get(bare) or _SLOT.get(
+        bare.rpartition("_")[0] if named_unit(bare) or bare.endswith("_px") else "", "_"
+    )
 
 
 def named_columns(names: Iterable[str], reading: EventReading) -> dict[str, str]:

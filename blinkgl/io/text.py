@@ -9,6 +9,7 @@ whole file. Written: seconds with six decimals, or integer µs (exact both).
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import gzip
 import os
@@ -70,6 +71,7 @@ class TextReader:
                     elif not comment and not reading.columns:
                         self._refuse_heading(text)
                 elif text:
+                    self._start += 3 if line.startswith(codecs.BOM_UTF8) else 0
                     break
                 self._start, self._lines = file.tell(), self._lines + 1
             sample, count = self._sample(file)
@@ -170,12 +172,13 @@ class TextReader:
 
 
 def _is_heading(text: str) -> bool:
-    return text[0].isalpha() or text[0] == '"' if not re.match(r"(nan|inf|true|false)\b", text, re.I) else False
+    return bool(re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I))
 
 
 def _names(heading: str) -> list[str]:
-    names = re.split(r"[,;\t]|\s+(?![\[(])", heading.lower().replace('"', ""))
-    return [name.strip() for name in names if name.strip()]
+    """Return the names of columns; a first one without a name, as pandas' index, is empty."""
+    names = [name.strip() for name in re.split(r"[,;\t]|\s+(?![\[(])", heading.lower().replace('"', ""))]
+    return [name for k, name in enumerate(names) if name or (k == 0 and heading[0] in ",;")]
 
 
 def _row(line: bytes) -> list[float] | None:

@@ -170,10 +170,17 @@ def test_headings_of_text(tmp_path):
         ("% x;y;t[us];p", "3;4;5;1"),
         ("id,x,y,timestamp (ms),polarity", "9,3,4,0.005,1"),
         ('"t_ns","x","y","on"', "5000,3,4,1"),
+        (",t_us,x,y,p", "0,5,3,4,1"),
+        ("event_x,event_y,ts_nsec,polarity", "3,4,5000,1"),
     ):
         path.write_text(f"{heading}\n{row}\n")
         events, said = read(path)
         assert [events.x[0], events.y[0], events.t[0], events.p[0]] == [3, 4, 5, 1] and len(said) == ("t p" in heading)
+    path.write_bytes(b"\xef\xbb\xbf5 3 4 1\r\n6 3 4 0\r\n")
+    assert read(path, time_unit="us")[0].t.tolist() == [5, 6]
+    np.savez(tmp_path / "a.npz", ROWS[:, [2, 0, 1, 3]], height=260, width=346)
+    with open_events(tmp_path / "a.npz") as file:
+        assert same(file.read(), E) and (file.height, file.width) == (260, 346)
     with gzip.open(tmp_path / "e.csv.gz", "wt") as file:
         file.writelines(["x,y,t_us,p\n", *(f"{x},{y},{t},{p}\n" for x, y, t, p in ROWS.astype(int).tolist())])
     assert same(read(tmp_path / "e.csv.gz")[0], E)

@@ -128,16 +128,7 @@ def compare(
         interval_ms=interval_ms,
         zero_time=zero_time,
         judge=judge,
-        reading=EventReading.of(
-            time_unit=time_unit,
-            size=size,
-            origin=origin,
-            columns=columns,
-            polarity=polarity,
-            stream=stream,
-            damaged=damaged,
-            sort=sort,
-        ),
+        reading=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
     )
 
 
@@ -212,16 +203,7 @@ def calibrate(
         seed=seed,
         overwrite=overwrite,
         quiet=quiet,
-        events=EventReading.of(
-            time_unit=time_unit,
-            size=size,
-            origin=origin,
-            columns=columns,
-            polarity=polarity,
-            stream=stream,
-            damaged=damaged,
-            sort=sort,
-        ),
+        events=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
     )
 
 
@@ -257,16 +239,7 @@ def convert(
     return command.run(
         source,
         target,
-        reading=EventReading.of(
-            time_unit=time_unit,
-            size=size,
-            origin=origin,
-            columns=columns,
-            polarity=polarity,
-            stream=stream,
-            damaged=damaged,
-            sort=sort,
-        ),
+        reading=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
         zero_time=zero_time,
         write_unit=write_unit,
         overwrite=overwrite,

@@ -260,16 +260,7 @@ def predict(
     asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
     method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     model = None if method is not None else network_of(checkpoint, device, raw, precision, iterations)
-    reading = EventReading.of(
-        time_unit=time_unit,
-        size=size,
-        origin=origin,
-        columns=columns,
-        polarity=polarity,
-        stream=stream,
-        damaged=damaged,
-        sort=sort,
-    )
+    reading = EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort)
     file = infer.open_sized(events, reading)
     for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)

@@ -13,6 +13,7 @@ Like other encoders of a ready event list we write EVT3's single events only, no
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 from collections.abc import Iterator
@@ -99,16 +100,17 @@ class EvtReader:
         """Yield all events, decoded from ``words`` words at a time."""
         dtype, state = _WORD[self.version], START[self.version].copy()
         position, lost, stray = self._start, 0, 0
+        buffers = room(self.version, words)  # one for all pieces: fresh memory costs as much as decoding
         with open(self.path, "rb") as file:
             file.seek(self._start)
             while not stray and (data := file.read(words * dtype.itemsize)):
                 # A file that ends within a word is truncated, which is said after its whole words.
                 stray = len(data) % dtype.itemsize
                 raw = np.frombuffer(data[: len(data) - stray], dtype)
-                events, bad = self._decode(raw, state)
+                events, bad = self._decode(raw, state, buffers)
                 while bad >= 0 and self._keep:
                     raw, lost, position = raw[bad + 1 :], lost + 1, position + (bad + 1) * dtype.itemsize
-                    more, bad = self._decode(raw, state)
+                    more, bad = self._decode(raw, state, buffers)
                     events = Events.concatenate([events, more])
                 if bad >= 0:
                     raise AssetError(
@@ -132,8 +134,9 @@ class EvtReader:
         if state[0] < 0 and state[-1]:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
-    def _decode(self, words: np.ndarray, state: np.ndarray) -> tuple[Events, int]:
-        return decode(self.version, words, state, upper_first=self._upper_first, mend=self._mend)
+    def _decode(self, words: np.ndarray, state: np.ndarray, buffers: list[np.ndarray]) -> tuple[Events, int]:
+        upper_first, mend = self._upper_first, self._mend
+        return decode(self.version, words, state, upper_first=upper_first, mend=mend, buffers=buffers)
 
 
 START = {
@@ -147,17 +150,34 @@ _MOST = {"evt2": 1, "evt21": 32, "evt3": 12}
 """Events of a word: a vector of EVT3 holds twelve."""
 
 
+def room(version: str, words: int) -> list[np.ndarray]:
+    """Return arrays for x, y, t and p of all events that so many words may hold."""
+    return [np.empty(_MOST[version] * words, kind) for kind in (np.uint16, np.uint16, np.int64, np.uint8)]
+
+
+@functools.lru_cache(maxsize=2)
+def _single(words: int) -> np.ndarray:
+    """Return masks of one event a word."""
+    return np.ones(words, np.uint32)
+
+
 def decode(
-    version: str, words: np.ndarray, state: np.ndarray, *, upper_first: bool = False, mend: bool = False
+    version: str,
+    words: np.ndarray,
+    state: np.ndarray,
+    *,
+    upper_first: bool = False,
+    mend: bool = False,
+    buffers: list[np.ndarray] | None = None,
 ) -> tuple[Events, int]:
     """Return the events of words, and the index of the first word that the format does not have (-1: none). state : of
     :data:`START`, kept up to date.   upper_first : order of the halves of EVT2.1.   mend : count a missing TIME_HIGH
-    where EVT3's low bits begin again."""
-    columns = [np.empty(_MOST[version] * len(words), kind) for kind in (np.uint16, np.uint16, np.int64, np.uint8)]
+    where EVT3's low bits begin again.   buffers : of :func:`room`, for as many words or more."""
+    columns = buffers or room(version, len(words))
     if version == "evt3":
         n, bad = _decode_evt3(words, state, *columns, mend)
     elif version == "evt2":
-        n, bad = _decode_evt2(words, np.ones(len(words), np.uint32), state, *columns)
+        n, bad = _decode_evt2(words, _single(len(words)), state, *columns)
     else:
         upper, lower = (words.view("<u4")[half::2].copy() for half in ((0, 1) if upper_first else (1, 0)))
         n, bad = _decode_evt2(upper, lower, state, *columns)
@@ -322,14 +342,6 @@ def _decode_evt3(words, state, x, y, t, p, mend):
         elif kind != 7 and kind != 10 and kind < 14:  # 7, 15 continued, 10 external trigger, 14 others
             bad = i
             break
-    state[0], state[1], state[2], state[3], state[4], state[5], state[6], state[7] = (
-        high,
-        row,
-        low,
-        base,
-        polarity,
-        wraps,
-        mended,
-        untimed,
-    )
+    state[0], state[1], state[2], state[3] = high, row, low, base
+    state[4], state[5], state[6], state[7] = polarity, wraps, mended, untimed
     return n, bad

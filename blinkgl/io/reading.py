@@ -48,7 +48,6 @@ class EventReading:
     @classmethod
     def of(
         cls,
-        *,
         time_unit: str | None = None,
         size: str | Sequence[int] | None = None,
         origin: str | None = None,

@@ -306,8 +306,7 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep):
 
     places : what each field is, 0 t, 1 x, 2 y, 3 p, 4 ignored.   shift : decimal places from the unit of time to µs.
     pair : numbers of OFF, of ON, and another of OFF.   keep : go on after a bad line."""
-    n, line, i, bad, lost = 0, 0, 0, -1, 0
-    values = np.zeros(5, np.int64)
+    n, line, i, bad, lost, values = 0, 0, 0, -1, 0, np.zeros(5, np.int64)
     while i < len(buffer):
         field, good = 0, True
         while buffer[i] != 10:

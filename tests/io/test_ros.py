@@ -62,7 +62,7 @@ def bag(path, form, topics):
 @pytest.mark.parametrize("form, name", [("bag", "e.bag"), ("sqlite3", "e"), ("mcap", "e")])
 @pytest.mark.parametrize("kind", ["dvs_msgs", "prophesee_event_msgs", "event_camera_msgs"])
 def test_bags_of_every_kind(tmp_path, form, name, kind):
-    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = bag(tmp_path / name, form, {"/dvs/events": (kind, E)})
     inner = [path, *path.glob(f"*.{'db3' if form == 'sqlite3' else form}")] if path.is_dir() else [path]
     for one in inner:  # the folder, and the file in it
@@ -72,7 +72,7 @@ def test_bags_of_every_kind(tmp_path, form, name, kind):
 
 
 def test_several_topics_and_none(tmp_path):
-    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = bag(tmp_path / "e.bag", "bag", {"/right": ("dvs_msgs", E.part(slice(9))), "/left": ("dvs_msgs", E)})
     with open_events(path) as file:
         assert same(file.read(), E) and file.said == ["2 topics of events: /left is read (--stream for another)"]
@@ -90,7 +90,7 @@ def test_several_topics_and_none(tmp_path):
 
 def test_evt3_packets(tmp_path):
     """The camera's own words go on from packet to packet, which may break anywhere."""
-    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     from rosbags import rosbag1
 
     events = some_events(500, 0, 40_000_000, 720, 1280)

@@ -430,7 +430,7 @@ def messages(path):
 
 def test_rosbag_on_the_topics_of_esim(data, sequence, tmp_path):
     """Events, images, depth, flow in px/s, poses and the inertial unit, at their own times."""
-    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = exported(data, tmp_path, "rosbag") / "train/sequence_000000.bag"
     found, events = messages(path), read_events(sequence / "events.h5")
     assert set(found) == {"/imu", "/pose"} | {
@@ -469,7 +469,7 @@ def test_rosbag_on_the_topics_of_esim(data, sequence, tmp_path):
 
 
 def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
-    pytest.importorskip("rosbags", reason="optional extra [formats]")
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = exported(stereo.parents[1], tmp_path, "rosbag") / "train/sequence_000000.bag"
     with open_events(path) as file:
         assert file.said == ["2 topics of events: /cam0/events is read (--stream for another)"]

@@ -141,8 +141,9 @@ class EventFile:
         unit = getattr(self._reader, "unit", None)
         lines = [*getattr(self._reader, "said", ()), unit.line if unit else None]
         if self.guessed_size:
-            known = "the smallest sensor that holds" if (self.height, self.width) in SENSORS else "as far as there are"
-            lines.append(f"size taken as {self.width}x{self.height}, {known} all events (--size if that is wrong)")
+            known = (self.height, self.width) in SENSORS
+            why = "the smallest sensor that holds all events" if known else "as far as events go, beyond known sensors"
+            lines.append(f"size taken as {self.width}x{self.height}, {why} (--size if that is wrong)")
         if unread := getattr(self._reader, "unread", 0):
             lines.append(f"left out: rows that are no events: {unread:,}")
         return [line for line in (*lines, *self.told.values()) if line]
@@ -186,15 +187,15 @@ class EventFile:
         whole = self._inside(self._until_damage() if self.reading.keep else self._declared())
         if self.reading.sort:
             whole = iter([Events.concatenate(list(whole))])
-        held, latest, places, most, late = Events.empty(), -(1 << 62), 0, 0, 0
+        held, latest, moved, most, late = Events.empty(), -(1 << 62), 0, 0, 0
         for events in whole:
             t = events.t
             peak = np.maximum.accumulate(np.append(latest, t))[1:]  # the latest time so far, at each event
             latest, behind = (int(peak[-1]) if len(t) else latest), peak - t
-            places, most = places + int(np.count_nonzero(np.diff(t) < 0)), max(most, int(behind.max(initial=0)))
-            if not self.reading.sort and (lost := behind > _OVERLAP_US).any():
-                late += int(np.count_nonzero(lost))
-                events = events.part(~lost)
+            lost = (behind > _OVERLAP_US) & (not self.reading.sort)
+            late, moved = late + int(np.count_nonzero(lost)), moved + int(np.count_nonzero(behind[~lost]))
+            most = max(most, int(behind[~lost].max(initial=0)))
+            events = events.part(~lost) if lost.any() else events
             held = Events.concatenate([held, events])
             if (np.diff(held.t) < 0).any():
                 held = held.part(np.argsort(held.t, kind="stable"))
@@ -206,8 +207,8 @@ class EventFile:
             self.told["late"] = (
                 f"left out: events more than {_OVERLAP_US // 1000} ms late: {late:,} (--sort keeps them)"
             )
-        if places > late:
-            self.told["moved"] = f"put in order: times ran backwards in {places:,} places, by up to {most:,} µs"
+        if moved:
+            self.told["moved"] = f"put in order: events that came late: {moved:,}, by up to {most:,} µs"
 
     def _until_damage(self) -> Iterator[Events]:
         count = 0

@@ -368,7 +368,7 @@ def test_times_that_run_backwards(tmp_path):
         read(tmp_path / "near.npz")
     for declared in ({"damaged": "keep"}, {"sort": True}):
         kept, said = read(tmp_path / "near.npz", **declared)
-        assert kept.t.tolist() == events.t.tolist() and len(said) == 1 and "times ran backwards in" in said[0]
+        assert kept.t.tolist() == events.t.tolist() and len(said) == 1 and "events that came late" in said[0]
     far = events.part(np.roll(np.arange(5000), -1))  # the first event comes last
     np.savez(tmp_path / "far.npz", x=far.x, y=far.y, t_us=far.t, p=far.p)
     assert same(read(tmp_path / "far.npz", sort=True)[0], events)

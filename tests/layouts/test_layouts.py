@@ -226,6 +226,8 @@ def test_eventkubric(data, sequence, tmp_path, monkeypatch):
     np.testing.assert_array_equal(occluded, tracks["occluded"])
     for k, frame in enumerate(rgb):
         np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
+    with open_events(folder / "train/sequence_000000/events/0000000000.npz") as file:  # says its own unit, ns
+        assert file.read().t.tolist() == (part.t - tracks["t_us"][0]).tolist() and file.said == []
 
 
 def test_generate_writes_a_layout_too_when_all_are_whole(tmp_path, capsys):

@@ -52,7 +52,7 @@ def test_convert(ns, tmp_path, capsys):
     said = capsys.readouterr()
     assert "3,000 events, 80x60, from npz" in said.out
     assert "left out: events outside 80x60: 1 (first: x 500, y 5)" in said.err
-    assert "put in order: times ran backwards in" in said.err
+    assert "put in order: events that came late" in said.err
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert same(blinkgl.read_events(tmp_path / "o.h5"), blinkgl.read_events(ns, **DECLARED))
@@ -115,4 +115,4 @@ def test_eflow_predict_reads_alike(ns, tmp_path, capsys):
     from eflow.cli import run as eflow
 
     assert eflow(["predict", "contrast-affine", ns, "--whole", *OPTIONS]) == 0
-    assert "put in order: times ran backwards" in capsys.readouterr().err
+    assert "put in order: events that came late" in capsys.readouterr().err

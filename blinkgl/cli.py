@@ -77,6 +77,13 @@ def generate(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
     ] = None,
+    both_sides: Annotated[
+        bool | None,
+        typer.Option(
+            "--both-sides/--one-side",
+            help="Draw faces of files from both sides, or from their front alone (default: as each file says).",
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
     workers: Annotated[
         int | None,
@@ -121,7 +128,10 @@ def generate(
         out,
         num=num,
         seed=seed,
-        overrides=overrides or [],
+        overrides=[
+            *(overrides or []),
+            *([] if both_sides is None else [f"scene.both_sides={str(both_sides).lower()}"]),
+        ],
         quiet=quiet,
         executor=chosen,
         resume=resume,

@@ -8,12 +8,45 @@ import typer
 
 from blinkgl.machine import event_options as of_events
 
+# What may be declared of frames, in every command that reads them.
+Fps = Annotated[float | None, typer.Option(help="Frames per second (default: the file's own times).")]
+Timestamps = Annotated[str | None, typer.Option(help="File of frame times, a line each: 'time' or 'time name'.")]
+FramesTimeUnit = Annotated[
+    str | None,
+    typer.Option(
+        "--frames-time-unit",
+        help="Of --timestamps: s, ms, us, ns, or frames of --fps (default: as its heading or name says, else guessed "
+        "from all values).",
+    ),
+]
+Curve = Annotated[
+    str | None,
+    typer.Option(
+        help="Curve of the frames: linear, srgb, pq, hlg or an exponent (default: what the file states; linear for "
+        "grey images, a camera's own; srgb for video and colour)."
+    ),
+]
+WhiteLevel = Annotated[
+    float | None,
+    typer.Option("--white-level", help="Code of white: 4095 of 12 bits in 16 (default: what the file states, else "
+                 "guessed from the clip's codes)."),
+]  # fmt: skip
+Range = Annotated[
+    str | None,
+    typer.Option("--range", help="Of the codes: full, or limited, 16 to 235 of 8 bits (default: the file's)."),
+]
+Background = Annotated[
+    str | None, typer.Option(help="Below transparent pixels: black, grey, white or #rrggbb (default: black).")
+]
+
 
 def simulate(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="INPUT", help="Video, folder of images, .npy or .npz of frames, .aedat4 or .aedat with frames."
+            metavar="INPUT",
+            help="Video, folder of images, TIFF stack, animated GIF, PNG or WebP, .npy or .npz of frames, "
+            ".aedat4 or .aedat with frames.",
         ),
     ],
     out: Annotated[
@@ -36,19 +69,27 @@ def simulate(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(help="Frames per second (default: the video's, or from the time stamps).")
+    fps: Fps = None,
+    timestamps: Timestamps = None,
+    time_unit: Annotated[
+        str | None,
+        typer.Option(
+            "--time-unit",
+            help="Of --timestamps: s, ms, us, ns, or frames of --fps (default: as its heading or "
+            "name says, else guessed from all values).",
+        ),
     ] = None,
-    timestamps: Annotated[
-        str | None, typer.Option(help="File of frame times: integers in µs, or decimals in s.")
-    ] = None,
+    zero_time: Annotated[bool, typer.Option("--zero-time", help="Count times from the first frame.")] = False,
     gamma: Annotated[
         str | None,
         typer.Option(
-            help="srgb, linear or an exponent (default: linear for floats and for a recording's frames; "
-            "the sensor's own for grey images of its size; else srgb)."
+            help="srgb, linear, pq, hlg or an exponent (default: what the file states; linear for floats and for a "
+            "recording's frames; the sensor's own for grey images of its size; else srgb)."
         ),
     ] = None,
+    white_level: WhiteLevel = None,
+    range_: Range = None,
+    background: Background = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     keep_noise: Annotated[bool, typer.Option("--keep-noise", help="Make events of the frames' noise, too.")] = False,
@@ -69,8 +110,15 @@ def simulate(
         config=config,
         overrides=overrides or [],
         quiet=quiet,
-        fps=fps,
-        timestamps=timestamps,
+        declared=dict(
+            fps=fps,
+            timestamps=timestamps,
+            time_unit=time_unit,
+            zero_time=zero_time,
+            white_level=white_level,
+            range=range_,
+            background=background,
+        ),
         gamma=gamma,
         interpolate=interpolate,
         max_px=max_px,
@@ -88,14 +136,18 @@ def compare(
     ] = None,
     frames: Annotated[str | None, typer.Option(help="Frames of the scene, to measure log-intensity changes.")] = None,
     out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
-    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
-    timestamps: Annotated[str | None, typer.Option(help="File of frame times.")] = None,
-    gamma: Annotated[
-        str, typer.Option(help="Curve of the frames: linear (a camera's own), srgb or an exponent.")
-    ] = "linear",
+    fps: Fps = None,
+    timestamps: Timestamps = None,
+    frames_time_unit: FramesTimeUnit = None,
+    gamma: Curve = None,
+    white_level: WhiteLevel = None,
+    range_: Range = None,
+    background: Background = None,
     frame_delay_ms: Annotated[float, typer.Option(help="Offset added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval without frames, ms.")] = 20.0,
-    zero_time: Annotated[bool, typer.Option("--zero-time", help="Start both at their first event.")] = False,
+    zero_time: Annotated[
+        bool, typer.Option("--zero-time", help="Start both at their first event, and frames at the first.")
+    ] = False,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of both, if the files do not give it.")] = None,
     time_unit: of_events.TimeUnit = None,
     origin: of_events.Origin = None,
@@ -113,6 +165,7 @@ def compare(
 ) -> int:
     """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against
     brightness."""
+    from blinkgl.io.frames import Declared
     from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
 
@@ -121,8 +174,14 @@ def compare(
         b,
         out,
         frames=frames,
-        fps=fps,
-        timestamps=timestamps,
+        declared=Declared(
+            fps=fps,
+            timestamps=timestamps,
+            time_unit=frames_time_unit,
+            white_level=white_level,
+            range=range_,
+            background=background,
+        ),
         gamma=gamma,
         frame_delay_ms=frame_delay_ms,
         interval_ms=interval_ms,
@@ -158,16 +217,21 @@ def calibrate(
         list[str] | None,
         typer.Option("--set", metavar="key=value", help="Emulator parameter to keep fixed; may be repeated."),
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
-    timestamps: Annotated[str | None, typer.Option(help="File of frame times.")] = None,
-    gamma: Annotated[
-        str, typer.Option(help="Curve of the frames: linear (a camera's own), srgb or an exponent.")
-    ] = "linear",
+    fps: Fps = None,
+    timestamps: Timestamps = None,
+    frames_time_unit: FramesTimeUnit = None,
+    gamma: Curve = None,
+    white_level: WhiteLevel = None,
+    range_: Range = None,
+    background: Background = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     frame_delay_ms: Annotated[
         float | None, typer.Option(help="Offset added to the frame times, ms (default: estimated).")
     ] = None,
+    zero_time: Annotated[
+        bool, typer.Option("--zero-time", help="Count events from the first, and frames from the first.")
+    ] = False,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, if the recording does not give it.")] = None,
     time_unit: of_events.TimeUnit = None,
     origin: of_events.Origin = None,
@@ -193,8 +257,15 @@ def calibrate(
         emulator=emulator,
         sensor=sensor,
         overrides=overrides or [],
-        fps=fps,
-        timestamps=timestamps,
+        declared=dict(
+            fps=fps,
+            timestamps=timestamps,
+            time_unit=frames_time_unit,
+            zero_time=zero_time,
+            white_level=white_level,
+            range=range_,
+            background=background,
+        ),
         gamma=gamma,
         interpolate=interpolate,
         max_px=max_px,

@@ -274,7 +274,7 @@ def predict(
         predictor = infer.Predictor(model, *shape, **options)
     reads = ("old", "new") if model is None else model.reads
     show_flows(file, predictor, reads, asked, outputs, typer.echo)
-    for line in file.said:
+    for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import imageio.v2 as imageio
+import av
 import numpy as np
 
 from blinkgl import open_events, simulate_file
@@ -11,10 +11,13 @@ from blinkgl import open_events, simulate_file
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     y, x = np.mgrid[:96, :128]
-    with imageio.get_writer(out / "disc.mp4", fps=50, macro_block_size=None) as video:
+    with av.open(out / "disc.mp4", "w") as video:
+        stream = video.add_stream("libx264", rate=50, width=128, height=96, pix_fmt="yuv420p")
         for k in range(12):  # a bright disc crosses a dim gradient
             disc = np.hypot(x - 20 - 8 * k, y - 48) < 14
-            video.append_data(np.repeat(np.where(disc, 220, 40 + x // 2).astype(np.uint8)[..., None], 3, axis=2))
+            frame = np.where(disc, 220, 40 + x // 2).astype(np.uint8)
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "gray").reformat(format="yuv420p")))
+        video.mux(stream.encode())
 
     report = simulate_file(
         out / "disc.mp4",

@@ -190,3 +190,11 @@ def test_a_memory_limit_ends_a_command_in_one_line(tmp_path):
         done.stderr
     )
     assert not (tmp_path / "e.npz").exists()
+
+
+@pytest.mark.parametrize("words, given", [([], []), (["--both-sides"], ["true"]), (["--one-side"], ["false"])])
+def test_sides_of_files_are_an_override(monkeypatch, words, given):
+    seen = {}
+    monkeypatch.setattr("blinkgl.show.generate.run", lambda *_, **keys: seen.update(keys) or 0)
+    assert cli.run(["generate", "a.yaml", "-o", "out", "--set", "seed=3", *words]) == 0
+    assert seen["overrides"] == ["seed=3", *(f"scene.both_sides={value}" for value in given)]

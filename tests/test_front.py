@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.scene.build import build_scene
-from tests.scene.gltf_files import arm_file
+from tests.scene.gltf_files import GltfBuilder, arm_file
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -167,7 +168,7 @@ def test_arrays_as_mesh_and_image():
     )
     camera = blinkgl.Camera(32, 32, fov=53.13, pose=(-2, 0, 0))
     scene = blinkgl.Scene(camera, light=blinkgl.Light(unlit=True), background=0.5) + blinkgl.Mesh(
-        **square, material=blinkgl.Material(image, double_sided=True)
+        **square, material=blinkgl.Material(image, both_sides=True)
     )
     frame = blinkgl.render_frame(scene, 0.0, ["images", "depth", "ids"])
     # The camera looks along +x, so that +y, where u is 1, is on its left.
@@ -412,3 +413,39 @@ def test_what_lives_is_what_yaml_makes_of_it(tmp_path):
     assert moved == pytest.approx(0.5 * walker.parts[0].mesh.deformer.speed, rel=1e-3)
     paint = b.Primitive("figure", material=b.Material(color=(1, 0, 0)))
     assert paint.material.tree["color"] == [1, 0, 0]
+
+
+def test_a_closed_renderer_says_so():
+    scene = blinkgl.Scene(blinkgl.Camera(32, 24)) + blinkgl.Primitive("sphere", pose=(3, 0, 0))
+    renderer = blinkgl.Renderer(scene)
+    renderer.close()
+    renderer.close()
+    for use in (renderer.luminance, renderer.image, renderer.frame):
+        with pytest.raises(blinkgl.ConfigError) as error:
+            use(0.1)
+        assert str(error.value) == "Renderer: the renderer is closed; use it before close(), or make a new one"
+
+
+def test_sides_are_what_the_file_says_unless_overruled(tmp_path):
+    """A single-sided box around the camera, which shows its outside alone."""
+    builder = GltfBuilder()
+    builder.node(mesh=builder.mesh(*(lambda box: (box.vertices, box.faces))(trimesh.creation.box((6, 6, 6)))))
+    (tmp_path / "box.glb").write_bytes(builder.glb())
+    camera = blinkgl.Camera(16, 12)
+
+    def seen(body, **keys):
+        with blinkgl.Renderer(blinkgl.Scene(camera, **keys) + body) as renderer:
+            return bool(np.isfinite(renderer.frame(0.1, ["depth"]).depth).all())
+
+    for given, expected in ((None, False), (True, True), (False, False)):
+        assert seen(blinkgl.Mesh(tmp_path / "box.glb"), both_sides=given) == expected
+        painted = blinkgl.Mesh(tmp_path / "box.glb", material=blinkgl.Material(both_sides=given))
+        assert seen(painted) == expected and seen(painted, both_sides=False if given else None) == expected
+    box = trimesh.creation.box((6, 6, 6))
+    for faces in (box.faces, box.faces[:, ::-1]):  # arrays do not say
+        assert seen(blinkgl.Mesh(vertices=box.vertices, faces=faces))
+    assert not seen(blinkgl.Primitive("cuboid", extents=(6, 6, 6)))
+    with pytest.raises(
+        blinkgl.ConfigError, match="double_sided: this key was removed .got True.; expected both_sides: true"
+    ):
+        blinkgl.Material(double_sided=True)

@@ -141,7 +141,7 @@ def told_scene(scene: Scene) -> dict[str, Any]:
                     *part.material.base_color,
                     *part.material.uv_scale,
                     float(part.material.unlit),
-                    float(part.material.double_sided),
+                    float(not part.culled),
                 )
             ),
             *(part.material.texture.name for part in thing.parts if part.material.texture),

@@ -40,6 +40,7 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.gl import create_context
 from blinkgl.io.formats import convert
+from blinkgl.io.frames import Declared
 from blinkgl.layouts.export import LAYOUTS, export_layout
 from blinkgl.machine.cpu import cpu_field
 from blinkgl.recordings.simulation import file_to_events
@@ -112,7 +113,8 @@ def simulated(scratch: Path) -> Path:
     """Turn a folder of frames into events with each emulator, and the events into other formats."""
     out = scratch / "out"
     for emulator in EMULATORS:
-        file_to_events(scratch / "clip" / "image_left", out / f"{emulator}.npz", fps=100, emulator=emulator, seed=3)
+        clip = scratch / "clip" / "image_left"
+        file_to_events(clip, out / f"{emulator}.npz", declared=Declared(fps=100), emulator=emulator, seed=3)
     for name in ("a.h5", "b.txt", "c.raw", "d.npy"):
         convert(out / "esim.npz", out / "formats" / name)
     return out

@@ -42,7 +42,7 @@ from blinkgl.config.run import load_run
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.flow import read_flo, read_flow_png, write_flo, write_flow_png
 from blinkgl.io.formats import open_events, write_events
-from blinkgl.io.frames import open_frames
+from blinkgl.io.frames import Declared, open_frames
 from blinkgl.io.images import write_pfm
 from blinkgl.io.reading import EventReading
 from blinkgl.scene.importing.mesh_files import load_asset
@@ -178,7 +178,7 @@ def _write_picture(path: Path) -> None:
 
 def _read_frames(path: Path) -> None:
     """A folder of two frames, or an array of frames."""
-    list(open_frames(path if path.suffix in (".npy", ".npz") else path.parent, fps=100.0))
+    list(open_frames(path if path.suffix in (".npy", ".npz") else path.parent, Declared(fps=100.0)))
 
 
 FRAMES = Format(_write_picture, _read_frames)

@@ -31,7 +31,7 @@ from blinkgl.config.reader import to_short_yaml
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import load_sensor
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.frames import read_any_image
+from blinkgl.io.frames import NOTHING, Declared, read_any_image
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.calibration import judge_half
@@ -60,12 +60,12 @@ MakeClip = Callable[[int], Clip]
 
 def slider(root: Path) -> MakeClip:
     folder = root / "slider_depth"
-    return _clip(folder / "events_chunk.txt", folder / "images", timestamps=folder / "images.txt")
+    return _clip(folder / "events_chunk.txt", folder / "images", Declared(timestamps=folder / "images.txt"))
 
 
-def _clip(events: Path, frames: Path, **options: Any) -> MakeClip:
+def _clip(events: Path, frames: Path, declared: Declared = NOTHING) -> MakeClip:
     stream, size, _ = read_recording(events)
-    timed, exposures = timed_frames(frames, **options)
+    timed, exposures = timed_frames(frames, declared)
     given, reading = list(timed), FrameReading(exposures=exposures, name=frames.name)
     return lambda most: clip_of_frames(stream, given, size, reading, most=most)
 

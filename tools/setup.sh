@@ -31,10 +31,10 @@ need() {
     fi
 }
 
-# The first Python >= 3.10: $PYTHON, python3, or one with its version in the name.
+# The first Python >= 3.11: $PYTHON, python3, or one with its version in the name.
 find_python() {
-    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11 python3.10; do
-        if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11; do
+        if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
             command -v "$candidate"
             return
         fi
@@ -46,8 +46,8 @@ make_venv() {
     # One whose Python is gone, or that was made without pip, is made anew.
     if "$python" -c 'import pip' 2>/dev/null; then return; fi
     base=$(find_python) || {
-        need "python3 python3-venv" "there is no Python 3.10 or newer"
-        base=$(find_python) || { echo "still no Python 3.10 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
+        need "python3 python3-venv" "there is no Python 3.11 or newer"
+        base=$(find_python) || { echo "still no Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
     }
     if ! "$base" -c 'import venv, ensurepip' 2>/dev/null; then  # Debian and Ubuntu ship Python without them
         need "python3-venv" "Python's venv module is missing"

@@ -1,4 +1,5 @@
-"""Camera calibrations in YAML: Kalibr's camchain, DSEC's ``cam_to_cam.yaml`` and EuRoC's ``sensor.yaml``.
+"""Camera calibrations: Kalibr's camchain, DSEC's ``cam_to_cam.yaml``, EuRoC's ``sensor.yaml``, OpenCV's FileStorage,
+ROS' camera_info, COLMAP's ``cameras.txt`` and Metavision's JSON.
 
 Kalibr has one table per camera, each with its pose relative to the camera before::
 
@@ -14,12 +15,17 @@ EuRoC has one file per camera. Its distortion is called radial-tangential, and `
 that the trajectory describes.
 
 DSEC has the tables under ``intrinsics``, with ``camera_matrix`` instead of ``intrinsics``, and beside them those of the
-rectified images (``camRect0`` …). All count pixels as BlinkGL does: (0, 0) is the centre of the top-left pixel.
+rectified images (``camRect0`` …).
+
+OpenCV, ROS and Metavision have a matrix K and coefficients k1 k2 p1 p2 [k3 …], whose model, where none is named, is
+OpenCV's own (``cv::calibrateCamera``). All count pixels as BlinkGL does, (0, 0) is the centre of the top-left pixel,
+but COLMAP, where it is (0.5, 0.5).
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,63 +36,172 @@ import numpy as np
 from blinkgl.camera import CAMERA_MODELS, CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
 from blinkgl.config.poses import rigid_matrix
-from blinkgl.config.reader import read_table, to_yaml
+from blinkgl.config.reader import parse_yaml, read_text, to_yaml
 from blinkgl.errors import ConfigError
 
 _RIGID = 1e-4
-_NONE = ("none", "None", "", None)
+_NONE = ("none", "None", "", "no", "pinhole", "no_distortion", None)
 _COUNTS = {"radtan": (4, 5), "equidistant": (4,)}
-_EUROC = {"radial-tangential": "radtan"}
+_SYNONYMS = {
+    "radial-tangential": "radtan", "plumb_bob": "radtan", "brown": "radtan", "opencv": "radtan", "radtan4": "radtan",
+    "radtan5": "radtan", "rational_polynomial": "radtan", "fisheye": "equidistant", "equi": "equidistant",
+    "kannala_brandt": "equidistant", "opencv_fisheye": "equidistant",
+}  # fmt: skip
+_MATRIX = ("camera_matrix", "K", "Camera_Matrix", "CameraMatrix", "cameraMatrix", "M1")
+_COEFFICIENTS = ("distortion_coefficients", "distortion_coeffs", "Distortion_Coefficients", "dist_coeffs", "distCoeffs",
+                 "D", "D1")  # fmt: skip
+_COLMAP: dict[str, tuple[str | None, str]] = {
+    # Model: ours, and what its numbers are; f is both focal lengths.
+    "SIMPLE_PINHOLE": (None, "f cx cy"), "PINHOLE": (None, "fx fy cx cy"), "SIMPLE_RADIAL": ("radtan", "f cx cy k1"),
+    "RADIAL": ("radtan", "f cx cy k1 k2"), "OPENCV": ("radtan", "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": ("equidistant", "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": ("radtan", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
     """A camera of a calibration file. camera : its model.   T_cam_before : (4, 4) float64 rigid, from the axes of the
-    previous camera of the chain to its own (Kalibr's T_cn_cnm1); None where it is not given."""
+    previous camera of the chain to its own (Kalibr's T_cn_cnm1).   T_cam_imu : (4, 4) rigid, from the inertial unit's
+    axes to its own; None where they are not given."""
 
     camera: CameraModel
     T_cam_before: np.ndarray | None = None
+    T_cam_imu: np.ndarray | None = None
 
 
 def read_camchain(path: str | Path) -> dict[str, Calibrated]:
-    """Return the cameras of a calibration in any of these formats, by name, in the file's order: DSEC's raw cameras
-    only, and EuRoC's as ``cam0``.
+    """Return the cameras of a calibration in any of these formats, by name, in the file's order: of one camera as
+    ``cam0``, COLMAP's as ``cam`` and their number, DSEC's rectified ones after the raw ones.
 
-    Raises ConfigError naming file, camera and key for another kind of file, an unsupported model, a wrong number of
-    coefficients, impossible values, a distortion that folds inside the image, or a transform that is not rigid."""
-    where = str(path)
-    tree = read_table(path, "a calibration: cam0, cam1, …")
+    Raises ConfigError naming file, camera and key for another kind of file, an unsupported model, coefficients without
+    a model, a wrong number of them, impossible values, a distortion that folds inside the image, or a transform that is
+    not rigid."""
+    where, text = str(path), read_text(path)
+    if re.search(r"^[ \t]*\d+[ \t]+[A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]", text, re.M):
+        return _colmap(text, where)
+    tree = _tree(text, where)
+    if (one := _of_matrix(tree, where)) is not None:
+        return {"cam0": one}
     dsec = isinstance(tree.get("intrinsics"), dict)
     tables = tree["intrinsics"] if dsec else {"cam0": tree} if isinstance(tree.get("intrinsics"), list) else tree
     places = tree.get("extrinsics") if dsec else None
-    found = {
-        str(name): _camera(table, f"{where}: {name}", "camera_matrix" if dsec else "intrinsics")
+    names = [
+        str(name)
         for name, table in tables.items()
-        if isinstance(table, dict) and ("resolution" in table or "distortion_model" in table)
-        if not (dsec and str(name).startswith("camRect"))
-    }
-    if not found:
-        raise ConfigError(
-            "the file has no camera", where=where, value=sorted(map(str, tree))[:5], accepted="cam0: {intrinsics: …, …}"
-        )
+        if isinstance(table, dict) and ("resolution" in table or "distortion_model" in table or "intrinsics" in table)
+    ]
+    if not names:
+        accepted = "cam0: {intrinsics: …, …}, or a camera matrix"
+        raise ConfigError("the file has no camera", where=where, value=sorted(map(str, tree))[:5], accepted=accepted)
+    key = "camera_matrix" if dsec else "intrinsics"
+    raw = [name for name in names if not (dsec and name.startswith("camRect"))]
+    found = {name: _camera(tables[name], f"{where}: {name}", key) for name in raw}
     for k, (name, one) in enumerate(found.items()):
         given, key = tables[name].get("T_cn_cnm1"), "T_cn_cnm1"
         if dsec and isinstance(places, dict) and k:
             key = f"T_{k}{k - 1}"
             given = places.get(key)
-        if given is not None:
-            found[name] = Calibrated(one.camera, _rigid(given, f"{where}: {name}.{key}"))
+        before = None if given is None else _rigid(given, f"{where}: {name}.{key}")
+        unit = next((k for k in ("T_cam_imu", "T_imu_cam") if tables[name].get(k) is not None), None)
+        T = None if unit is None else _rigid(tables[name][unit], f"{where}: {name}.{unit}")
+        found[name] = Calibrated(one.camera, before, np.linalg.inv(T) if T is not None and unit == "T_imu_cam" else T)
+    rectified_ = {name: _camera(tables[name], f"{where}: {name}", "camera_matrix") for name in names if name not in raw}
+    return found | rectified_
+
+
+def _tree(text: str, where: str) -> dict[str, Any]:
+    """Return the table of a YAML or JSON file, also of OpenCV's dialect: ``%YAML:1.0`` and the tags of its types."""
+    text = re.sub(r"\A\s*%YAML[: ]1\.\d\s*\n(---\s*\n)?", "", text)
+    tree = parse_yaml(re.sub(r"!!opencv-\w+", "", text), where)
+    if not isinstance(tree, dict):
+        raise ConfigError("not a table of keys", where=where, value=tree, accepted="a calibration: cam0, cam1, …")
+    return tree
+
+
+def _of_matrix(tree: dict[str, Any], where: str) -> Calibrated | None:
+    """Return the camera of a file of OpenCV, ROS or Metavision, or None for another kind of file."""
+    inner = next((v for v in tree.values() if isinstance(v, dict) and any(key in v for key in _MATRIX)), {})
+    table = tree if any(key in tree for key in _MATRIX) else inner if "K" in inner else {}
+    key = next((key for key in _MATRIX if key in table), None)
+    K = None if key is None else _flat(table[key])
+    if K is None or len(K) != 9:
+        return None
+    if abs(K[1]) > 1e-6 * abs(K[0]):
+        raise ConfigError("the pixels are skewed", where=f"{where}: {key}", value=K[1], accepted="0 in the first row")
+    size = next((table[k] for k in ("img_size", "image_size", "resolution") if k in table), None)
+    size = [table.get("image_width"), table.get("image_height")] if size is None else size
+    numbers = next((name for name in _COEFFICIENTS if name in table), None)
+    given = [] if numbers is None else _flat(table[numbers])
+    model = table.get("distortion_model", table.get("type", table.get("camera_model")))
+    if model in _NONE and any(given or ()):
+        model = "equidistant" if table.get("fisheye_model") else "radtan"
+    plain = {"resolution": size, "intrinsics": [K[0], K[4], K[2], K[5]], "distortion_model": model}
+    return _camera(plain | {"distortion_coeffs": given}, where, "intrinsics")
+
+
+def _flat(given: Any) -> list[float] | None:
+    """Return the numbers of a matrix of OpenCV (rows, cols, data), of ROS, or a list of rows; None: none of these."""
+    data = given.get("data") if isinstance(given, dict) else given
+    if not isinstance(data, list):
+        return None
+    flat = [value for row in data for value in (row if isinstance(row, list) else [row])]
+    return [float(v) for v in flat] if all(isinstance(v, (int, float)) for v in flat) else None
+
+
+def _colmap(text: str, where: str) -> dict[str, Calibrated]:
+    """Return the cameras of COLMAP's cameras.txt: CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
+    found: dict[str, Calibrated] = {}
+    for line in text.splitlines():
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        place, model = f"{where}: camera {fields[0]}", fields[1] if len(fields) > 1 else ""
+        if model not in _COLMAP:
+            known = ", ".join(_COLMAP)
+            raise ConfigError("unsupported camera model", where=place, value=model, accepted=f"one of {known}")
+        kind, names = _COLMAP[model]
+        numbers = [_number(field) for field in fields[4:]]
+        if len(numbers) != len(names.split()) or None in numbers:
+            raise ConfigError("wrong numbers", where=place, value=fields[4:], accepted=names)
+        by = dict(zip(names.split(), numbers))
+        focal = [by.get("fx", by.get("f")), by.get("fy", by.get("f"))]
+        # Its pixels begin at 0, ours are centred there.
+        intrinsics = [*focal, by["cx"] - 0.5, by["cy"] - 0.5]
+        order = ("k1", "k2", "k3", "k4") if kind == "equidistant" else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        given = [by.get(name, 0.0) for name in order] if kind else []
+        table = {"resolution": [_number(fields[2]), _number(fields[3])], "intrinsics": intrinsics}
+        found[f"cam{fields[0]}"] = _camera(
+            table | {"distortion_model": kind, "distortion_coeffs": given}, place, "intrinsics"
+        )
     return found
 
 
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
 def read_place_on_body(path: str | Path) -> np.ndarray:
-    """Return T_body_sensor, (4, 4) float64: the ``T_BS`` of EuRoC's ``sensor.yaml`` with its rounded rotation made
-    exact. Raises ConfigError."""
-    given = read_table(path, "EuRoC's sensor.yaml").get("T_BS")
+    """Return T_body_sensor, (4, 4) float64, with its rounded rotation made exact: ``T_BS`` or ``T_body_sensor`` of
+    EuRoC's ``sensor.yaml``, or of Kalibr's first camera the inverse of ``T_cam_imu`` or ``T_imu_cam``. Raises
+    ConfigError."""
+    tree = _tree(read_text(path), str(path))
+    tables = [tree, *(value for value in tree.values() if isinstance(value, dict))]
+    names = ("T_BS", "T_body_sensor", "T_imu_cam", "T_cam_imu")
+    found = next(((table, key) for table in tables for key in names if key in table), None)
+    if found is None:
+        accepted = "T_BS, T_body_sensor, T_cam_imu or T_imu_cam"
+        raise ConfigError("no place on a body", where=str(path), value=sorted(map(str, tree))[:5], accepted=accepted)
+    table, key = found
+    given = table[key]
     data = given.get("data") if isinstance(given, dict) else given
     if isinstance(data, list) and len(data) == 16:
         data = [data[k : k + 4] for k in range(0, 16, 4)]
-    return rigid_matrix(_rigid(data, f"{path}: T_BS"))
+    T = rigid_matrix(_rigid(data, f"{path}: {key}"))
+    return np.linalg.inv(T) if key == "T_cam_imu" else T
 
 
 def camchain_yaml(cameras: Mapping[str, Calibrated]) -> str:
@@ -149,15 +264,30 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
         raise ConfigError("not a size", where=f"{where}.resolution", value=size, accepted="[width, height], whole px")
     intrinsics = _numbers(table, key, (4,), where)
     lens = table.get("distortion_model")
-    kind = "pinhole" if lens in _NONE else _EUROC.get(str(lens), str(lens))
-    numbers = "distortion_coefficients" if "distortion_coefficients" in table else "distortion_coeffs"
+    kind = "pinhole" if lens in _NONE else _SYNONYMS.get(str(lens).lower(), str(lens))
+    numbers = next((name for name in _COEFFICIENTS if name in table), "distortion_coeffs")
+    known = f"one of {', '.join(_COUNTS)}, none"
     if kind not in ("pinhole", *_COUNTS):
-        raise ConfigError(
-            "unknown distortion model",
-            where=f"{where}.distortion_model",
-            value=lens,
-            accepted=f"one of {', '.join(_COUNTS)}, none",
+        raise ConfigError("unknown distortion model", where=f"{where}.distortion_model", value=lens, accepted=known)
+    given = _flat(table.get(numbers)) or []
+    if kind == "pinhole" and any(given):
+        # They are never dropped.
+        stated = (
+            "distortion coefficients without a model" if lens is None else f"coefficients of a lens of model {lens}"
         )
+        accepted = f"distortion_model: {known}, and no coefficients with none"
+        raise ConfigError(stated, where=f"{where}.{numbers}", value=given, accepted=accepted)
+    if kind == "radtan" and len(given) > 5:
+        if any(given[5:]):
+            raise ConfigError(
+                "the rational model's further coefficients (k4, k5, k6 …) are not supported",
+                where=f"{where}.{numbers}",
+                value=given[5:],
+                accepted="k1 k2 p1 p2 k3: a calibration without CALIB_RATIONAL_MODEL",
+            )
+        table = {**table, numbers: given[:5]}
+    elif isinstance(table.get(numbers), dict):
+        table = {**table, numbers: given}
     given = [] if kind == "pinhole" else _numbers(table, numbers, _COUNTS[kind], where)
     try:
         made = CAMERA_MODELS[kind](

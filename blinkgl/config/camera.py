@@ -14,6 +14,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from blinkgl.camera import CAMERA_MODELS, CameraModel, focal_length
@@ -56,7 +57,7 @@ class CameraConfig(Config):
     )
     calibration: str | None = Field(
         None,
-        description="YAML file of Kalibr (camchain), DSEC (cam_to_cam) or EuRoC (sensor); its size, lens, "
+        description="file of Kalibr, DSEC, EuRoC, OpenCV, ROS, COLMAP or Metavision; its size, lens, "
         "distortion, fx, fy, cx and cy replace this key when the run is read",
     )
     calibration_name: str | None = Field(
@@ -182,6 +183,31 @@ def calibrated(camera: Any, base: Path) -> Any:
                 accepted=f"{getattr(seen, key)}, or nothing",
             )
     return {**own, **camera_keys(seen)}
+
+
+def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:
+    """Return what the calibration of a sensor's ``camera:`` says of places and the table does not: ``place`` on the
+    rig, whose origin is the file's first camera, and ``imu`` with its position and rotation. Raises ConfigError."""
+    from scipy.spatial.transform import Rotation
+
+    from blinkgl.config.camchain import read_camchain
+
+    camera, said = table.get("camera"), {}
+    if not isinstance(camera, dict) or not isinstance(camera.get("calibration"), str):
+        return said
+    chain = list(read_camchain(base / camera["calibration"]).items())
+    number = next((k for k, (name, _) in enumerate(chain) if name == camera.get("calibration_name")), 0)
+    links = [one.T_cam_before for _, one in chain[1 : number + 1]]
+    if "place" not in table and links and all(link is not None for link in links):
+        T = np.eye(4)
+        for link in links:  # from the axes of the camera before to its own
+            T = np.asarray(link) @ T
+        said["place"] = {"matrix": np.linalg.inv(T).tolist()}
+    imu, place = table.get("imu"), chain[number][1].T_cam_imu if chain else None
+    if isinstance(imu, dict) and place is not None and not {"position", "rotation"} & set(imu):
+        turned = Rotation.from_matrix(place[:3, :3]).as_euler("xyz", degrees=True)
+        said["imu"] = {**imu, "position": place[:3, 3].tolist(), "rotation": turned.tolist()}
+    return said
 
 
 def camera_keys(camera: CameraModel) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import Field
 
 from blinkgl.config.base import Config
-from blinkgl.config.camera import calibrated
+from blinkgl.config.camera import calibrated, placed_by_calibration
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import (
     Table,
@@ -65,7 +65,10 @@ def expanded(tree: Table, base: Path) -> Table:
         said = {key: each_option(table[key], meaning) for key, meaning in meanings.items() if key in table}
         return {**table, **said}
 
-    return with_groups(tree, lambda table: with_sections(spelled_out(table), spelled_out))
+    def placed(table: Table) -> Table:
+        return {**spelled_out(table), **placed_by_calibration(table, base)}
+
+    return with_groups(tree, lambda table: with_sections(spelled_out(table), placed))
 
 
 def _recipe(events: Any) -> Any:

@@ -9,6 +9,8 @@ from pydantic import Field
 from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.values import Paths
 
+CURVES = ("srgb", "linear", "pq", "hlg")
+FLOW_FORMATS = ("dsec", "kitti", "vkitti2", "tartanair2", "flo", "pfm", "flo5", "npy")
 MAX_SPAN_S = (2**32 - 1) * 1e-6
 """Longest recording of one event file, s: DSEC stores microseconds in 32 bits."""
 
@@ -25,7 +27,15 @@ class FramesConfig(Config):
     flow: str | None = Field(
         "flow",
         description="sub-folder of the optical flow, one file per pair of frames in their order: .npy "
-        "(H, W, 2 or 3), .flo or DSEC .png; null: none",
+        "(H, W, 2 or 3), .flo, .png, .pfm or .flo5; `{0}` is the folder's name, `{1}` its parent's …; null: none",
+    )
+    flow_format: str = Field(
+        "auto",
+        description="of the flow files: dsec, kitti, vkitti2, tartanair2, flo, pfm, flo5, npy; auto: by ending, and "
+        "16-bit PNGs by their values",
+    )
+    check_flow: bool = Field(
+        True, description="refuse flow that explains its images worse than its double, its half, its negative or none"
     )
     fps: float = Field(
         10.0,
@@ -35,15 +45,28 @@ class FramesConfig(Config):
     )
     first: int = Field(0, ge=0, description="frames skipped at the beginning")
     count: int | None = Field(None, ge=3, description="frames used; null: all")
-    gamma: Literal["srgb", "linear"] = Field("srgb", description="transfer curve of the images")
+    gamma: str | float | None = Field(
+        None,
+        description="transfer curve of the images: srgb, linear, pq, hlg or an exponent; null: what the files state, "
+        "else srgb for integers and linear for floats",
+    )
+    white_level: float | None = Field(
+        None,
+        gt=0,
+        le=1e9,
+        description="code of white, 4095 of 12 bits in 16; null: what the files state, or the type's",
+    )
+    range: Literal["full", "limited"] | None = Field(
+        None, description="of the codes: limited is 16 to 235 of 8 bits; null: full"
+    )
     interpolate: Literal["linear", "motion"] = Field(
         "motion", description="between frames: as `blinkgl simulate --interpolate`"
     )
     max_px: float = Field(1.0, gt=0, le=1e3, description="for motion: largest displacement per step, px")
     keep_noise: bool = Field(
         False,
-        description="make events of the images' noise, too; otherwise the noise is estimated from the first "
-        "images and changes that it explains cause no events (images without noise are used "
+        description="make events of the images' noise, too; otherwise the noise is estimated all along "
+        "and changes that it explains cause no events (images without noise are used "
         "unchanged)",
     )
     max_displacement: float | None = Field(
@@ -60,6 +83,18 @@ class FramesConfig(Config):
         ),
         "backward": Removed("the key left out: it has no effect", lambda value: value is None),
     }
+
+    @rule("gamma")
+    def _a_curve(gamma: str | float | None):
+        if (isinstance(gamma, str) and gamma not in CURVES) or (isinstance(gamma, float) and not 0 < gamma <= 10):
+            accepted = f"{', '.join(CURVES)} or an exponent up to 10"
+            raise Refused("unknown transfer curve", where="gamma", value=gamma, accepted=accepted)
+
+    @rule("flow_format")
+    def _a_format(flow_format: str):
+        if flow_format not in ("auto", *FLOW_FORMATS):
+            accepted = ", ".join(("auto", *FLOW_FORMATS))
+            raise Refused("unknown format of flow", where="flow_format", value=flow_format, accepted=accepted)
 
     @rule("fps", "count")
     def _fits_a_file(fps: float, count: int | None):

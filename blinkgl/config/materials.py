@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, Removed, rule
 
 TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
@@ -29,7 +29,11 @@ class MaterialConfig(Config):
     color: tuple[Radiance, Radiance, Radiance] = Field((1.0, 1.0, 1.0), description="linear factor")
     uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
     unlit: bool = Field(False, description="radiance = albedo, independent of light")
-    double_sided: bool = Field(False, description="draw back faces, with the normal reversed")
+    both_sides: bool | None = Field(
+        None,
+        description="draw faces from behind, too, with the normal reversed; null: as the mesh's file says, or unless "
+        "the primitive is closed",
+    )
     metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="fraction that is metal")
     roughness: Annotated[float, Field(ge=0, le=1)] = Field(
         1.0, description="0: a mirror; 1 for a non-metal: matt, without reflection"
@@ -50,6 +54,8 @@ class MaterialConfig(Config):
         "below cutoff",
     )
     cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="threshold of the mask; 1 is white or opaque")
+
+    removed: ClassVar[Any] = {"double_sided": Removed("both_sides: true", lambda value: value is False)}
 
     @rule("texture", "procedural", "photograph")
     def _one(*sources):

@@ -91,8 +91,21 @@ class TrajectoryConfig(Config):
     """Poses from a file, connected by a C2 spline. They are T_world_body: of a camera with OpenCV's axes, of an object
     with its own. The file must cover the sequence."""
 
-    file: str = Field(description="TUM: t x y z qx qy qz qw; or EuRoC's CSV: t, x, y, z, qw, qx, qy, qz")
-    form: Literal["auto", "tum", "euroc"] = Field("auto", description="auto: EuRoC where lines have commas")
+    file: str = Field(description="a table of poses (TUM, EuRoC, ESIM …), KITTI's, COLMAP's images.txt, NeRF's JSON")
+    form: Literal["auto", "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"] = Field(
+        "auto", description="auto: by the heading, else by the content; a guess is logged"
+    )
+    columns: str | None = Field(None, description="names of the columns, such as `t x y z qw qx qy qz`; `-`: left out")
+    time_unit: Literal["s", "ms", "us", "ns"] | None = Field(
+        None, description="of the file's times; null: as its heading says, else the form's, else guessed from all"
+    )
+    maps_from: Literal["camera", "world"] | None = Field(
+        None, description="world: poses map the world to the camera; null: the form's (colmap: world)"
+    )
+    axes: Literal["opencv", "opengl", "ned"] | None = Field(
+        None, description="of the camera in the file; null: the form's (nerf: opengl, tartanair: ned)"
+    )
+    rate: float | None = Field(None, gt=0, le=1e6, description="poses per second of a file without times")
     start: float | None = Field(
         None,
         ge=-1e10,

@@ -163,8 +163,13 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Return the plain data of a YAML file. Raises ConfigError for a file that is missing, unreadable, not regular, too
-    large, not UTF-8 or not YAML."""
+    """Return the plain data of a YAML file. Raises ConfigError as :func:`read_text`, and for what is not YAML."""
+    return parse_yaml(read_text(path), str(path))
+
+
+def read_text(path: str | Path) -> str:
+    """Return the text of a YAML file, without a byte order mark. Raises ConfigError for a file that is missing,
+    unreadable, not regular, too large or not UTF-8."""
     path = Path(path)
     where = str(path)
     try:
@@ -175,7 +180,7 @@ def read_yaml(path: str | Path) -> Any:
             raise ConfigError(
                 "file is too large for a configuration", where=where, accepted=f"at most {MAX_BYTES} bytes"
             )
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise ConfigError("no such file", where=where, accepted="a YAML file") from None
     except OSError as error:
@@ -186,7 +191,6 @@ def read_yaml(path: str | Path) -> Any:
         raise ConfigError(
             "cannot be read: not text in UTF-8", where=where, accepted="a YAML text file in UTF-8"
         ) from None
-    return parse_yaml(text, where)
 
 
 def read_table(path: str | Path, accepted: str = "key: value lines") -> dict[str, Any]:

@@ -53,6 +53,12 @@ class ObjectsConfig(Config):
     deform: RandomDeformConfig = RandomDeformConfig()
 
 
+BOTH_SIDES = Field(
+    None,
+    description="false: faces of files are drawn from their front alone; null: as each [file says](scenes.md#sides)",
+)
+
+
 class PoolConfig(Config):
     """Source of the random world's objects."""
 
@@ -64,11 +70,10 @@ class PoolConfig(Config):
         "fish swims, a flag flies",
     )
     variants: int = Field(24, ge=1, le=10_000, description="random shapes per primitive kind (aspect ratios, sides)")
-    folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
+    folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, off, 3mf, glb, gltf")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for "
-        "obj, ply, stl",
+        description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for others",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
     removed: ClassVar[Any] = {
@@ -172,6 +177,7 @@ class RandomSceneConfig(Config):
         0.3, gt=0, le=1e4, description="radius of the empty sphere around the camera centre, m"
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    both_sides: bool | None = BOTH_SIDES
     removed: ClassVar[Any] = {
         "walls": Removed(
             "scene: {kind: explicit} with objects of category: wall",
@@ -223,12 +229,11 @@ class MeshConfig(Config):
         {},
         description="sizes, numbers of faces and motion of the primitive: see [primitives](#primitives)",
     )
-    file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
+    file: str | None = Field(None, description="obj, ply, stl, off, 3mf, glb or gltf file")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
         description="upward axis of the file, which becomes the world's z: with y, the file's (x, y, z) is drawn "
-        "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for "
-        "obj, ply, stl",
+        "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for others",
     )
     project_uvs: ClassVar[Any] = False
     uv_size: ClassVar[Any] = 1.0
@@ -349,6 +354,7 @@ class ExplicitSceneConfig(Config):
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    both_sides: bool | None = BOTH_SIDES
     max_faces: ClassVar[Any] = 5_000_000
     fixed: ClassVar[Any] = ("max_faces",)
 
@@ -410,6 +416,7 @@ class FileSceneConfig(Config):
         "remain",
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+    both_sides: bool | None = BOTH_SIDES
     lights_gain: Positive = Field(
         1.0,
         description="factor on the file's lights; their lux and candela are divided by 683 lm/W, the factor of "

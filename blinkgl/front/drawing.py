@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Renderer:
         self.start_s, self.end_s = self.config.time.t0_ns * 1e-9, self.config.time.t1_ns * 1e-9
         with ExitStack() as stack:
             gl = stack.enter_context(create_context(self.config.gl.backend, self.config.gl.device))
-            self._renderer = stack.enter_context(SceneRenderer(gl, self.scene, self.config.render))
+            self._renderer: Any = stack.enter_context(SceneRenderer(gl, self.scene, self.config.render))
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Renderer:
@@ -53,8 +54,9 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Release OpenGL."""
+        """Release OpenGL; every later use raises ConfigError."""
         self._stack.close()
+        self._renderer = _Closed()
 
     def luminance(self, t: float) -> np.ndarray:
         """Return (H, W) float32 linear luminance at t s, the input of emulators."""
@@ -91,6 +93,15 @@ class Renderer:
             request,
             t_ns + interval if to is None else _ns(to, "to"),
             t_ns - interval if back_to is None else _ns(back_to, "back_to"),
+        )
+
+
+class _Closed:
+    """What a closed renderer draws with."""
+
+    def __getattr__(self, name: str) -> NoReturn:
+        raise ConfigError(
+            "the renderer is closed", where="Renderer", accepted="use it before close(), or make a new one"
         )
 
 

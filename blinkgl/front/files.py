@@ -5,165 +5,26 @@ Each function imports what it needs when it is called, so that reading an event 
 from __future__ import annotations
 
 import os
-import warnings
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.front import arguments as check
-from blinkgl.io import formats
-from blinkgl.io.formats import EventFile
-from blinkgl.io.reading import EventReading
+from blinkgl.front.event_files import EventOptions, checked_size, event_reading
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from blinkgl.front.sections import EmulatorSettings
+    from blinkgl.io.frames import Declared
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import FrameUse, SimulationReport
 
 _SIDE = 65535
-
-
-class EventOptions(TypedDict, total=False):
-    """Declarations about an event file; :func:`blinkgl.open_events` describes them."""
-
-    time_unit: str | None
-    size: tuple[int, int] | None
-    origin: str | None
-    columns: str | Iterable[str] | None
-    polarity: str | Iterable[float] | None
-    stream: int | None
-    damaged: str
-    sort: bool
-
-
-def _reading(declared: EventOptions) -> EventReading:
-    given: dict[str, Any] = dict(declared)
-    if given.get("size") is not None:
-        given["size"] = _size(given["size"])
-    return EventReading.of(**given)
-
-
-@check.public
-def open_events(path: str | os.PathLike, **declared: Unpack[EventOptions]) -> EventFile:
-    """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
-    ``height``, ``width`` in px, None if the file does not contain them (``file.sized()`` computes them), times in µs.
-    Formats and endings: docs/formats.md. For .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
-    ``file.imu()``, its inertial unit. ``file.said`` lists what was guessed, and after reading what was left out.
-
-    time_unit : "s", "ms", "us" or "ns".   size : (height, width), px.   origin : "top" or "bottom", the row of y = 0.
-    columns : order of a table's columns, "x,y,t,p".   polarity : numbers of OFF and ON, (-1, 1).   stream : of several.
-    damaged : "refuse", or "keep" what is whole.   sort : put events in order of time. Default: as the file says; what
-    it does not say is guessed.
-    Raises AssetError: missing file, unknown ending, or content of another format; ConfigError."""
-    return formats.open_events(check.path(path, "path"), _reading(declared))
-
-
-@check.public
-def read_events(path: str | os.PathLike, *, truth: bool = False, **declared: Unpack[EventOptions]) -> Events:
-    """Return all :class:`Events` of a file, t in µs, in memory. A guess, or something left out, is a warning.
-
-    truth : also read their causes (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
-    declared : as of :func:`open_events`. Raises AssetError and EventDataError (decreasing times …)."""
-    with formats.open_events(check.path(path, "path"), _reading(declared)) as file:
-        events = file.read()
-    _warn(file)
-    if not check.one_of(truth, "truth", bool, "True or False"):
-        return events
-    from blinkgl.io.event_labels import with_truth
-
-    return with_truth(events, 0, check.path(path, "path").parent)
-
-
-def _warn(file: EventFile) -> None:
-    for line in file.said:
-        warnings.warn(f"{file.path}: {line}", stacklevel=4)
-
-
-@check.public
-def write_events(
-    path: str | os.PathLike,
-    events: Events | Iterable[Events],
-    height: int,
-    width: int,
-    *,
-    t_offset_us: int = 0,
-    write_unit: str = "s",
-    overwrite: bool = True,
-) -> int:
-    """Write events, or chunks in order, of a sensor of height x width px, and return their number. The file appears
-    complete or not at all.
-
-    path : its ending names the format (docs/formats.md).   t_offset_us : DSEC's, µs.
-    write_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
-    path, height, width = (
-        check.path(path, "path"),
-        check.whole(height, "height", 1, _SIDE),
-        check.whole(width, "width", 1, _SIDE),
-    )
-    offset = check.whole(t_offset_us, "t_offset_us", 0, 2**62)
-    return formats.write_events(
-        path,
-        _chunks(events),
-        height,
-        width,
-        t_offset_us=offset,
-        write_unit=write_unit,
-        overwrite=overwrite,
-    )
-
-
-def _chunks(events: Any) -> Iterator[Events]:
-    if isinstance(events, Events):
-        events = (events,)
-    if not isinstance(events, Iterable):
-        raise ConfigError("not events", where="events", value=events, accepted="Events, or chunks of them")
-
-    def checked() -> Iterator[Events]:
-        for chunk in events:
-            yield check.one_of(chunk, "events", Events, "Events, or chunks of them")
-
-    return checked()
-
-
-@check.public
-def convert(
-    source: str | os.PathLike,
-    target: str | os.PathLike,
-    *,
-    zero_time: bool = False,
-    write_unit: str = "s",
-    overwrite: bool = True,
-    **declared: Unpack[EventOptions],
-) -> int:
-    """Copy events from one file format to another, in pieces. Returns the number of events. A guess, or something left
-    out, is a warning.
-
-    write_unit : as of :func:`write_events`.   zero_time : count times from the first event.   declared : of ``source``,
-    as of :func:`open_events`. Raises AssetError, OutputError, EventDataError, ConfigError."""
-    file, count = formats.convert(
-        check.path(source, "source"),
-        check.path(target, "target"),
-        _reading(declared),
-        zero_time=bool(zero_time),
-        write_unit=write_unit,
-        overwrite=overwrite,
-    )
-    _warn(file)
-    return count
-
-
-def _size(size: Any) -> tuple[int, int]:
-    """Return (height, width), px. Raises ConfigError."""
-    pair = check.one_of(size, "size", (list, tuple), "(height, width)")
-    if len(pair) != 2:
-        raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
-    return check.whole(pair[0], "size", 1, _SIDE), check.whole(pair[1], "size", 1, _SIDE)
 
 
 def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
@@ -207,16 +68,32 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
 
 
 @check.public
-def read_trajectory(path: str | os.PathLike, *, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) int64 ns and poses T_world_body (N, 4, 4) float64 of TUM's text or EuRoC's CSV.
+def read_trajectory(
+    path: str | os.PathLike,
+    *,
+    form: str | None = None,
+    columns: str | None = None,
+    time_unit: str | None = None,
+    maps_from: str | None = None,
+    axes: str | None = None,
+    rate: float | None = None,
+    times: str | os.PathLike | None = None,
+    notes: list[str] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) int64 ns and poses T_world_body (N, 4, 4) float64, with OpenCV's axes, of a table with or
+    without a heading, KITTI's poses, COLMAP's images.txt or NeRF's transforms.json.
 
-    form : "tum" or "euroc"; None: EuRoC if lines contain commas.
-    Raises AssetError with the line: invalid pose, times that do not increase, a gap."""
+    form : "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"; None: by heading and content.
+    columns : names, such as "t x y z qw qx qy qz".   time_unit : "s", "ms", "us", "ns".   maps_from : "camera" or
+    "world".   axes : of the camera, "opencv", "opengl", "ned".   rate : poses per second, or times : a file of times,
+    for a file without them.   notes : gets what was guessed, a line each.
+    Raises AssetError with the line: invalid pose, times that do not increase, a gap; ConfigError."""
     from blinkgl.io import trajectories
 
-    if form not in (None, *trajectories.FORMATS):
-        raise ConfigError("unknown form", where="form", value=form, accepted="tum, euroc or None")
-    return trajectories.read_trajectory(check.path(path, "path"), form)
+    per_second = None if rate is None else check.number(rate, "rate", above=0, most=1e9)
+    given = None if times is None else check.path(times, "times")
+    declared = trajectories.PoseFile(form, columns, time_unit, maps_from, axes, per_second, given)
+    return trajectories.read_trajectory(check.path(path, "path"), declared, notes)
 
 
 @check.public
@@ -234,43 +111,73 @@ def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarra
     trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
 
 
+class DeclaredFrames(TypedDict, total=False):
+    """What a file of frames does not say; :func:`blinkgl.simulate_file` describes them."""
+
+    fps: float | None
+    timestamps: str | os.PathLike | None
+    time_unit: str | None
+    white_level: float | None
+    range: str | None
+    background: str | None
+
+
+class DeclaredBoth(EventOptions, total=False):
+    """What event files do not say (:func:`blinkgl.open_events`), nor frames beside them."""
+
+    fps: float | None
+    timestamps: str | os.PathLike | None
+    frames_time_unit: str | None
+    white_level: float | None
+    range: str | None
+    background: str | None
+
+
 @check.public
 def compare(
     a: str | os.PathLike,
     b: str | os.PathLike | None = None,
     *,
     frames: str | os.PathLike | None = None,
-    fps: float | None = None,
     interval_ms: float = 20.0,
     zero_time: bool = False,
     judge: bool = False,
-    **declared: Unpack[EventOptions],
+    gamma: str | float | None = None,
+    frame_delay_ms: float = 0.0,
+    **declared: Unpack[DeclaredBoth],
 ) -> Comparison:
     """Compare two event files over their common time: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: only ``a`` is described.
-    frames : video or folder of images that both are compared with.   fps : of the frames, Hz.
-    interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
+    frames : video or folder of images that both are compared with.   gamma : of their codes; None: what the file
+    states, linear for grey images, srgb for video and colour.   frame_delay_ms : added to their times, ms.   declared :
+    what the file does not say of them, as of :func:`simulate_file` (``frames_time_unit`` is its ``time_unit``).
+    interval_ms : ms, of rates and correlations.   zero_time : count both from their first event, and frames from the
+    first.
     judge : also compute how well a classifier separates b from a, and the halves of each: ``told_apart``, ``halves``.
-    declared : of both files, as of :func:`open_events`. Raises AssetError, EventDataError, ConfigError."""
+    time_unit, size … : of both event files, as of :func:`open_events`.
+    Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
 
     return comparison.compare(
         check.path(a, "a"),
         None if b is None else check.path(b, "b"),
         frames=None if frames is None else check.path(frames, "frames"),
-        fps=_fps(fps),
+        declared=_declared(declared, "frames_time_unit"),
+        gamma=gamma,
+        frame_delay_ms=check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6),
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
         judge=bool(judge),
-        reading=_reading(declared),
+        reading=event_reading(declared),
     )
 
 
-class ReadingOptions(EventOptions, total=False):
+class ReadingOptions(DeclaredBoth, total=False):
     """Options of frames beside a recording; :func:`blinkgl.calibrate` describes them."""
 
-    gamma: str | float
+    zero_time: bool
+    gamma: str | float | None
     interpolate: str
     max_px: float
     frame_delay_ms: float | None
@@ -284,8 +191,6 @@ def calibrate(
     emulator: EmulatorSettings = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
-    fps: float | None = None,
-    timestamps: str | os.PathLike | None = None,
     starts: int = 3,
     seed: int = 0,
     **reading: Unpack[ReadingOptions],
@@ -296,14 +201,16 @@ def calibrate(
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping of initial values.   fixed : keys that keep their initial values.   still : a static scene in
-    constant light, without frames: only noise is fitted.   fps : of the frames, Hz.   timestamps : file of the frames'
-    times.   gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between them, "motion" or
-    "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None: estimated.
-    starts : of the search.   time_unit, size … : of the recording, as of :func:`open_events`.   Raises AssetError,
-    EventDataError, ConfigError."""
+    constant light, without frames: only noise is fitted.   fps, timestamps, frames_time_unit, white_level, range,
+    background : of the frames, as of :func:`simulate_file`.   zero_time : count events from the first, and frames from
+    the first.   gamma : of their codes; None: what the file states, linear for grey images, srgb for video and colour.
+    interpolate : between them, "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their
+    times, ms; None: estimated.   starts : of the search.   time_unit, size … : of the recording, as of
+    :func:`open_events`.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
+    from blinkgl.recordings.decoding import Codes
 
     listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
     given = tuple(fixed) if listed else (None,)
@@ -312,7 +219,7 @@ def calibrate(
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
     delay = reading.get("frame_delay_ms")
     understood = FrameReading(
-        reading.get("gamma", FrameReading.gamma),
+        Codes(reading.get("gamma")),
         reading.get("interpolate", FrameReading.interpolate),
         check.number(reading.get("max_px", FrameReading.max_px), "max_px", above=0, most=1000),
         None if delay is None else check.number(delay, "frame_delay_ms", least=-1e6, most=1e6),
@@ -324,11 +231,10 @@ def calibrate(
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
-        fps=_fps(fps),
-        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        declared=_declared(reading, "frames_time_unit"),
         starts=check.whole(starts, "starts", 1, 20),
         seed=check.seed(seed),
-        events=_reading(cast(EventOptions, {k: v for k, v in reading.items() if k in EventOptions.__annotations__})),
+        events=event_reading(reading),
     )
 
 
@@ -336,6 +242,9 @@ class FrameOptions(TypedDict, total=False):
     """Options of frames that are converted to events; :func:`blinkgl.simulate` describes them."""
 
     fps: float | None
+    zero_time: bool
+    white_level: float | None
+    range: str | None
     emulator: EmulatorSettings
     gamma: str | float | None
     interpolate: str
@@ -347,21 +256,23 @@ class FrameOptions(TypedDict, total=False):
 
 @check.public
 def simulate(
-    frames: Iterable, *, report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
+    frames: Iterable, *, unit: str = "ns", report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
-    """Yield the :class:`Events` of any stream of frames, a chunk per step, t in µs; only the current frames are stored.
+    """Yield the :class:`Events` of any stream of frames, t in µs: one chunk per frame, an empty one too, as soon as
+    that frame has come. Nothing of an array is used after the next is asked for, so that one buffer may serve all.
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
-    t_ns). uint8, uint16, or float (1.0 is white).
+    time). uint8, uint16, or float.   unit : of the times: "ns", whole numbers, or "s", "ms", "us", floats too.
+    zero_time : count times from the first frame.   white_level : code of white (default: the type's largest, 1.0 of
+    floats).   range : "limited" for codes from 16 to 235 of 8 bits.
     emulator : as of :func:`record`, default "esim".   seed : of its noise, default 0.
     sensor : camera whose read-out limit is used and, with an emulator's name, its values; frames keep their size.
-    gamma : "srgb", "linear" or an exponent; default: linear for floats, srgb for integers, except grey ones of the size
-    of ``sensor``, which count as its own (``report.assumed_gamma``).   keep_noise : also make events from the noise of
-    integer frames, which otherwise causes none (``report.noise``).
-    interpolate : "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, necessary for frames
-    between which motion exceeds 2 px (``report.guessed_over_px``).
-    report : a SimulationReport to be filled.
-    Raises ConfigError at once; EventDataError during iteration, naming the frame."""
+    gamma : "srgb", "linear", "pq", "hlg" or an exponent; default: linear for floats, srgb for integers, except grey
+    ones of the size of ``sensor``, which count as its own (``report.assumed_gamma``, ``report.notes``).   keep_noise :
+    also make events from the noise of integer frames, which otherwise causes none (``report.noise``). interpolate :
+    "linear", the default; "motion": dense flow, at most ``max_px`` (1) px a step, necessary for frames between which
+    motion exceeds 2 px (``report.guessed_over_px``). report : a SimulationReport to be filled. Raises ConfigError at
+    once; EventDataError during iteration, naming the frame."""
     from blinkgl.recordings import simulation
 
     if not isinstance(frames, Iterable) or isinstance(frames, (str, os.PathLike)):
@@ -369,7 +280,9 @@ def simulate(
             "not frames", where="frames", value=frames, accepted="an iterable of arrays; of a file, simulate_file"
         )
     use, options = _options(**frame_options)
-    return simulation.frames_to_events(_frames(frames), report=report, **vars(use), **options)
+    if unit not in ("ns", "us", "ms", "s"):
+        raise ConfigError("unknown unit of time", where="unit", value=unit, accepted="s, ms, us or ns")
+    return simulation.frames_to_events(_frames(frames), use, unit=unit, report=report, **options)
 
 
 @check.public
@@ -378,26 +291,33 @@ def simulate_file(
     target: str | os.PathLike,
     *,
     timestamps: str | os.PathLike | None = None,
+    time_unit: str | None = None,
+    background: str | None = None,
     size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
     **frames: Unpack[FrameOptions],
 ) -> SimulationReport:
-    """Convert a video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
+    """Convert a video, a folder of images, a stack or .npy frames (N, H, W[, 3]) to an event file, as
     ``blinkgl simulate``; files appear complete or not at all.
 
-    timestamps : file of times, one a frame.   size : (height, width), px, to which frames are cropped and scaled; None:
+    timestamps : file of times, one a frame.   time_unit : of these, "s", "ms", "us", "ns" or "frames" of fps; None: as
+    the file says, else guessed from all.   background : below transparent pixels, "black", "grey", "white" or
+    "#rrggbb".   size : (height, width), px, to which frames are cropped and scaled; None:
     that of ``sensor``, or else the frames' own.   preview : a video of frames and events to write.
-    frames : fps, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of :func:`simulate`. Returns a
-    report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
+    frames : fps, zero_time, white_level, range, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of
+    :func:`simulate`. Returns a report: frames, steps, events, lost, notes on what was guessed … Raises AssetError,
+    OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
     use, options = _options(**frames)
+    given: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
+    options = {key: options[key] for key in ("emulator", "seed", "readout")}
     return simulation.file_to_events(
         check.path(source, "source"),
         check.path(target, "target"),
-        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
-        size=_sensor_size(frames.get("sensor")) if size is None else _size(size),
+        declared=_declared(given),
+        size=_sensor_size(frames.get("sensor")) if size is None else checked_size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
         use=use,
@@ -408,6 +328,9 @@ def simulate_file(
 def _options(
     *,
     fps: float | None = None,
+    zero_time: bool = False,
+    white_level: float | None = None,
+    range: str | None = None,
     emulator: EmulatorSettings = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
@@ -420,28 +343,42 @@ def _options(
     from blinkgl.config.sensor import load_sensor
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import simulation
+    from blinkgl.recordings.decoding import Codes
 
     tree = events_tree(emulator)
     camera = None if sensor is None else load_sensor(sensor)
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
+    declared = _declared({"white_level": white_level, "range": range, "fps": fps})
     use = simulation.FrameUse(
-        gamma,
+        Codes(gamma, declared.white_level, declared.range, simulation.own_frames(camera)),
         interpolate,
         check.number(max_px, "max_px", above=0, most=1e4),
         bool(keep_noise),
-        simulation.own_frames(camera),
     )
     return use, dict(
-        fps=_fps(fps),
+        fps=declared.fps,
+        zero_time=bool(zero_time),
         emulator=simulation.emulator_config(tree),
         seed=check.seed(seed),
         readout=None if camera is None else camera.readout,
     )
 
 
-def _fps(fps: float | None) -> float | None:
-    return None if fps is None else check.number(fps, "fps", above=0, most=1e9)
+def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:
+    """Return what is declared of frames; ``unit`` is the key of the unit of their times. Raises ConfigError."""
+    from blinkgl.io.frames import Declared
+
+    fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
+    return Declared(
+        None if fps is None else check.number(fps, "fps", above=0, most=1e9),
+        None if stamps is None else check.path(stamps, "timestamps"),
+        given.get(unit),
+        bool(given.get("zero_time", False)),
+        None if white is None else check.number(white, "white_level", above=0, most=1e9),
+        given.get("range"),
+        given.get("background"),
+    )
 
 
 def _frames(frames: Iterable) -> Iterator:
@@ -450,10 +387,10 @@ def _frames(frames: Iterable) -> Iterator:
         try:
             array, *rest = item if isinstance(item, tuple) else (item,)
             array = np.asarray(array)
-            if not 0 <= len(rest) <= 2 or (rest and int(rest[0]) != rest[0]):
+            if not 0 <= len(rest) <= 2 or (rest and not isinstance(rest[0], (int, float, np.integer, np.floating))):
                 raise ValueError
         except (TypeError, ValueError, OverflowError):
             raise EventDataError(
-                "not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, whole ns)"
+                "not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, time)"
             ) from None
         yield (array, *rest) if rest else array

@@ -152,9 +152,10 @@ class Keyframes(Piece):
 
 
 class Trajectory(Piece):
-    """A motion from a file, TUM's or EuRoC's, by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
+    """A motion from a file by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
 
-    file : path.   form : "tum", "euroc"; "auto": EuRoC if lines contain commas.   start : time on the file's clock, s,
+    file : path.   form, columns, time_unit, maps_from, axes, rate : what the file does not say, as of
+    :func:`blinkgl.read_trajectory`.   start : time on the file's clock, s,
     of 0 s on the scene's; None: the sequence begins at the first pose.   smooth : s, each pose becomes the mean of
     those within it.   speed_limit : units/s, turn_limit : degrees/s, beyond which poses are refused.
     T_body_sensor : pose of the camera or body of this motion on the body of the file's poses: (4, 4), or the path of
@@ -165,7 +166,12 @@ class Trajectory(Piece):
         self,
         file: str | os.PathLike,
         *,
-        form: Literal["auto", "tum", "euroc"] = "auto",
+        form: Literal["auto", "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"] = "auto",
+        columns: str | None = None,
+        time_unit: Literal["s", "ms", "us", "ns"] | None = None,
+        maps_from: Literal["camera", "world"] | None = None,
+        axes: Literal["opencv", "opengl", "ned"] | None = None,
+        rate: float | None = None,
         start: float | None = None,
         smooth: float = 0.0,
         speed_limit: float = 100.0,
@@ -174,6 +180,7 @@ class Trajectory(Piece):
     ):
         there = check.path(file, "Trajectory.file").expanduser().absolute()
         tree = check.given(file=there, form=form, start=start, smooth=smooth)
+        tree |= check.given(columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=rate)
         tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
         if isinstance(T_body_sensor, (str, os.PathLike)):
             tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "Trajectory.T_body_sensor").absolute())

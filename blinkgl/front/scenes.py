@@ -225,7 +225,7 @@ class Primitive(_Object):
 class Mesh(_Object):
     """A body from a file, ``Mesh("chair.glb")``, or from triangles, ``Mesh(vertices=v, faces=f)``.
 
-    file : obj, ply, stl, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
+    file : obj, ply, stl, off, 3mf, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
     vertices : (V, 3) m, body axes.   faces : (F, 3) indices, counter-clockwise seen from outside.
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
@@ -303,7 +303,8 @@ class Scene(Piece):
     duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label
     interval after ``start``, so that a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
     collisions : stop bodies where they collide.   gravity : (3,) m/s², without effect if no object is a dynamic
-    :class:`Body`.   seed : of the sensor's noise.
+    :class:`Body`.   seed : of the sensor's noise.   both_sides : whether faces of files are drawn from behind, too;
+    None: as each file says.
     Raises ConfigError."""
 
     def __init__(
@@ -320,6 +321,7 @@ class Scene(Piece):
         collisions: bool = False,
         gravity: Vector = (0.0, 0.0, -9.81),
         seed: int = 0,
+        both_sides: bool | None = None,
     ):
         self.camera = Camera() if camera is None else check.one_of(camera, "Scene.camera", Camera, "a Camera")
         self.light = Light() if light is None else check.one_of(light, "Scene.light", Light, "a Light")
@@ -330,6 +332,7 @@ class Scene(Piece):
         if self.fog is not None and len(self.fog) != 2:
             raise ConfigError("not two numbers", where="Scene.fog", value=fog, accepted="(density, radiance)")
         self._plain = {"background": check.plain(background), "collisions": check.plain(collisions)}
+        self._plain["both_sides"] = check.plain(both_sides)
         self._gravity = self._checked(PhysicsConfig, {"gravity": check.plain(gravity)})
         self._run = {
             "seed": check.plain(seed),

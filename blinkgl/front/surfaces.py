@@ -66,7 +66,8 @@ class Material(Piece):
     color : (3,) linear factor.   procedural, seed : kind and number of a computed texture, such as "bricks".
     photograph : one of scikit-image's, such as "astronaut".   uv_scale : (2,) repeats.
     max_size : px, files with longer sides are reduced.
-    unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
+    unlit : radiance = albedo, whatever the light.   both_sides : draw faces from behind,
+    too; None: as the mesh's file says.
     metallic, roughness : 0 to 1; 0 and 1 are matt; times ``metallic_roughness_map``, its blue and its green.
     emission : (3,) linear emitted radiance; times ``emission_map``, sRGB.
     normal_map : x to the right in the picture, y up, z outwards, 0 to 255 for -1 to 1; ``normal_scale`` times its x, y.

@@ -27,7 +27,7 @@ _ABSENT = {"events": "no events", "frame": "no frames", "imus": "no samples of a
 class Aedat4Reader:
     """The streams of a recording; times are the file's own int64 µs (usually since 1970).
 
-    height, width : px of the events' sensor.   said : a line where there are several streams of events. Raises
+    height, width : px of the events' sensor.   notes : a line where there are several streams of events. Raises
     AssetError: not AEDAT4, damaged, the requested stream is missing."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
@@ -41,9 +41,9 @@ class Aedat4Reader:
             raise AssetError(
                 "no such stream of events", where=str(path), value=self._number, accepted=f"--stream {shown}"
             )
-        self.said = []
+        self.notes = []
         if len(found) > 1:
-            self.said.append(f"{len(found)} streams of events: {shown}; {self._number} is read (--stream for another)")
+            self.notes.append(f"{len(found)} streams of events: {shown}; {self._number} is read (--stream for another)")
         events = self._streams[self._number]
         self.height, self.width = events["height"], events["width"]
 

@@ -88,17 +88,23 @@ def guessed_frame_unit(values: np.ndarray, where: str) -> TimeUnit:
     steps = np.diff(values)
     if not len(steps):
         return TimeUnit("s" if (values % 1).any() else "us", "guessed", (float(values[0]), float(values[-1])))
-    positive = steps[steps > 0]
-    least = float(np.quantile(positive, 0.25)) if len(positive) else 1.0
-    for k in np.flatnonzero(np.abs(steps) > _LEAP * least)[:1]:
-        small, large = sorted(abs(values[k : k + 2]))
-        if large > _LEAP * small:
+    size = np.abs(values)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        leaps = np.flatnonzero(np.maximum(size[1:], size[:-1]) > _LEAP * np.minimum(size[1:], size[:-1]))
+    for k in leaps[leaps > 0]:
+        # A pause leaps, too, but the steps after it are as long as those before.
+        before, after = (
+            np.median(np.abs(steps[:k])),
+            np.median(np.abs(steps[k + 1 :])) if k + 1 < len(steps) else np.inf,
+        )
+        if max(before, after) > _LEAP * min(before, after):
             raise EventDataError(
                 "times in two units",
                 where=f"{where}: frames {k} and {k + 1}",
                 value=values[k : k + 2].tolist(),
                 accepted="one unit for all, or --time-unit s, ms, us or ns where the leap is meant",
             )
+    positive = steps[steps > 0]
     usual = float(np.median(positive)) if len(positive) else 1.0
     likely = {
         unit: abs(np.log10(1e9 / (usual * ns * _TYPICAL_HZ)))

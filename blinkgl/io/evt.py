@@ -74,13 +74,13 @@ class EvtReader:
     """Header and events of an EVT2/EVT2.1/EVT3 file. ``height`` and ``width`` are None when the header does not give
     them.
 
-    Events before the first TIME_HIGH have no time: they are left out, and ``said`` counts them. Triggers and vendors'
+    Events before the first TIME_HIGH have no time: they are left out, and ``notes`` counts them. Triggers and vendors'
     words are skipped. With ``damaged="keep"`` words that the format does not have are skipped, too, and counted.
     Raises AssetError: no ``% evt`` header, another version, an impossible size, stray bytes at the end (truncated), a
     word that the format does not have (with its byte), events but no TIME_HIGH."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        self.path, self._keep, self.said = Path(path), reading.keep, []
+        self.path, self._keep, self.notes = Path(path), reading.keep, []
         self._mend = reading.keep or reading.sort
         header, self._start = _read_header(self.path)
         # Either line of the header names the version.
@@ -126,7 +126,7 @@ class EvtReader:
             said.append(f"4096 µs counted for each of {state[-2]:,} TIME_HIGH words that are missing")
         if state[-1]:
             said.append(f"left out: events before the first TIME_HIGH, which have no time: {state[-1]:,}")
-        self.said = [line for line in said if line]
+        self.notes = [line for line in said if line]
         if stray:
             raise AssetError(
                 f"truncated: {stray} stray bytes after the last {self.version.upper()} word", where=str(self.path)

@@ -11,15 +11,15 @@ import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.images import encode_npy, encode_png, read_npy, read_png
+from blinkgl.io.images import encode_npy, encode_png, read_npy, read_pfm, read_png
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Flow as 16-bit PNG: DSEC's (quantum 1/128 px, ±256 px) and KITTI's (1/64 px, ±512 px).
 #
-# On disk the channels are R = x, G = y, B = valid. OpenCV is the codec because imageio's default and Pillow silently
-# return 8 bits for 16-bit RGB; it speaks BGR, so the order is turned here and nowhere else.
+# On disk the channels are R = x, G = y, B = valid. OpenCV is the codec, since Pillow silently returns
+# 8 bits for 16-bit RGB; OpenCV's order is BGR, so the order is turned here and nowhere else.
 
-DSEC_SCALE = 128.0
+DSEC_SCALE, KITTI_SCALE = 128.0, 64.0
 _ZERO = 1 << 15
 
 
@@ -59,9 +59,7 @@ def read_flow_png(path: str | os.PathLike, *, scale: float = DSEC_SCALE) -> tupl
     """Return flow (H, W, 2) float32 px (0 where invalid), valid (H, W) bool.
 
     Raises AssetError when the file is not a 16-bit RGB PNG."""
-    raw = read_png(path)
-    if raw.dtype != np.uint16 or raw.ndim != 3 or raw.shape[2] != 3:
-        raise AssetError("not a flow PNG", where=str(path), value=f"{raw.dtype} {raw.shape}", accepted="16-bit RGB")
+    raw = _sixteen_bits(Path(path))
     valid = raw[..., 0] > 0
     flow = (raw[..., 2:0:-1].astype(np.float32) - np.float32(_ZERO)) / np.float32(scale)
     return np.where(valid[..., None], flow, np.float32(0)), valid
@@ -114,23 +112,88 @@ def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     return np.where(valid[..., None], flow, np.float32(0)), valid
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Other data sets' flow: KITTI's and TartanAir v2's PNGs with 1/64 px, Virtual KITTI 2's in shares of the image's size,
+# FlyingThings3D's PFM, Spring's HDF5 of twice the images' size.
+
 ENDINGS = (".png", ".flo", ".npy")
+"""Endings of the files that are written."""
+FORMS = ("dsec", "kitti", "vkitti2", "tartanair2", "flo", "pfm", "flo5", "npy")
+READ_ENDINGS = (".png", ".flo", ".npy", ".pfm", ".flo5")
 
 
-def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+def flow_form(path: str | os.PathLike) -> tuple[str, str | None]:
+    """Return the form of a flow file, one of ``FORMS``, and the line that says a guess, or None: 16-bit PNGs do not say
+    whose they are. Raises AssetError: unreadable."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix != ".png":
+        return suffix[1:], None
+    raw = _sixteen_bits(path)
+    third, first = raw[..., 0], raw[..., 2]  # on disk blue and red
+    if first.max() <= 255 and (third.max() > 255 or raw[..., 1].max() > 255):
+        form = "tartanair2"  # its mask comes first
+    elif set(np.unique(third[::8, ::8]).tolist()) <= {0, 65535} and third.max() == 65535:
+        form = "vkitti2"
+    else:
+        form = "kitti" if any(part in ("flow_occ", "flow_noc") for part in path.parts) else "dsec"
+    return form, f"{path.name}: 16-bit flow taken as {form}'s (flow_format: {', '.join(FORMS[:4])})"
+
+
+def _sixteen_bits(path: Path) -> np.ndarray:
+    raw = read_png(path)
+    if raw.dtype != np.uint16 or raw.ndim != 3 or raw.shape[2] != 3:
+        raise AssetError("not a flow PNG", where=str(path), value=f"{raw.dtype} {raw.shape}", accepted="16-bit RGB")
+    return raw
+
+
+def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool.
 
-    Raises AssetError: missing, damaged, or not flow."""
+    form : one of ``FORMS``; None: by the ending, DSEC's for .png.   Raises AssetError: missing, damaged, not flow."""
     path = Path(path)
-    if path.suffix == ".flo":
+    if path.suffix.lower() not in READ_ENDINGS:
+        accepted = ", ".join(READ_ENDINGS)
+        raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=accepted)
+    form = form or {".png": "dsec"}.get(path.suffix.lower(), path.suffix.lower()[1:])
+    if form == "flo":
         return read_flo(path)
-    if path.suffix == ".png":
-        return read_flow_png(path)
-    if path.suffix != ".npy":
-        raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
-    flow, stated = read_flow_npy(path)
-    valid = stated & np.isfinite(flow).all(-1)
+    if form in ("dsec", "kitti"):
+        return read_flow_png(path, scale=DSEC_SCALE if form == "dsec" else KITTI_SCALE)
+    if form == "tartanair2":
+        # u is the third channel, and 0 in the first means that the point is seen in both images.
+        raw = _sixteen_bits(path)
+        return (raw[..., :2].astype(np.float32) - np.float32(_ZERO)) / np.float32(KITTI_SCALE), raw[..., 2] == 0
+    if form == "vkitti2":
+        # Shares of the width and height less one, from -1 to 1.
+        raw = _sixteen_bits(path)
+        size = np.array([raw.shape[1] - 1, raw.shape[0] - 1], np.float32)
+        flow, valid = (raw[..., 2:0:-1].astype(np.float32) * np.float32(2 / 65535) - 1) * size, raw[..., 0] > 0
+    elif form == "pfm":
+        data = read_pfm(path)
+        if data.ndim != 3:
+            raise AssetError("not a flow field", where=str(path), value=data.shape, accepted="PFM of three channels")
+        flow = data[..., :2]
+        valid = np.isfinite(flow).all(-1)
+    elif form == "flo5":
+        flow = read_flo5(path)
+        valid = np.isfinite(flow).all(-1)
+    else:
+        flow, stated = read_flow_npy(path)
+        valid = stated & np.isfinite(flow).all(-1)
     return np.where(valid[..., None], flow, np.float32(0)), valid
+
+
+def read_flo5(path: str | os.PathLike) -> np.ndarray:
+    """Return flow (H, W, 2) float32 of Spring's .flo5, every second row and column: it is of twice the images' size, in
+    their px. Raises AssetError."""
+    from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
+
+    with open_hdf5(path) as file, hdf5_errors(path):
+        data = file["flow"]
+        if data.ndim != 3 or data.shape[2] != 2:
+            raise AssetError("not a flow field", where=str(path), value=data.shape, accepted="(2 H, 2 W, 2)")
+        return np.ascontiguousarray(data[::2, ::2], np.float32)
 
 
 def read_flow_npy(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:

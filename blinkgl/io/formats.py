@@ -135,11 +135,11 @@ class EventFile:
         return not hasattr(self._reader, "unit")
 
     @property
-    def said(self) -> list[str]:
+    def notes(self) -> list[str]:
         """Return a line for each thing that was guessed, with the option that overrules it, and, after reading, for
         each that was left out or moved."""
         unit = getattr(self._reader, "unit", None)
-        lines = [*getattr(self._reader, "said", ()), unit.line if unit else None]
+        lines = [*getattr(self._reader, "notes", ()), unit.line if unit else None]
         if self.guessed_size:
             known = (self.height, self.width) in SENSORS
             why = "the smallest sensor that holds all events" if known else "as far as events go, beyond known sensors"
@@ -154,7 +154,7 @@ class EventFile:
 
         Raises, naming event and value, EventDataError: decreasing times, an event outside height and width where those
         are known, or that :class:`~blinkgl.types.events.Events` cannot hold; AssetError when the file is damaged. With
-        ``damaged="keep"`` what is whole is yielded, and :attr:`said` tells what is not."""
+        ``damaged="keep"`` what is whole is yielded, and :attr:`notes` tells what is not."""
         last, count = None, 0
         flipped = (self.reading.origin or getattr(self._reader, "origin", "top")) == "bottom"
         if flipped and self.height is None:

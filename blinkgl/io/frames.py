@@ -1,189 +1,308 @@
-"""Frame sequences as input: a video, a folder of images, or an array file; one frame in memory at a time (.npz:
-all)."""
+"""Frame sequences as input: a video, a folder of images, a stack or animation, or an array file; one frame in memory at
+a time (.npz: all)."""
 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_image
+from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.alpha import background_of
+from blinkgl.io.clock import NANOSECONDS, checked_unit
+from blinkgl.io.images import NpzReader, check_npy, numpy_errors
+from blinkgl.io.names import Series, series
+from blinkgl.io.stamps import Stamps, read_timestamps, stamps_of_array
+from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills
 
-VIDEO = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif", ".mpg", ".mpeg", ".ts", ".wmv"}
-IMAGE = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".exr", ".hdr", ".pfm"}
+VIDEO = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".wmv", ".3gp", ".flv", ".mxf"}
+STACK = {".tif", ".tiff", ".gif", ".webp", ".apng"}
 RECORDING = {".aedat", ".aedat4"}
-_STAMP_FILES = ("timestamps.txt", "images.txt", "timestamps.csv")
+RANGES = ("full", "limited")
+_STAMP_FILES = ("timestamps.txt", "images.txt", "timestamps.csv", "data.csv")
+_LOOKED_AT = 16
+"""Frames, spread over the clip, whose largest code tells 8, 10, 12 or 14 bits in 16."""
+_ENDINGS = tuple(f"_{unit}" for unit in NANOSECONDS)
+_BITS = (8, 10, 12, 14)
+
+Frames = Iterator[tuple[np.ndarray, int | None, str]]
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a user declares of a clip of frames; None: what the file says, else a guess that is said.
+
+    fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.stamps`).
+    time_unit : of these, "s", "ms", "us", "ns", or "frames" of ``fps``.   zero_time : count times from the first frame.
+    white_level : code of white.   range : "full" or "limited" (16 to 235 of 8 bits).   background : colour below
+    transparent pixels, "black", "grey", "white" or "#rrggbb".
+
+    Raises ConfigError: values that are none of these, fps beside timestamps."""
+
+    fps: float | None = None
+    timestamps: str | os.PathLike | None = None
+    time_unit: str | None = None
+    zero_time: bool = False
+    white_level: float | None = None
+    range: str | None = None
+    background: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
+            raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
+        if self.time_unit != "frames":
+            checked_unit(self.time_unit)
+            if self.fps is not None and self.timestamps is not None:
+                raise ConfigError(
+                    "a frame rate and a list of times contradict each other",
+                    where="--fps, --timestamps",
+                    value=f"{self.fps:g}, {self.timestamps}",
+                    accepted="one of them, or --time-unit frames",
+                )
+        if self.range not in (None, *RANGES):
+            raise ConfigError("unknown range", where="--range", value=self.range, accepted="full or limited")
+        if self.white_level is not None and not (np.isfinite(self.white_level) and self.white_level > 0):
+            raise ConfigError(
+                "not a white level", where="--white-level", value=self.white_level, accepted="a positive number"
+            )
+        background_of(self.background)
+
+
+NOTHING = Declared()
 
 
 @dataclass(frozen=True)
 class FrameSource:
     """Frames with their times.
 
-    height, width : px. count : number of frames, None when unknown before the end. linear : whether codes
-    are known to be proportional to light (a camera's own frames beside its events). Iterating yields (frame, t_ns,
-    name): frame (H, W) or (H, W, 3) RGB
-    of uint8, uint16 or float32; t_ns int, strictly increasing; name for messages.
+    height, width : px. count : number of frames, None when unknown before the end. Iterating yields (frame, t_ns,
+    name): frame (H, W) or (H, W, 3) RGB of uint8, uint16 or float32; t_ns int, strictly increasing; name for messages.
+
+    own_times : whether the file itself has times. fps, times_ns : what is used in their place, or None. origin :
+    "camera" (a camera's own frames beside its events, proportional to light), "video" or "images". transfer : curve
+    that the file states: "linear", "pq", "hlg", an exponent; None: it states none. levels : codes of black and white
+    that the file states or that were guessed, None: the ends of the type. notes : what was read that is unusual,
+    guessed or left out, a line each; more may be added while iterating.
 
     Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do
-    not increase, a single frame.
+    not increase, more or fewer times than frames, a single frame.
     """
 
     path: Path
     height: int
     width: int
     count: int | None
-    fps: float | None
-    _frames: Callable[[], Iterator[tuple[np.ndarray, int | None, str]]] = field(repr=False)
-    linear: bool = False
+    _frames: Callable[[], Frames] = field(repr=False)
+    own_times: bool = False
+    origin: str = "images"
+    transfer: str | float | None = None
+    levels: tuple[float, float] | None = None
+    notes: list[str] = field(default_factory=list)
+    fps: float | None = None
+    times_ns: list[int] | None = None
+    zero_time: bool = False
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int, str]]:
-        last = None
-        index = -1
-        for index, (frame, t_ns, name) in enumerate(self._frames()):
+        last = first = None
+        count = 0
+        for frame, own, name in self._frames():
             if frame.shape[:2] != (self.height, self.width):
                 raise EventDataError(
                     "frame size changed",
-                    where=f"{self.path}: frame {index} ({name})",
+                    where=f"{self.path}: frame {count} ({name})",
                     value=frame.shape[:2],
                     accepted=f"{(self.height, self.width)} as frame 0",
                 )
-            if t_ns is None:
-                t_ns = round(index * 1e9 / self.fps)
+            t_ns = self._time(count, own)
             if last is not None and t_ns <= last:
                 raise EventDataError(
                     "time stamps must increase",
-                    where=f"{self.path}: frame {index} ({name})",
+                    where=f"{self.path}: frame {count} ({name})",
                     value=f"{t_ns / 1e9:.9g} s",
-                    accepted=f"more than {last / 1e9:.9g} s",
+                    accepted=f"more than {last / 1e9:.9g} s, or --fps instead of the stamps",
                 )
             last = t_ns
-            yield frame, t_ns, name
-        if index < 1:
-            raise EventDataError("events need at least two frames", where=str(self.path), value=f"{index + 1} frame(s)")
+            first = t_ns if first is None else first
+            yield frame, t_ns - first if self.zero_time else t_ns, name
+            count += 1
+        if count < 2:
+            raise EventDataError("events need at least two frames", where=str(self.path), value=f"{count} frame(s)")
+        self.check_count(count)
+
+    def _time(self, number: int, own: int | None) -> int:
+        if self.times_ns is not None:
+            self.check_count(max(number + 1, len(self.times_ns)))
+            return self.times_ns[number]
+        if self.fps is not None:
+            return round(number * 1e9 / self.fps)
+        assert own is not None
+        return own
+
+    def check_count(self, count: int | None) -> None:
+        """Raise EventDataError where ``count`` frames, if known, have another number of times."""
+        if self.times_ns is not None and count is not None and count != len(self.times_ns):
+            raise EventDataError(
+                "one time stamp per frame",
+                where=str(self.path),
+                value=f"{len(self.times_ns)} stamps, {count} frames",
+                accepted="as many, or --fps",
+            )
+
+    def timed(self, declared: Declared, stamps: Stamps | None = None) -> FrameSource:
+        """Return the frames at the times that are declared, else at those of a list that lies beside them, else at
+        their own. Raises EventDataError: none of these, or another number of them."""
+        if declared.timestamps is not None:
+            stamps = read_timestamps(Path(declared.timestamps), declared.time_unit, declared.fps)
+        if stamps is None and declared.fps is None and not self.own_times:
+            raise EventDataError("frames without times", where=str(self.path), accepted="--fps or --timestamps")
+        if stamps is not None and stamps.note:
+            self.notes.append(stamps.note)
+        times = None if stamps is None else stamps.times_ns
+        source = replace(self, fps=declared.fps, times_ns=times or self.times_ns, zero_time=declared.zero_time)
+        source.check_count(self.count)
+        if self.count == 1:
+            raise EventDataError("events need at least two frames", where=str(self.path), value="1 frame")
+        return source
 
 
-def open_frames(
-    path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
-) -> FrameSource:
-    """Open a video (by ending), a folder of images, .npy/.npz with frames (N, H, W) or (N, H, W, 3), or the frames that
-    a camera recorded beside its events (.aedat, .aedat4), at the middle of their exposures.
+def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameSource:
+    """Open a video (by ending), a folder of images, a TIFF stack, an animated GIF, PNG or WebP, .npy/.npz with frames
+    (N, H, W) or (N, H, W, 3), or the frames that a camera recorded beside its events (.aedat, .aedat4), at the middle
+    of their exposures.
 
-    fps : frame rate; overrides the video's own and any time stamps. timestamps : file with one time per frame, or "time
-    name" lines as the Event Camera Dataset's images.txt (integers are µs, numbers with a point seconds). A folder's own
-    timestamps.txt, or an images.txt in it or its parent, is used automatically.
+    A folder's own timestamps.txt, images.txt or data.csv, or one of these or FOLDER.txt beside it, is used
+    automatically.
 
-    Raises AssetError or EventDataError, one line naming file, frame and value.
+    Raises AssetError or EventDataError, one line naming file, frame and value; ConfigError for what cannot be declared.
     """
     path = Path(path)
-    if fps is not None and not (np.isfinite(fps) and fps > 0):
-        raise EventDataError("frame rate", where="--fps", value=fps, accepted="a positive number")
     if not path.exists():
         raise AssetError("no such file or folder", where=str(path))
+    suffix = path.suffix.lower()
     if path.is_dir():
-        source = _folder(path, fps, timestamps)
-    elif path.suffix.lower() in VIDEO:
-        source = _video(path, fps, timestamps)
-    elif path.suffix.lower() in (".npy", ".npz"):
-        source = _array(path, fps, timestamps)
-    elif path.suffix.lower() in RECORDING:
-        source = _recording(path, fps, timestamps)
-    else:
-        raise AssetError(
-            "unknown input",
-            where=str(path),
-            value=path.suffix,
-            accepted="a video (" + " ".join(sorted(VIDEO)) + "), a folder of images, .npy, .npz, .aedat or .aedat4",
-        )
-    if source.count == 1:
-        raise EventDataError("events need at least two frames", where=str(path), value="1 frame")
-    return source
-
-
-def read_any_image(path: Path) -> np.ndarray:
-    """Return (H, W) or (H, W, 3) RGB; uint8, uint16 or float32 as in the file. Raises AssetError when undecodable."""
-    if path.suffix.lower() == ".pfm":
-        from blinkgl.io.images import read_pfm
-
-        return read_pfm(path)
-    if path.suffix.lower() == ".exr":
-        from blinkgl.io.video import read_exr
-
-        return read_exr(path)
-    image = read_image(path)
-    if image.dtype not in (np.uint8, np.uint16, np.float32):
-        raise AssetError(
-            "unsupported pixel type", where=str(path), value=str(image.dtype), accepted="8-bit, 16-bit or float32"
-        )
-    return image
-
-
-def _folder(folder: Path, fps: float | None, timestamps) -> FrameSource:
-    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE and p.is_file()), key=_natural)
-    stamp_file = (
-        Path(timestamps)
-        if timestamps
-        else next((f for f in [folder / n for n in _STAMP_FILES] + [folder.parent / "images.txt"] if f.is_file()), None)
+        return _folder(path, declared)
+    if suffix in VIDEO:
+        return _video(path, declared).timed(declared)
+    if suffix in STACK or (suffix == ".png" and open_stills(path).pages > 1):
+        return _stacks(path, Series([path]), declared).timed(declared)
+    if suffix in (".npy", ".npz"):
+        return _array(path, declared).timed(declared)
+    if suffix in RECORDING:
+        return _recording(path).timed(declared)
+    raise AssetError(
+        "unknown input",
+        where=str(path),
+        value=path.suffix,
+        accepted=f"a video ({' '.join(sorted(VIDEO))}), a folder of images, a stack or animation "
+        f"({' '.join(sorted(STACK))}), .npy, .npz, .aedat or .aedat4",
     )
-    times: list[int | None]
-    stamps = read_timestamps(stamp_file) if stamp_file is not None and fps is None else None
-    if stamps is not None and stamps[0][1] is not None:  # "time name" lines
-        if not files:
-            files = [p for _, name in stamps if (p := stamp_file.parent / name).is_file()]
-        by_name = {Path(name).name: t for t, name in stamps}
-        if missing := [p.name for p in files if p.name not in by_name]:
-            raise EventDataError(f"no time stamp for image {missing[0]}", where=str(stamp_file))
-        times = [by_name[p.name] for p in files]
-    elif stamps is not None:
-        if len(stamps) != len(files):
-            raise EventDataError(
-                "one time stamp per image", where=str(stamp_file), value=f"{len(stamps)} stamps, {len(files)} images"
-            )
-        times = [t for t, _ in stamps]
-    else:
-        times = [None] * len(files)
-    if not files:
+
+
+def read_any_image(path: Path, background: str | None = None) -> np.ndarray:
+    """Return (H, W) or (H, W, 3) RGB, upright, without alpha; uint8, uint16 or float32 as in the file. Raises
+    AssetError when undecodable."""
+    return open_stills(Path(path)).read(background=background_of(background))
+
+
+def _folder(folder: Path, declared: Declared) -> FrameSource:
+    found = series(folder, IMAGE)
+    beside = [folder / name for name in _STAMP_FILES]
+    beside += [folder.parent / name for name in ("images.txt", "data.csv", f"{folder.name}.txt")]
+    list_file = Path(declared.timestamps) if declared.timestamps else next((f for f in beside if f.is_file()), None)
+    if list_file is not None and declared.timestamps is None and declared.fps is not None:
+        if declared.time_unit != "frames":
+            found.notes.append(f"{list_file.name} beside the images is not used, because of --fps")
+            list_file = None
+    stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps)
+    if not found.files and list_file is not None and stamps is not None and stamps.names:
+        found = Series([p for name in stamps.names if (p := list_file.parent / name).is_file()])
+    if not found.files:
         raise AssetError("no images in the folder", where=str(folder), accepted=" ".join(sorted(IMAGE)))
-    if times[0] is None and fps is None:
-        raise EventDataError(
-            "frames without times", where=str(folder), accepted="--fps, or a timestamps.txt beside the images"
-        )
-    first = read_any_image(files[0])
+    source = _stacks(folder, found, declared)
+    if stamps is not None and stamps.names is not None and source.count == len(found.files):
+        stamps = _by_name(stamps, found, str(list_file))
+    return source.timed(replace(declared, timestamps=None), stamps)
+
+
+def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
+    """Return the pages of all files as frames."""
+    files, background, notes = found.files, background_of(declared.background), found.notes
+    first = open_stills(files[0])
+    # Only stacks and animations have pages, so that the others need not be opened before their turn.
+    stacked = first.pages > 1 or {p.suffix.lower() for p in files} & STACK
+    opened = [open_stills(p) for p in files] if stacked else [first]
+    pages = sum(one.pages for one in opened) if stacked else len(files)
+    delays = [delay for one in opened for delay in one.delays_ms or []]
+    own = [round(1e6 * t) for t in np.cumsum([0.0, *delays])] if len(delays) == pages else None
+    times = None
+    if own is not None and declared.fps is None:
+        shown = f"{min(delays):g}" if min(delays) == max(delays) else f"{min(delays):g} to {max(delays):g}"
+        notes.append(f"each frame is shown for {shown} ms, as the file says (--fps for another rate)")
+    elif declared.fps is not None and pages == len(files) and (places := found.places()) is not None:
+        notes += found.missing()
+        times = [round(int(place) * 1e9 / declared.fps) for place in places]
+
+    def frames() -> Frames:
+        number = 0
+        for path in files:
+            one = open_stills(path)
+            for image in one.iterate(background):
+                yield image, own and own[number], path.name if one.pages == 1 else f"{path.name} page {number}"
+                number += 1
+            notes.extend(note for note in one.notes if note not in notes)
+
+    image = next(first.iterate(background))
+    levels = None if first.white is None else (0.0, float(first.white))
+    if image.dtype == np.uint16 and declared.white_level is None and declared.range is None:
+        chosen = [files[int(k)] for k in np.unique(np.linspace(0, len(files) - 1, _LOOKED_AT))]
+        top = max(int(one.max()) for path in chosen for one in open_stills(path).iterate(background))
+        # PNG's sBIT allows codes of the full scale, too.
+        levels = levels if levels is not None and top <= levels[1] else _white_of(top, notes)
+    size = image.shape[:2]
+    has = own is not None
     return FrameSource(
-        folder,
-        *first.shape[:2],
-        len(files),
-        fps,
-        lambda: ((read_any_image(p), t, p.name) for p, t in zip(files, times)),
+        where, *size, pages, frames, has, transfer=first.transfer, levels=levels, notes=notes, times_ns=times
     )
 
 
-def _video(path: Path, fps: float | None, timestamps) -> FrameSource:
+def _white_of(top: int, notes: list[str]) -> tuple[float, float] | None:
+    """Return the levels of 16-bit frames whose largest code, in a sample of the whole clip, is ``top``."""
+    for bits in _BITS:
+        if 2 ** (bits - 2) <= top < 2**bits:
+            notes.append(
+                f"16-bit codes up to {top:,}: taken as {bits} bits, white {2**bits - 1:,} (--white-level 65535 if dark)"
+            )
+            return 0.0, float(2**bits - 1)
+    return None
+
+
+def _by_name(stamps: Stamps, found: Series, where: str) -> Stamps:
+    """Return the times of the files, by their names. Raises EventDataError: a file without."""
+    by_name = {name: t for given, t in zip(stamps.names or (), stamps.times_ns) for name in (Path(given).name, given)}
+    missing = [p.name for p in found.files if p.name not in by_name and p.stem not in by_name]
+    if missing:
+        raise EventDataError(f"no time stamp for image {missing[0]}", where=where)
+    if left := len(stamps.times_ns) - len(found.files):
+        found.notes.append(f"{Path(where).name}: {left} times of images that are not in the folder are left out")
+    return replace(stamps, times_ns=[by_name.get(p.name, by_name.get(p.stem, 0)) for p in found.files])
+
+
+def _video(path: Path, declared: Declared) -> FrameSource:
     from blinkgl.io.video import VideoReader
 
-    reader = VideoReader(path)
-    times = [t for t, _ in read_timestamps(Path(timestamps))] if timestamps and fps is None else None
-    fps = fps or reader.fps
-    if not fps and times is None:
-        raise EventDataError("video without a frame rate", where=str(path), accepted="--fps")
-
-    def frames():
-        for i, frame in enumerate(reader):
-            if times is not None and i >= len(times):
-                raise EventDataError(
-                    f"no time stamp for frame {i}", where=str(timestamps), value=f"{len(times)} stamps"
-                )
-            yield frame, times[i] if times is not None else None, f"#{i}"
-
-    return FrameSource(path, reader.height, reader.width, reader.expected or None, fps, frames)
+    below = background_of(declared.background)
+    reader = VideoReader(path, range=declared.range, background=below, zero_time=declared.zero_time)
+    frames = lambda: ((frame, t_ns, f"#{i}") for i, (frame, t_ns) in enumerate(reader))
+    size, timed = (reader.height, reader.width), None not in reader.times_ns
+    return FrameSource(path, *size, reader.count, frames, timed, "video", reader.transfer, reader.levels, reader.notes)
 
 
-def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
-    times = None
+def _array(path: Path, declared: Declared) -> FrameSource:
+    notes: list[str] = []
+    own: list[int] | None = None
     with numpy_errors(path):
         if path.suffix.lower() == ".npy":
             check_npy(path)
@@ -194,98 +313,39 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
                 if name is None:
                     raise AssetError("no array 'frames'", where=str(path), value=data.names)
                 frames = data[name]
-                stamp = next(
-                    (k for k in ("timestamps", "t", "times", "timestamps_us", "timestamps_ns") if k in data), None
-                )
-                times = _stamps(stamp, data[stamp]) if stamp else None
+                called = [f"{k}{unit}" for k in ("timestamps", "times", "time", "ts", "t") for unit in ("", *_ENDINGS)]
+                stamp = next((k for k in called if k in data), None)
+                if stamp is not None and declared.fps is None and declared.timestamps is None:
+                    stamps = stamps_of_array(stamp, data[stamp], declared.time_unit, str(path))
+                    own, notes = stamps.times_ns, [stamps.note] if stamps.note else []
+                elif stamp is not None:
+                    notes.append(f"'{stamp}' in the file is not used, because of --fps or --timestamps")
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
         raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W) or (N, H, W, 3)")
     if frames.dtype not in (np.uint8, np.uint16) and frames.dtype.kind != "f":
         raise AssetError(
             "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
         )
-    if timestamps:
-        times = [t for t, _ in read_timestamps(Path(timestamps))]
-    if fps is not None:
-        times = None
-    elif times is None:
-        raise EventDataError("frames without times", where=str(path), accepted="--fps or --timestamps")
-    elif len(times) != len(frames):
-        raise EventDataError(
-            "one time stamp per frame", where=str(path), value=f"{len(times)} stamps, {len(frames)} frames"
-        )
+    levels = None
+    if frames.dtype == np.uint16 and declared.white_level is None and declared.range is None:
+        levels = _white_of(int(max(frame.max() for frame in frames)), notes)
 
-    def iterate():
-        for i in range(len(frames)):
-            frame = np.ascontiguousarray(frames[i])
-            if frame.dtype.kind == "f":
-                with np.errstate(over="ignore"):  # becomes inf, which a later check refuses by name
-                    frame = frame.astype(np.float32)
-            yield (
-                frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame,
-                times[i] if times else None,
-                f"#{i}",
-            )
+    def read() -> Frames:
+        for i, frame in enumerate(frames):
+            frame = frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame
+            yield np.asarray(frame, np.float32 if frame.dtype.kind == "f" else None), None, f"#{i}"
 
-    return FrameSource(path, *frames.shape[1:3], len(frames), fps, iterate)
+    size, has = frames.shape[1:3], own is not None
+    return FrameSource(path, *size, len(frames), read, has, levels=levels, notes=notes, times_ns=own)
 
 
-def _recording(path: Path, fps: float | None, timestamps) -> FrameSource:
+def _recording(path: Path) -> FrameSource:
+    """Frames that a camera recorded beside its events."""
     from blinkgl.io.formats import open_events
 
-    times = [t for t, _ in read_timestamps(Path(timestamps))] if timestamps and fps is None else None
     file = open_events(path)
     first = next(file.frames(), None)
     if first is None:
         raise EventDataError("events need at least two frames", where=str(path), value="0 frames")
-
-    def frames() -> Iterator[tuple[np.ndarray, int | None, str]]:
-        for i, frame in enumerate(file.frames()):
-            if times is not None and i >= len(times):
-                raise EventDataError(
-                    f"no time stamp for frame {i}", where=str(timestamps), value=f"{len(times)} stamps"
-                )
-            yield frame.image, None if fps else times[i] if times is not None else frame.t_us * 1000, f"#{i}"
-
-    return FrameSource(path, *first.image.shape[:2], None, fps, frames, linear=True)
-
-
-def _stamps(name: str, values: np.ndarray) -> list[int]:
-    """Return ns of an array of times: by its name's unit, else floats are seconds and integers µs."""
-    unit = 1 if name.endswith("_ns") else 1000 if name.endswith("_us") or values.dtype.kind != "f" else 10**9
-    return [round(float(t) * unit) if values.dtype.kind == "f" else int(t) * unit for t in values]
-
-
-def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
-    """Return (t_ns, name or None) per line of "time" or "time name"; integers are µs, numbers with a point or exponent
-    seconds; ``#`` comments and one header line are skipped. Raises EventDataError naming the line."""
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    stamps: list[tuple[int, str | None]] = []
-    for number, line in enumerate(lines, 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
-        try:
-            t_ns = int(fields[0]) * 1000 if re.fullmatch(r"[-+]?\d+", fields[0]) else round(float(fields[0]) * 1e9)
-        except (ValueError, OverflowError):
-            if number == 1:
-                continue
-            raise EventDataError(
-                f"line {number} is not a time stamp", where=str(path), value=line, accepted="'time' or 'time name'"
-            ) from None
-        stamps.append((t_ns, fields[1] if len(fields) > 1 else None))
-    if not stamps:
-        raise EventDataError("no time stamps", where=str(path))
-    if len({name is None for _, name in stamps}) > 1:
-        raise EventDataError(
-            "times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line"
-        )
-    return stamps
-
-
-def _natural(path: Path) -> list:
-    """Return a sort key with frame2 before frame10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
+    frames = lambda: ((frame.image, frame.t_us * 1000, f"#{i}") for i, frame in enumerate(file.frames()))
+    return FrameSource(path, *first.image.shape[:2], None, frames, True, "camera", "linear")

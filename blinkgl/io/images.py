@@ -237,6 +237,11 @@ def read_png(path: str | os.PathLike) -> np.ndarray:
         data = Path(path).read_bytes()
     except OSError as error:
         raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
+    return decode_image(data, path)
+
+
+def decode_image(data: bytes, path: str | os.PathLike) -> np.ndarray:
+    """Return :func:`read_png` of bytes already read."""
     if (problem := _image_problem(data)) is not None:
         raise AssetError(problem, where=str(path))
     try:
@@ -265,7 +270,7 @@ def _image_problem(data: bytes) -> str | None:
                     size = opened.size
         except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged: its plug-ins raise anything; OpenCV decides
             return "cannot decode image (corrupt or truncated)" if not len(data) else None
-    return _size_problem(*size) if size else "cannot decode image (no size in its header)"
+    return size_problem(*size) if size else "cannot decode image (no size in its header)"
 
 
 def _png_problem(data: bytes) -> str | None:
@@ -279,12 +284,13 @@ def _png_problem(data: bytes) -> str | None:
         if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             break
         if kind == b"IEND":
-            return _size_problem(*struct.unpack_from(">II", data, 16))
+            return size_problem(*struct.unpack_from(">II", data, 16))
         at = end
     return f"cannot decode image (corrupt or truncated at byte {at})"
 
 
-def _size_problem(width: int, height: int) -> str | None:
+def size_problem(width: int, height: int) -> str | None:
+    """Return why an image of this size is not read, or None."""
     return (
         None
         if 0 < width * height <= _MAX_PIXELS

@@ -62,10 +62,10 @@ def typestore(ros2: bool) -> Any:
 
 class BagReader:
     """The events of one topic; of several the first by name, or another by ``stream``. height, width : px, of its first
-    message.   said : a line where there are several topics. Raises AssetError: damaged, no topic of events."""
+    message.   notes : a line where there are several topics. Raises AssetError: damaged, no topic of events."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        self.path, self.said = Path(path), []
+        self.path, self.notes = Path(path), []
         self.height = self.width = None
         with self._opened() as bag:
             self._topics = sorted({c.topic for c in bag.connections if c.msgtype in _EVENTS})
@@ -80,7 +80,7 @@ class BagReader:
                 )
             self._topic = self._topics[number]
             if len(self._topics) > 1:
-                self.said = [f"{len(self._topics)} topics of events: {self._topic} is read (--stream for another)"]
+                self.notes = [f"{len(self._topics)} topics of events: {self._topic} is read (--stream for another)"]
             for _, _, (height, width) in self._messages(bag):
                 self.height, self.width = (height, width) if height and width else (None, None)
                 break

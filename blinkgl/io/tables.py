@@ -76,7 +76,7 @@ def order_line(order: Iterable[str]) -> str:
 class Table:
     """Four columns in a file.   read : rows of a slice, "x", "y", "t", "p" and perhaps "cause" -> (N,) numbers.
     count : rows.   heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to
-    t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   said :
+    t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   notes :
     lines for the user, of guesses."""
 
     read: Callable[[slice], dict[str, np.ndarray]]
@@ -86,7 +86,7 @@ class Table:
     offset: int | float = 0
     size: tuple[int, int] | None = None
     place: str = ""
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Table:
@@ -123,12 +123,12 @@ def table_of_records(records: Any, named: Mapping[str, str], **known: Any) -> Ta
 
 def table_of_rows(rows: Any, where: str, reading: EventReading, **known: Any) -> Table:
     """Return the table of an array (N, K) without names: K columns as declared, or four by :func:`guessed_order`."""
-    order, said = reading.columns or (), ()
+    order, notes = reading.columns or (), ()
     if not order or reading.named:
         if rows.shape[1] != 4:
             raise AssetError("columns without names", where=where, value=rows.shape, accepted="--columns x,y,t,p")
         order = guessed_order(np.concatenate([rows[:_SAMPLE], rows[max(_SAMPLE, len(rows) - _SAMPLE) :]]))
-        said = (order_line(order),)
+        notes = (order_line(order),)
     if len(order) != rows.shape[1]:
         raise AssetError(
             f"--columns names {len(order)} columns", where=where, value=rows.shape, accepted="one for each"
@@ -138,12 +138,12 @@ def table_of_rows(rows: Any, where: str, reading: EventReading, **known: Any) ->
         columns = np.ascontiguousarray(rows[part].T)  # contiguous, because each is read several times
         return {slot: column for slot, column in zip(order, columns, strict=True) if slot != "_"}
 
-    return Table(read, len(rows), said=said, **known)
+    return Table(read, len(rows), notes=notes, **known)
 
 
 class TableReader:
     """Events of a table. height, width : px, None where the file does not give them.   unit : of its times, read,
-    declared or guessed.   said : lines for the user.   unread : rows left out so far, with ``damaged="keep"``."""
+    declared or guessed.   notes : lines for the user.   unread : rows left out so far, with ``damaged="keep"``."""
 
     def __init__(self, path: Path, reading: EventReading, tables: list[Table]):
         self.path, self._keep, self._polarity, self.unread = path, reading.keep, reading.polarity, 0
@@ -152,10 +152,10 @@ class TableReader:
             accepted = f"--stream 0 to {len(tables) - 1}"
             raise AssetError("no such stream", where=str(path), value=number, accepted=accepted)
         self._table = table = tables[number]
-        self.said = [*table.said]
+        self.notes = [*table.notes]
         if len(tables) > 1:
             more = f"{len(tables)} streams of events: {number} ({table.place}) is read (--stream for another)"
-            self.said.append(more)
+            self.notes.append(more)
         self.height, self.width = table.size or (None, None)
         first = table.read(slice(0, 1))
         self.count, self.causes = table.count, "cause" in first

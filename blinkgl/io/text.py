@@ -38,12 +38,12 @@ _SHIFT = {"s": 6, "ms": 3, "us": 0, "ns": -3}
 
 
 class TextReader:
-    """Reads events from text. height, width : px, None when the file does not give them.   unit : of the times.   said
+    """Reads events from text. height, width : px, None when the file does not give them.   unit : of the times.   notes
     : lines for the user.   unread : lines left out so far, with ``damaged="keep"``. Raises AssetError with the number
     of a line that is not an event."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        self.path, self._reading, self.said, self.unread = Path(path), reading, [], 0
+        self.path, self._reading, self.notes, self.unread = Path(path), reading, [], 0
         self.height = self.width = None
         self._start = self._lines = 0  # bytes and lines before the first event
         self._order: tuple[str, ...] = ()
@@ -78,7 +78,7 @@ class TextReader:
         self._order = reading.columns or self._order
         if not self._order:
             self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
-            self.said.append(order_line(self._order))
+            self.notes.append(order_line(self._order))
         self.unit = TimeUnit("us", "read")
         if reading.time_unit or unit:
             self.unit = TimeUnit(reading.time_unit or unit or "", "declared" if reading.time_unit else "read")

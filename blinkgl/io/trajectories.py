@@ -1,97 +1,371 @@
-"""Trajectories of other programs: TUM's text and EuRoC's CSV.
+"""Trajectories of other programs, as poses of a body in the world, T_world_body, with OpenCV's axes.
 
-    TUM     t x y z qx qy qz qw          s, m; separated by spaces, `#` begins a comment
-    EuRoC   t, x, y, z, qw, qx, qy, qz[, …]   ns, m; `#` begins a comment; further columns are left alone
+    tum, orbslam    t x y z qx qy qz qw                  s; a camera in the world
+    euroc           t, x, y, z, qw, qx, qy, qz[, …]      ns; the inertial unit in the world
+    kitti           12 numbers: the rows of T_world_cam  times of times.txt, or a rate
+    tartanair       x y z qx qy qz qw                    a rate; axes: x forwards, y right, z down
+    colmap          images.txt: id qw qx qy qz x y z …   the world in the camera; a rate
+    nerf            transforms.json: T_world_cam         OpenGL's axes; "time" of each frame, or a rate
 
-Poses are those of a body in the world, T_world_body. A camera's axes are OpenCV's in both.
+A heading is believed before all of these (ESIM's has commas, ns and w last). What neither it nor the user says is
+guessed from the whole file, for order and unit each by itself, and the notes say so.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds
+from blinkgl.io.names import natural_order
+from blinkgl.io.stamps import read_timestamps
 
-FORMATS = ("tum", "euroc")
+FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
+AXES = ("opencv", "opengl", "ned")
+MAPS_FROM = ("camera", "world")
 _MOST_LINES = 5_000_000
 _GAP = 20
 """A step this many times the usual one is a gap."""
+_COLUMNS = {
+    "tum": "t x y z qx qy qz qw", "orbslam": "t x y z qx qy qz qw", "euroc": "t x y z qw qx qy qz",
+    "tartanair": "x y z qx qy qz qw", "colmap": "- qw qx qy qz x y z",
+}  # fmt: skip
+_UNITS = {"tum": "s", "orbslam": "s", "euroc": "ns"}
+_FROM = {"colmap": "world"}
+_OWN_AXES = {"nerf": "opengl", "tartanair": "ned"}
+_TO_OPENCV = {
+    # Columns: OpenCV's x (right), y (down), z (forwards) in the body's own axes.
+    "opengl": np.diag([1.0, -1.0, -1.0]),
+    "ned": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+}
+_TITLE = re.compile(r"[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
+_SURE = 0.9
+"""Mean size of the component of a quaternion that is taken for w where nothing says which is."""
+_FASTEST = 60.0
+"""units/s of a camera from which on a note asks for the unit."""
 
 
-def read_trajectory(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) int64 ns and poses (N, 4, 4) float64 T_world_body, N >= 2, of a file of ``form`` "tum" or
-    "euroc"; None: EuRoC where the lines have commas.
+@dataclass(frozen=True)
+class PoseFile:
+    """What a user declares of a trajectory; None: what the file says, else a guess that is said.
+
+    form : one of ``FORMS``.   columns : names of the columns, "t x y z qw qx qy qz"; "-" is left out.   time_unit :
+    "s", "ms", "us", "ns".   maps_from : "camera" where poses map from the camera to the world, "world" where they map
+    from the world to the camera.   axes : of the camera, "opencv", "opengl", or "ned" (x forwards, y right, z down).
+    rate : poses per second of a file without times.   times : file of their times.
+
+    Raises ConfigError: values that are none of these."""
+
+    form: str | None = None
+    columns: str | None = None
+    time_unit: str | None = None
+    maps_from: str | None = None
+    axes: str | None = None
+    rate: float | None = None
+    times: str | os.PathLike | None = None
+
+    def __post_init__(self) -> None:
+        for key, known in (("form", FORMS), ("axes", AXES), ("maps_from", MAPS_FROM)):
+            if (value := getattr(self, key)) not in (None, *known):
+                raise ConfigError(f"unknown {key}", where=key, value=value, accepted=", ".join(known))
+        checked_unit(self.time_unit, "time_unit")
+        if self.columns is not None:
+            roles = self.columns.replace(",", " ").split()
+            wanted = ["qw", "qx", "qy", "qz", "x", "y", "z"]
+            if sorted(set(roles) - {"t", "-"}) != wanted or len([r for r in roles if r != "-"]) - ("t" in roles) != 7:
+                raise ConfigError(
+                    "not names of columns", where="columns", value=self.columns, accepted="such as t x y z qx qy qz qw"
+                )
+
+
+ANY = PoseFile()
+
+
+@dataclass
+class _Table:
+    """Poses as read: times (texts, or None), (N, 3) positions, rotations, and the number of each pose's line."""
+
+    times: list[str] | None
+    positions: np.ndarray
+    rotations: Rotation
+    lines: list[int]
+    unit: str | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def read_trajectory(
+    path: str | os.PathLike, declared: PoseFile = ANY, notes: list[str] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) int64 ns and poses (N, 4, 4) float64 T_world_body, N >= 2, with OpenCV's axes.
+
+    notes : gets what was guessed, a line each.
 
     Raises AssetError, naming the line: a wrong count of numbers, not finite, times that do not increase, a quaternion
-    of length other than 1, a gap of 20 usual steps; a heading with w first in a TUM file."""
+    of length other than 1, a gap of 20 usual steps, no times; ConfigError as :class:`PoseFile`."""
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeError) as error:
         raise AssetError(f"cannot be read: {' '.join(str(error).split())[:120]}", where=str(path)) from None
-    rows = [(k, line) for k, line in enumerate(lines[:_MOST_LINES], 1) if line.strip() and not line.startswith("#")]
-    if len(rows) < 2:
-        raise AssetError("no trajectory", where=str(path), value=f"{len(rows)} poses", accepted="two or more")
-    form = form or ("euroc" if "," in rows[0][1] else "tum")
-    heading = " ".join(line.lower() for line in lines[:20] if line.startswith("#"))
-    if form == "tum" and "qw" in heading and heading.index("qw") < (heading + "qx").index("qx"):
-        raise AssetError(
-            "the heading says that quaternions begin with w",
-            where=str(path),
-            value=heading[:80],
-            accepted="t x y z qx qy qz qw, as TUM's files have it",
-        )
-    times, numbers = [], np.empty((len(rows), 7))
-    for i, (k, line) in enumerate(rows):
-        words = line.replace(",", " ").split()
-        try:
-            if len(words) != 8 and not (form == "euroc" and len(words) > 8):
-                raise ValueError
-            times.append(_nanoseconds(words[0], form))
-            numbers[i] = [float(word) for word in words[1:8]]
-            if not np.isfinite(numbers[i]).all():
-                raise ValueError
-        except (ValueError, OverflowError):
-            accepted = "t x y z qx qy qz qw" if form == "tum" else "t, x, y, z, qw, qx, qy, qz"
-            raise AssetError(f"line {k} is no pose", where=str(path), value=line[:80], accepted=accepted) from None
-    if max(map(abs, times)) >= 2**62:
-        raise AssetError(
-            "times are too large: another unit?",
-            where=str(path),
-            value=rows[-1][1][:40],
-            accepted="seconds in TUM's files, nanoseconds in EuRoC's",
-        )
-    t_ns = np.array(times, np.int64)
-    _check_times(t_ns, [k for k, _ in rows], path)
-    quaternions = numbers[:, 3:] if form == "tum" else numbers[:, [4, 5, 6, 3]]
-    length = np.linalg.norm(quaternions, axis=1)
-    if (np.abs(length - 1) > 0.01).any():
-        i = int(np.argmax(np.abs(length - 1) > 0.01))
-        raise AssetError(
-            f"line {rows[i][0]} has no rotation",
-            where=str(path),
-            value=f"a quaternion of length {length[i]:.4g}",
-            accepted="length 1",
-        )
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), numbers[:, :3]
+    form = declared.form or _form(path, text)
+    readers = {"kitti": _kitti, "colmap": _colmap, "nerf": _nerf}
+    table = readers.get(form or "", _columns)(path, text, replace(declared, form=form))
+    if len(table.positions) < 2:
+        value = f"{len(table.positions)} poses"
+        raise AssetError("no trajectory", where=str(path), value=value, accepted="two or more")
+    said = [] if notes is None else notes
+    said += table.notes
+    t_ns = _times(table, declared, path, said)
+    T = np.tile(np.eye(4), (len(t_ns), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = table.rotations.as_matrix(), table.positions
+    if (declared.maps_from or _FROM.get(form or "", "camera")) == "world":
+        T = np.linalg.inv(T)
+    axes = declared.axes or _OWN_AXES.get(form or "", "opencv")
+    if axes != "opencv":
+        T[:, :3, :3] = T[:, :3, :3] @ _TO_OPENCV[axes]
+        if declared.axes is None:
+            said.append(f"{path.name}: {form}'s axes ({axes}) turned to OpenCV's (axes: opencv if they are already)")
+    speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) / (np.diff(t_ns) * 1e-9)
+    if (fast := float(np.median(speed))) > _FASTEST:
+        said.append(f"{path.name}: the body moves at {fast:.4g} units/s: another unit of time or length? (time_unit)")
     return t_ns, T
 
 
-def _nanoseconds(word: str, form: str) -> int:
-    """Return ns of a number of s or ns, with all its digits."""
-    if form == "euroc":
-        return int(float(word)) if "." in word or "e" in word.lower() else int(word)
-    whole, _, part = word.partition(".")
-    if "e" in word.lower() or not part.isdigit() or not whole.lstrip("-").isdigit():
-        return round(float(word) * 1e9)
-    sign = -1 if whole.startswith("-") else 1
-    return int(whole) * 1_000_000_000 + sign * int(part[:9].ljust(9, "0"))
+def _form(path: Path, text: str) -> str | None:
+    """Return the form that a file's name or its first lines show; None: a table of named or of unknown columns."""
+    start = text.lstrip()[:1]
+    if path.suffix.lower() == ".json" or start == "{":
+        return "nerf"
+    if re.search(r"^# *IMAGE_ID, QW", text[:2000], re.M):
+        return "colmap"
+    row = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    count = len(re.split(r"[\s,;]+", row.strip()))
+    if count == 7 and "," not in row:
+        return "tartanair"
+    return "kitti" if count == 12 and "," not in row else None
+
+
+def _rows(path: Path, text: str) -> tuple[str, list[tuple[int, list[str]]]]:
+    """Return the heading, and (line, fields) of every line of data."""
+    heading, rows = "", []
+    for number, line in enumerate(text.splitlines()[:_MOST_LINES], 1):
+        body = line.strip()
+        if not body:
+            continue
+        fields = [part for part in re.split(r"[\s,;]+", body) if part]
+        if body.startswith("#") or (not rows and not heading and not any(map(_is_number, fields))):
+            if not rows:
+                # The last line before the data that names a w is the heading.
+                titles = body.lstrip("# ")
+                heading = titles if re.search(r"w\b", titles, re.I) or not heading else heading
+            continue
+        rows.append((number, fields))
+    return heading, rows
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
+
+
+def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
+    """Read a table of positions and quaternions."""
+    heading, rows = _rows(path, text)
+    titles = _TITLE.findall(heading)
+    roles = (declared.columns or "").replace(",", " ").split() or _roles(titles)
+    notes: list[str] = []
+    if not roles and declared.form is not None:
+        roles = _COLUMNS[declared.form].split()
+    if not rows:
+        return _Table(None, np.empty((0, 3)), Rotation.identity(), [])
+    if not roles:
+        roles = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+        numbers = _numbers(path, rows, list(range(4, 8)), " ".join(roles))
+        mean = np.abs(numbers).mean(axis=0)
+        # w is the largest near the start of most trajectories; EuRoC's states have it first and go on with speeds.
+        first = len(rows[0][1]) > 8 or (mean[0] > _SURE > mean[3])
+        if first:
+            roles = _COLUMNS["euroc"].split()
+        order = "qw qx qy qz" if first else "qx qy qz qw"
+        other = _COLUMNS["tum" if first else "euroc"]
+        notes.append(f"{path.name}: quaternions taken as {order} (columns: {other}, if that is wrong)")
+    at = {role: k for k, role in enumerate(roles) if role != "-"}
+    wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    most = max((at[role] for role in wanted), default=0)
+    for number, fields in rows:
+        # More columns than names are speeds and biases; fewer, or one too many of a bare table, is no pose.
+        if len(fields) <= most or (len(roles) == 8 and not titles and len(fields) not in (8, *range(14, 40))):
+            raise _no_pose(path, number, fields, " ".join(roles))
+    numbers = _numbers(path, rows, [at[role] for role in wanted], " ".join(roles))
+    lines = [number for number, _ in rows]
+    times = [fields[at["t"]] for _, fields in rows] if "t" in at else None
+    stated = named_unit(titles[at["t"]]) if "t" in at and at["t"] < len(titles) and len(titles) >= len(roles) else None
+    unit = stated or (_UNITS.get(declared.form or ""))
+    return _Table(times, numbers[:, :3], _rotations(numbers[:, 3:], lines, path), lines, unit, notes)
+
+
+def _roles(titles: Sequence[str]) -> list[str]:
+    """Return the role of each column by its title, "-" for those that have none; empty: the titles name no pose."""
+    names = [re.sub(r"\s*[\[(].*", "", title).strip("#").lower() for title in titles]
+    turns = [bool(re.match(r"(.*[_.])?(q|quat|orientation|rot|r)[_.]?([a-z]*[_.])*[wxyz]$", name)) and not
+             re.match(r"(p|t|pos)", name) for name in names]  # fmt: skip
+    roles: list[str] = []
+    for name, turn in zip(names, turns):
+        axis = name[-1:] if name[-1:] in "wxyz" else ""
+        rest = re.sub(r"[^a-z]", "", name[:-1])
+        if re.match(r"(time|ts?(_[a-zµ]+)?$|stamp|sec)", name):
+            role = "t"
+        elif not axis or rest.startswith(("v", "b", "w", "a")):
+            role = "-"  # a speed, a bias
+        elif turn or axis == "w" or (axis in roles and not any(turns)):
+            role = f"q{axis}"
+        else:
+            role = axis
+        roles.append("-" if role in roles else role)
+    if "qw" in roles and "qx" not in roles:
+        # w x y z after x y z, without a q: the ones next to w are the quaternion's.
+        w = roles.index("qw")
+        beside = range(w + 1, w + 4) if w + 3 < len(names) and names[w + 1][-1:] == "x" else range(w - 3, w)
+        for k, axis in zip(beside, "xyz"):
+            roles[k] = f"q{axis}"
+    return roles if {"x", "y", "z", "qx", "qy", "qz", "qw"} <= set(roles) else []
+
+
+def _numbers(path: Path, rows: Sequence[tuple[int, list[str]]], columns: list[int], accepted: str) -> np.ndarray:
+    out = np.empty((len(rows), len(columns)))
+    for i, (number, fields) in enumerate(rows):
+        if max(columns) >= len(fields) or not all(_is_number(fields[k]) for k in columns):
+            raise _no_pose(path, number, fields, accepted)
+        out[i] = [float(fields[k]) for k in columns]
+    return out
+
+
+def _no_pose(path: Path, number: int, fields: Sequence[str], accepted: str) -> AssetError:
+    return AssetError(f"line {number} is no pose", where=str(path), value=" ".join(fields)[:80], accepted=accepted)
+
+
+def _rotations(quaternions: np.ndarray, lines: Sequence[int], path: Path) -> Rotation:
+    length = np.linalg.norm(quaternions, axis=1)
+    if (wrong := np.abs(length - 1) > 0.01).any():
+        i = int(np.argmax(wrong))
+        raise AssetError(
+            f"line {lines[i]} has no rotation",
+            where=str(path),
+            value=f"a quaternion of length {length[i]:.4g}",
+            accepted="length 1, or columns: in the file's order",
+        )
+    return Rotation.from_quat(quaternions)
+
+
+def _matrices(path: Path, given: np.ndarray, lines: list[int]) -> tuple[np.ndarray, Rotation]:
+    """Return the positions and rotations of (N, 3 or 4, 4) matrices. Raises AssetError: not rigid."""
+    R = given[:, :3, :3]
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    wrong = (off > 0.01) | (np.linalg.det(R) < 0) if len(R) else np.zeros(0, bool)
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        value = " ".join(f"{v:.4g}" for v in given[i].ravel()[:12])
+        raise AssetError(f"line {lines[i]} is no pose", where=str(path), value=value, accepted="rows of a rotation")
+    return given[:, :3, 3], Rotation.from_matrix(R)
+
+
+def _kitti(path: Path, text: str, declared: PoseFile) -> _Table:
+    _, rows = _rows(path, text)
+    numbers = _numbers(path, rows, list(range(12)), "12 numbers, the rows of T_world_cam").reshape(-1, 3, 4)
+    lines = [number for number, _ in rows]
+    return _Table(None, *_matrices(path, numbers, lines), lines)
+
+
+def _colmap(path: Path, text: str, declared: PoseFile) -> _Table:
+    """images.txt: two lines per image, the second lists its points; sorted by the images' names."""
+    body = [(k, line) for k, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+    rows = [(k, line.split()) for k, line in body[::2] if line.strip()]
+    accepted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points"
+    numbers = _numbers(path, rows, list(range(1, 8)), accepted)
+    names = [fields[9] if len(fields) > 9 else str(number) for number, fields in rows]
+    order = [names.index(p.as_posix()) for p in natural_order(map(Path, names))]
+    lines = [rows[k][0] for k in order]
+    rotations = _rotations(numbers[order][:, [1, 2, 3, 0]], lines, path)
+    return _Table(None, numbers[order][:, 4:], rotations, lines)
+
+
+def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
+    try:
+        tree = json.loads(text)
+        frames = tree["frames"]
+        given = np.array([frame["transform_matrix"] for frame in frames], np.float64)
+        if given.ndim != 3 or given.shape[1] not in (3, 4) or given.shape[2] != 4 or not np.isfinite(given).all():
+            raise ValueError("transform_matrix")
+    except (ValueError, TypeError, LookupError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:80]
+        accepted = "frames: [{transform_matrix: 4 rows of 4, time: s}, …]"
+        raise AssetError(f"no transforms.json: {reason}", where=str(path), accepted=accepted) from None
+    lines = list(range(1, len(frames) + 1))
+    times = [str(frame["time"]) for frame in frames] if all("time" in frame for frame in frames) else None
+    return _Table(times, *_matrices(path, given, lines), lines, "s")
+
+
+def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> np.ndarray:
+    """Return the times of poses, ns. Raises AssetError."""
+    count = len(table.positions)
+    beside = Path(declared.times) if declared.times is not None else path.with_name("times.txt")
+    if table.times is None and declared.rate is not None:
+        return np.round(np.arange(count) * (1e9 / declared.rate)).astype(np.int64)
+    if table.times is None and beside.is_file():
+        try:
+            stamps = read_timestamps(beside, declared.time_unit)
+        except EventDataError as error:
+            raise AssetError(error.problem, where=error.where, value=error.value, accepted=error.accepted) from None
+        if len(stamps.times_ns) != count:
+            value = f"{len(stamps.times_ns)} times, {count} poses"
+            raise AssetError("one time per pose", where=str(beside), value=value, accepted="as many, or rate:")
+        notes += [stamps.note] if stamps.note else []
+        t_ns = np.array(stamps.times_ns, np.int64)
+    elif table.times is None:
+        raise AssetError("poses without times", where=str(path), accepted="rate: in Hz, or times: a file of them")
+    else:
+        texts = table.times
+        for number, text in zip(table.lines, texts):
+            if not _is_number(text) or not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,2})?", text):
+                raise _no_pose(path, number, [text], "a time first, a finite number")
+        unit = _unit(table, texts, declared, path)
+        if unit.line is not None:
+            notes.append(f"{path.name}: {unit.line.replace('--time-unit', 'time_unit:')}")
+        values = nanoseconds(texts, unit)
+        if max(map(abs, values)) >= 2**62:
+            value = f"{texts[-1]} {unit.name}"
+            accepted = "time_unit: s, ms, us or ns"
+            raise AssetError("times are too large: another unit?", where=str(path), value=value, accepted=accepted)
+        t_ns = np.array(values, np.int64)
+    _check_times(t_ns, table.lines, path)
+    return t_ns
+
+
+def _unit(table: _Table, texts: Sequence[str], declared: PoseFile, path: Path) -> TimeUnit:
+    if declared.time_unit is not None:
+        return TimeUnit(declared.time_unit, "declared")
+    if table.unit is not None:
+        return TimeUnit(table.unit, "read")
+    if any(a == b for a, b in pairwise(texts)):
+        return TimeUnit("s", "read")  # refused in a moment, whatever the unit
+    try:
+        return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+    except EventDataError as error:
+        accepted = "one unit for all, or time_unit: s, ms, us or ns"
+        raise AssetError(error.problem, where=error.where, value=error.value, accepted=accepted) from None
 
 
 def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:
@@ -106,7 +380,7 @@ def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:
             "poses are minutes apart: another unit of time?",
             where=str(path),
             value=f"{usual * 1e-9:.6g} s from pose to pose",
-            accepted="seconds in TUM's files, nanoseconds in EuRoC's",
+            accepted="time_unit: s, ms, us or ns",
         )
     if (steps > _GAP * usual).any():
         i = int(np.argmax(steps > _GAP * usual)) + 1
@@ -121,7 +395,7 @@ def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
     """Write (N,) int64 ns and (N, 4, 4) poses as TUM's text, completely or not at all. Raises OutputError."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    lines = ["# timestamp[s] tx ty tz qx qy qz qw"]
     for t, p, q in zip(np.asarray(t_ns).tolist(), poses[:, :3, 3].tolist(), quaternions.tolist()):
         sign, t = ("-", -t) if t < 0 else ("", t)
         lines.append(f"{sign}{t // 1_000_000_000}.{t % 1_000_000_000:09d} " + " ".join(f"{v:.12g}" for v in (*p, *q)))

@@ -1,101 +1,93 @@
-"""Video in and out through the ffmpeg binary that imageio-ffmpeg brings; streaming, one frame in memory."""
+"""Video in and out through PyAV (FFmpeg's libraries); streaming, one frame in memory.
+
+What a file says is used: each frame's own time, the display matrix, pixel range, matrix and transfer curve, bits per
+component. PyAV is imported when a video is opened.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import os
 import re
-import subprocess
-import tempfile
 from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import imageio_ffmpeg
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.images import decode_pfm
+from blinkgl.io.alpha import over
+from blinkgl.io.ticks import frame_times
+from blinkgl.io.yuv import known, rgb_from_yuv
+
+if TYPE_CHECKING:
+    import av
+
+_MAX_PIXELS = 1 << 28
+_FORMATS = frozenset(
+    "mov mp4 m4a 3gp 3g2 mj2 matroska webm avi mpegts mpeg mpegvideo flv asf ogg apng ivf nut dv mxf yuv4mpegpipe h264 "
+    "hevc vvc av1 obu m4v mjpeg rm wtv cine live_flv".split()
+)
+_ALONE = {"protocol_whitelist": "file", "format_whitelist": ",".join(sorted(_FORMATS))}
+"""Only the file itself is read: play lists and manifests (DASH, HLS, concat), which make FFmpeg open other files and
+the network for any file name, are not accepted."""
+TRANSFERS = {16: "pq", 18: "hlg", 8: "linear", 4: 2.2, 5: 2.8}
+"""Curves of ITU-T H.273, by their number, that codes are decoded with; all others count as sRGB, which a display's
+curve for BT.709 and BT.601 is closer to than their camera's."""
+_RANGES = {1: "limited", 2: "full"}
+_UNSPECIFIED = 2
+_PACKED = {
+    "nv12": "yuv420p", "nv21": "yuv420p", "nv16": "yuv422p", "yuyv422": "yuv422p", "uyvy422": "yuv422p",
+    "yvyu422": "yuv422p", "p010le": "yuv420p10le", "p210le": "yuv422p10le", "y210le": "yuv422p10le",
+    "v210": "yuv422p10le",
+}  # fmt: skip
+"""Formats with interleaved samples, by the planar one with the same samples."""
 
 
 class VideoWriter:
     """H.264 (yuv420p, plays everywhere) from uint8 RGB frames; the container goes by the ending (.mp4, .mkv, .avi).
 
     width and height have to be even. One encoder thread: the bytes do not depend on the machine's core count. Use as a
-    context manager. Raises OutputError, one line with ffmpeg's own reason, when the file cannot be written."""
+    context manager. Raises OutputError, one line with FFmpeg's own reason, when the file cannot be written."""
 
     def __init__(
         self, path: str | os.PathLike, height: int, width: int, fps: float, *, preset: str = "veryfast", crf: int = 20
     ):
         if height % 2 or width % 2:
             raise ValueError(f"yuv420p needs even sizes, got {width}x{height}")
-        self.path, self._shape = Path(path), (height, width, 3)
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the writer
-        command = [
-            _ffmpeg(OutputError, path),
-            "-y",
-            "-loglevel",
-            "error",
-            "-f",
-            "rawvideo",
-            "-pix_fmt",
-            "rgb24",
-            "-s",
-            f"{width}x{height}",
-            "-r",
-            f"{fps:g}",
-            "-i",
-            "-",
-            "-an",
-            "-c:v",
-            "libx264",
-            "-preset",
-            preset,
-            "-crf",
-            str(crf),
-            "-pix_fmt",
-            "yuv420p",
-            "-threads",
-            "1",
-            "-fflags",
-            "+bitexact",
-            "-flags:v",
-            "+bitexact",
-            "-map_metadata",
-            "-1",
-            "-movflags",
-            "+faststart",
-            os.fspath(path),
-        ]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._log)
+        av = _av(OutputError, path)
+        self.path, self._shape, self._frame = Path(path), (height, width, 3), av.VideoFrame
+        with self._errors():
+            # Without a date and a version of the encoder, so that the same frames give the same bytes.
+            self._file = av.open(_url(path), "w", options={"fflags": "+bitexact", "movflags": "+faststart"})
+            self._stream = self._file.add_stream("libx264", rate=Fraction(fps).limit_denominator(1_000_000))
+            self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+            self._stream.options = {"preset": preset, "crf": str(crf), "threads": "1", "flags": "+bitexact"}
 
     def write(self, frame: np.ndarray) -> None:
         """Write (height, width, 3) uint8 RGB."""
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise ValueError(f"expected uint8 {self._shape}, got {frame.dtype} {frame.shape}")
-        try:
-            self._process.stdin.write(np.ascontiguousarray(frame).data)
-        except OSError as error:
-            self._fail(error)
+        with self._errors():
+            self._file.mux(self._stream.encode(self._frame.from_ndarray(np.ascontiguousarray(frame), "rgb24")))
 
     def close(self) -> None:
-        if self._process is None:
-            return
-        try:
-            self._process.stdin.close()
-        except OSError as error:
-            self._fail(error)
-        if self._process.wait():
-            self._fail(None)
-        self._release()
+        if self._file is not None:
+            with self._errors():
+                self._file.mux(self._stream.encode(None))
+                self._file.close()
+            self._file = None
 
     def abort(self) -> None:
-        """Stop the encoder; never raises."""
-        if self._process is not None:
-            self._process.kill()
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
-            self._process.wait()
-            self._release()
+        """Close the file as it is; never raises."""
+        if self._file is not None:
+            with contextlib.suppress(Exception):
+                self._file.close()
+            self._file = None
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -103,112 +95,293 @@ class VideoWriter:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close() if kind is None else self.abort()
 
-    def _fail(self, error: OSError | None) -> None:
-        self._process.wait()
-        reason = _last_line(self._log) or (
-            str(error) if error else f"ffmpeg ended with status {self._process.returncode}"
-        )
-        self.abort()
-        raise OutputError(f"cannot write video: {reason}", where=str(self.path)) from error
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:  # PyAV's errors are OSErrors, or ValueErrors of a bad argument
+            self.abort()
+            raise OutputError(f"cannot write video: {_gist(error)}", where=str(self.path)) from error
+        except ValueError as error:
+            self.abort()
+            raise OutputError(f"cannot write video: {_gist(error)}", where=str(self.path)) from error
 
-    def _release(self) -> None:
-        self._log.close()
-        self._process = None
-
-
-_CONTAINERS = (
-    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,asf,ogg,gif,apng,webp_anim,ivf,nut,dv,mxf,"
-    "yuv4mpegpipe,h264,hevc,vvc,av1,obu,m4v,mjpeg,rm,wtv,cine"
-)
-_ALONE = ["-protocol_whitelist", "file", "-format_whitelist", _CONTAINERS]
-"""Only the file itself is read: play lists and manifests (DASH, HLS, concat), which make ffmpeg open other files and
-the network for any file name, are not accepted."""
+    _file: Any = None
 
 
-def _input(path: str | os.PathLike) -> str:
-    """Return the file for ffmpeg, which would take a name with a colon as a protocol."""
-    return f"file:{os.fspath(path)}"
+@dataclass(frozen=True)
+class _Scan:
+    """The packets of a file's video. times_ns : of the frames in the order of display, from the file's start; None
+    where packets have no stamps.   pts : their stamps, ticks.   note : what was made of them, or None.   damage : why
+    the file is not whole, or None."""
+
+    times_ns: list[int | None]
+    pts: list[int]
+    note: str | None
+    damage: str | None
 
 
 class VideoReader:
-    """Frames of any video ffmpeg can decode, as (H, W, 3) uint8 RGB, one at a time.
+    """Frames of any video that FFmpeg decodes, upright, one at a time, each at its own time.
 
-    fps is the container's average rate: frames are taken as equally spaced, also in variable-rate files.
+    height, width : px, as displayed.   count : number of frames.   times_ns : theirs, None where packets have no
+    stamps.   transfer : curve that the file states, as of ``--gamma``, None where it states none that matters (sRGB).
+    levels : codes of black and white; None: the ends of the type.   notes : what was guessed or is lost, a line each.
+    Iterating yields (frame, t_ns): (H, W) or (H, W, 3) RGB, uint8, uint16 or float32, and int ns since the file's
+    start, None where the file has none.
+
+    range : "full" or "limited", overrules the file's.   zero_time : whether the start does not matter.   background :
+    (r, g, b), 0 to 255, below transparent pixels.
 
     Raises
     ------
-    AssetError : unreadable, no video stream; and, while iterating, truncated or corrupt (with the frame's number).
+    AssetError : unreadable, encrypted, no video stream; and, while iterating, truncated or corrupt (with the frame's
+        number).
     """
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        *,
+        range: str | None = None,
+        background: tuple[int, int, int] | None = None,
+        zero_time: bool = False,
+    ):
         self.path = Path(path)
         if not self.path.is_file():
             raise AssetError("no such file", where=str(path))
-        _ffmpeg(AssetError, path)
-        try:
-            probe = imageio_ffmpeg.read_frames(_input(path), input_params=_ALONE)
-            meta = next(probe)
-            probe.close()
-        except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
-            if "not on whitelist" in str(error):
-                accepted = "a video by itself (mp4, mov, mkv, webm, avi …), no list or manifest of others"
-                raise AssetError("cannot read video: not a container", where=str(path), accepted=accepted) from error
-            raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
-        # ffmpeg turns frames upright.
-        self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]
-        self.fps = float(meta.get("fps") or 0)
-        self.expected = round(float(meta.get("duration") or 0) * self.fps)
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        size = self.width * self.height * 3
-        with tempfile.TemporaryFile() as log:
-            command = [
-                imageio_ffmpeg.get_ffmpeg_exe(),
-                "-loglevel",
-                "error",
-                "-nostdin",
-                *_ALONE,
-                "-i",
-                _input(self.path),
-                "-map",
-                "0:v:0",
-                "-fps_mode",
-                "passthrough",
-                "-f",
-                "rawvideo",
-                "-pix_fmt",
-                "rgb24",
-                "-s",
-                f"{self.width}x{self.height}",
-                "-",
-            ]
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, bufsize=size)
-            count = 0
-            try:
-                while len(data := process.stdout.read(size)) == size:
-                    yield np.frombuffer(data, np.uint8).reshape(self.height, self.width, 3)
-                    count += 1
-                status, trouble = process.wait(), _last_line(log)
-            finally:
-                process.kill()
-                process.stdout.close()
-                process.wait()
-        # Decoders also grumble about files that they decode whole: those words alone do not condemn a file.
-        damaged = re.search(
-            r"invalid data|error while decoding|partial file|concealing|corrupt|truncat|ended prematurely",
-            trouble,
-            re.I,
-        )
-        if status or data or count == 0 or damaged or count < 0.95 * self.expected - 2:
+        self._av = _av(AssetError, path)
+        self._range, self._background, self._zero_time = range, background, zero_time
+        self.notes: list[str] = []
+        with self._opened() as (file, stream):
+            self._scan = self._scanned(file, stream)
+            rate = stream.average_rate or stream.guessed_rate
+        self.fps = float(rate) if rate else 0.0
+        self.times_ns = self._scan.times_ns
+        self.count = len(self.times_ns)
+        first = next(self._decoded(), None)
+        if first is None:
             raise AssetError(
-                f"video truncated or corrupt after frame {count}" + (f": {trouble}" if trouble else ""),
-                where=str(self.path),
+                f"cannot read video: no frame can be decoded{_because(self._scan.damage)}", where=str(path)
             )
+        self._look_at(first)
+
+    def _look_at(self, frame: av.VideoFrame) -> None:
+        """Take from the first frame what holds for all."""
+        parts, notes = frame.format.components, self.notes
+        self._upright = _orientation(frame)
+        self.width, self.height = frame.width, frame.height
+        if self._upright[0]:
+            self.width, self.height = self.height, self.width
+        self._bits = max(part.bits for part in parts)
+        self._alpha = any(part.is_alpha for part in parts)
+        self._grey = len(parts) == 1 + self._alpha and frame.format.name != "pal8"
+        self.transfer = TRANSFERS.get(int(frame.color_trc))
+        stated = _RANGES.get(int(frame.color_range))
+        # Codes of grey and RGB stay as they are; YUV is converted with its range.
+        self._by_levels = self._grey or frame.format.is_rgb or frame.format.name == "pal8"
+        self.levels = None
+        if self._by_levels and (self._range or (stated if self._grey else None)) == "limited":
+            self.levels = tuple(code << self._bits - 8 for code in (16, 235))
+        elif self._by_levels and 8 < self._bits < 16 and not self._alpha:
+            self.levels = 0, 2**self._bits - 1
+        unstated = [] if self._by_levels or stated or self._range else ["range (limited; --range full for another)"]
+        if not self._by_levels and int(frame.colorspace) == _UNSPECIFIED:
+            unstated.append("YUV matrix (BT.601)")
+        if unstated:
+            notes.append(f"not stated by the video, so taken as usual: {' and '.join(unstated)}")
+        if self._scan.note:
+            notes.append(self._scan.note)
+        if self.transfer is not None:
+            notes.append(f"the video states the curve {self.transfer} (--gamma for another)")
+        if frame.interlaced_frame:
+            notes.append("interlaced video: both fields, which are of different times, are taken as one frame")
+        if self._scan.times_ns and self._scan.times_ns[0] and not self._zero_time:
+            notes.append(f"the first frame is at {self._scan.times_ns[0] / 1e9:.6g} s of the file (--zero-time: at 0)")
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, int | None]]:
+        pts, at, count = self._scan.pts, 0, 0
+        damage = self._scan.damage
+        frames = self._decoded()
+        while True:
+            try:
+                frame = next(frames, None)
+            except AssetError as error:
+                damage = error.problem
+                break
+            if frame is None:
+                break
+            if frame.is_corrupt:
+                damage = damage or "a frame is corrupt"
+                break
+            time = None if pts or count >= self.count else self.times_ns[count]
+            if pts and frame.pts is not None:
+                # Packets that gave no frame are passed over, so that the others keep their times.
+                while at < len(pts) and pts[at] < frame.pts:
+                    at += 1
+                if at < len(pts) and pts[at] == frame.pts:
+                    time, at = self._scan.times_ns[at], at + 1
+                else:  # it runs back, which whoever reads the frames refuses
+                    time = round((frame.pts * self._tick - self._start) * 10**9)
+            yield self._pixels(frame), time
+            count += 1
+        if damage or count < self.count:
+            raise AssetError(
+                f"video truncated or corrupt after frame {count}{_because(damage)}",
+                where=str(self.path),
+                accepted=f"a whole file of {self.count} frames",
+            )
+
+    def _pixels(self, frame: av.VideoFrame) -> np.ndarray:
+        """Return a frame's pixels, upright."""
+        image = self._codes(frame)
+        if self._alpha:
+            image, note = over(image, self._background)
+            if note and note not in self.notes:
+                self.notes.append(note)
+        transposed, left, up = self._upright
+        if transposed:
+            image = image.swapaxes(0, 1)
+        return np.ascontiguousarray(image[:: -1 if up else 1, :: -1 if left else 1])
+
+    def _codes(self, frame: av.VideoFrame) -> np.ndarray:
+        """Return (H, W), (H, W, 3) or, with alpha, (H, W, 4) codes."""
+        name, bits = frame.format.name, self._bits
+        planar = name.startswith(("yuv", "yuvj", "gbr", "gray")) and name.endswith(("p", "le", "gray")) and bits <= 16
+        if bits == 32 or (bits == 16 and "f16" in name):
+            return _floats(frame)
+        if planar and (self._by_levels or known(int(frame.colorspace))):
+            planes = [_plane(plane, bits) for plane in frame.planes]
+            if self._grey:
+                return planes[0]
+            if self._by_levels:  # the planes are G, B, R, A
+                rgb = np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
+                return np.rint(rgb * (65535.0 / (2**bits - 1))).astype(np.uint16) if self._alpha and bits > 8 else rgb
+            limited = (self._range or _RANGES.get(int(frame.color_range), "limited")) == "limited"
+            limited = limited and not (name.startswith("yuvj") and self._range is None)
+            rgb = rgb_from_yuv((planes[0], planes[1], planes[2]), bits, int(frame.colorspace), limited)
+            if not self._alpha:
+                return rgb
+            alpha = planes[3] if bits == 8 else np.rint(planes[3] * (65535.0 / (2**bits - 1))).astype(np.uint16)
+            return np.dstack([rgb, alpha])
+        if not self._by_levels and (name in _PACKED) and known(int(frame.colorspace)):
+            return self._codes(frame.reformat(format=_PACKED[name]))
+        wanted = ("rgba" if self._alpha else "rgb24") if bits <= 8 else "rgba64le" if self._alpha else "rgb48le"
+        if self._grey and bits <= 8:
+            wanted = "rgba" if self._alpha else "gray"
+        return frame.to_ndarray() if name == wanted else frame.reformat(format=wanted).to_ndarray()
+
+    def _scanned(self, file: av.container.InputContainer, stream: av.VideoStream) -> _Scan:
+        """Read the packets, without decoding them: the times of all frames, and whether the file is whole."""
+        if len(file.streams.video) > 1:
+            self.notes.append(f"{len(file.streams.video)} video streams: the first is read")
+        stamps, without, end = [], 0, 0.0
+        problem = None
+        with _logged(self._av) as log:
+            try:
+                for packet in file.demux():
+                    if not packet.size:
+                        continue
+                    if packet.pts is not None and packet.time_base:
+                        end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+                    if packet.stream is not stream or packet.is_discard:
+                        continue
+                    if packet.has_sidedata("encryption_info"):
+                        raise AssetError("encrypted video", where=str(self.path), accepted="a file without protection")
+                    if packet.pts is None:
+                        without += 1
+                    else:
+                        stamps.append(packet.pts)
+            except self._av.FFmpegError as error:
+                problem = _gist(error)
+        wanted, found = stream.frames, len(stamps) + without
+        seconds = (file.duration or 0) / 1e6
+        cut = [line for line in log if re.search(r"ended prematurely|partial file|truncat", line, re.I)]
+        if problem is None and found < wanted:
+            problem = f"{found} of {wanted} frames"
+        elif problem is None and cut:
+            problem = cut[0]
+        elif problem is None and file.format.name.startswith("matroska") and end < 0.95 * seconds - 0.1:
+            problem = f"{end:.3g} of {seconds:.3g} s"
+        self._start, self._tick = Fraction(file.start_time or 0, 1_000_000), stream.time_base
+        if file.format.name == "avi" and stamps:  # its stamps count decoding, which begins earlier
+            self._start = min(stamps) * self._tick
+        if without:  # some AVI and raw streams: nothing says when, so the frame rate does
+            rate = stream.average_rate or stream.guessed_rate
+            times = [round(k * 10**9 / rate) if rate else None for k in range(found)]
+            return _Scan(times, [], None, problem)
+        ticks = sorted(stamps)
+        rates = [rate for rate in (stream.average_rate, stream.base_rate, stream.guessed_rate) if rate]
+        times, note = frame_times(ticks, self._tick, self._start, rates)
+        return _Scan(times, ticks, note, problem)
+
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        with self._opened() as (file, stream):
+            stream.thread_type = "AUTO"
+            try:
+                yield from file.decode(stream)
+            except self._av.FFmpegError as error:
+                raise AssetError(_gist(error), where=str(self.path)) from error
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+        accepted = "a video by itself (mp4, mov, mkv, webm, avi …), no list or manifest of others"
+        with contextlib.ExitStack() as stack:
+            try:
+                file = stack.enter_context(self._av.open(_url(self.path), options=_ALONE))
+            except (self._av.FFmpegError, OSError, ValueError) as error:
+                # A format that is not on the list is an invalid argument for FFmpeg.
+                reason = "not a video" if getattr(error, "errno", 0) == errno.EINVAL else _gist(error)
+                raise AssetError(f"cannot read video: {reason}", where=str(self.path), accepted=accepted) from error
+            if not set(file.format.name.split(",")) & _FORMATS:
+                raise AssetError("cannot read video: not a container", where=str(self.path), accepted=accepted)
+            # A cover of an audio file counts as a video stream, too.
+            streams = [s for s in file.streams.video if not s.disposition & self._av.stream.Disposition.attached_pic]
+            if not streams:
+                raise AssetError("no pictures in the file: it has no video stream", where=str(self.path))
+            stream = streams[0]
+            if stream.codec_context is None:
+                raise AssetError("cannot read video: unknown codec", where=str(self.path))
+            if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
+                size = f"{stream.codec_context.width}x{stream.codec_context.height}"
+                raise AssetError(
+                    "video too large", where=str(self.path), value=size, accepted="at most 268 Mpx a frame"
+                )
+            yield file, stream
+
+
+def _orientation(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
+    """Return (transposed, mirrored left to right, upside down), in the order of application, by which a frame becomes
+    upright: x' = a x + c y, y' = b x + d y of its display matrix (ISO 14496-12, 8.3.2)."""
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+            if abs(b) > abs(a):
+                return True, c < 0, b < 0
+            return False, a < 0, d < 0
+    return False, False, False
+
+
+def _plane(plane: av.video.plane.VideoPlane, bits: int) -> np.ndarray:
+    """Return a plane's samples, (H, W) uint8 or uint16."""
+    dtype = np.dtype(np.uint8) if bits <= 8 else np.dtype("<u2")
+    rows = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    return rows[: plane.height, : plane.width]
+
+
+def _floats(frame: av.VideoFrame) -> np.ndarray:
+    """Return (H, W), (H, W, 3) or (H, W, 4) float32 of a frame of 16- or 32-bit floats, planes G, B, R, A."""
+    dtype = np.dtype("<f2") if "f16" in frame.format.name else np.dtype("<f4")
+    planes = [
+        np.frombuffer(plane, dtype).reshape(frame.height, -1)[:, : frame.width].astype(np.float32)
+        for plane in frame.planes
+    ]
+    return planes[0] if len(planes) == 1 else np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """Return (H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; ffmpeg does. Raises
-    AssetError: undecodable."""
+    """Return (H, W, 3), (H, W, 4) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; FFmpeg
+    has. Raises AssetError: undecodable."""
     if not os.path.isfile(path):
         raise AssetError("no such file", where=str(path))
     return decode_exr(Path(path).read_bytes(), str(path))
@@ -216,43 +389,56 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
 
 def decode_exr(data: bytes, where: str) -> np.ndarray:
     """Return :func:`read_exr` of bytes already read."""
-    # Through a pipe, and as OpenEXR whatever it looks like: a name such as f%d.exr would be a pattern of names. ffmpeg
-    # finds no end of an image in a pipe by itself.
-    whole = ["-f", "exr_pipe", "-c:v", "exr", "-frame_size", str(len(data))]
-    command = [_ffmpeg(AssetError, where), "-loglevel", "error", *whole, "-i", "pipe:0"]
-    command += ["-frames:v", "1", "-c:v", "pfm", "-f", "image2pipe", "-"]
-    result = subprocess.run(command, input=data, capture_output=True)
-    if result.returncode or not result.stdout:
-        raise AssetError(f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=where)
-    return decode_pfm(result.stdout, where)
-
-
-def _ffmpeg(error: type, where) -> str:
+    av = _av(AssetError, where)
     try:
-        return imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as problem:
-        raise error(
-            "no ffmpeg binary for video",
-            where=str(where),
-            accepted="use pip install imageio-ffmpeg, or set IMAGEIO_FFMPEG_EXE",
-        ) from problem
+        frames = av.CodecContext.create("exr", "r").decode(av.Packet(data))
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise AssetError(f"cannot decode OpenEXR image: {_gist(error)}", where=where) from error
+    if not frames or "f" not in frames[0].format.name:
+        raise AssetError("cannot decode OpenEXR image: no picture of floats", where=where)
+    return _floats(frames[0])
 
 
-def _last_line(log) -> str:
-    log.seek(0)
-    return _gist(log.read().decode(errors="replace"))
+@functools.cache
+def _imported() -> Any:
+    import av
+
+    return av
 
 
-def _gist(text: str) -> str:
-    """Return ffmpeg's most informative line, without addresses."""
-    lines = [re.sub(r"^\[[^\]]*\]\s*", "", line).strip() for line in text.splitlines()]
-    lines = [re.sub(r" @ 0x[0-9a-f]+", "", line) for line in lines if line]
-    telling = [
-        line
-        for line in lines
-        if re.search(
-            r"invalid|error|not found|no space|denied|partial|truncat|corrupt|moov|no such|premature", line, re.I
-        )
-        and not line.startswith(("Conversion failed", "Error opening input file"))
-    ]
-    return (telling or lines or [""])[-1][:200]
+def _av(error: type, where: str | os.PathLike) -> Any:
+    """Return PyAV. Raises ``error`` where it is not installed."""
+    try:
+        return _imported()
+    except ImportError as problem:
+        raise error("no FFmpeg for video", where=str(where), accepted="use pip install av") from problem
+
+
+@contextlib.contextmanager
+def _logged(av: Any) -> Iterator[list[str]]:
+    """Return the lines that FFmpeg reports from this thread, filled at the end."""
+    lines: list[str] = []
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.ERROR)
+    try:
+        with av.logging.Capture() as logs:
+            yield lines
+        lines += [f"{name}: {text}".strip() for _, name, text in logs]
+    finally:
+        av.logging.set_level(level)
+
+
+def _url(path: str | os.PathLike) -> str:
+    """Return the file for FFmpeg, which would take a name with a colon as a protocol."""
+    return f"file:{os.fspath(path)}"
+
+
+def _because(reason: str | None) -> str:
+    return f": {reason}" if reason else ""
+
+
+def _gist(error: BaseException) -> str:
+    """Return FFmpeg's own reason, without errno, file and addresses."""
+    log = getattr(error, "log", None)
+    text = log[2] if log else getattr(error, "strerror", None) or str(error)
+    return " ".join(re.sub(r" @ 0x[0-9a-f]+", "", text).split())[:200]

@@ -18,6 +18,7 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.frames import NOTHING, Declared
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.clip import (
     PLAIN,
@@ -126,8 +127,7 @@ def calibrate(
     emulator: str | EmulatorConfig | dict = EmulatorConfig.members.default,
     fixed: Iterable[str] = (),
     still: bool = False,
-    fps: float | None = None,
-    timestamps: str | os.PathLike | None = None,
+    declared: Declared = NOTHING,
     starts: int = 3,
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
@@ -136,7 +136,8 @@ def calibrate(
     """Fit an emulator to a recording.
 
     frames : of the scene, of the camera's size and at the middle of the exposures
-    (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   reading : how they are interpreted.
+    (:func:`~blinkgl.io.frames.open_frames`; default: the recording's own).   declared : what the user says of them;
+    zero_time also counts events from the first.   reading : how they are interpreted.
     still : a static scene in constant light, without frames: only noise.
     emulator : a name, or the initial configuration; ``fixed``: keys that keep their values.
     starts : of the search.   progress : called with (current activity, fraction).   events : what is declared of the
@@ -151,16 +152,19 @@ def calibrate(
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
     if progress:
         progress("reading", 0.0)
-    read, size, said = read_recording(recording, events, least=LEAST_EVENTS)
+    stream, size, said = read_recording(recording, events, least=LEAST_EVENTS)
     given = None
     if not still:
         frames = _own_frames(recording) if frames is None else frames
-        timed, exposures = timed_frames(frames, fps=fps, timestamps=timestamps)
-        given, reading = list(timed), replace(reading, exposures=exposures, name=os.fspath(frames))
+        source, exposures = timed_frames(frames, declared)
+        given, said = list(source), [*said, *source.notes]
+        codes = replace(reading.codes, white_level=declared.white_level, range=declared.range).of(source)
+        reading = replace(reading, codes=codes, exposures=exposures, name=os.fspath(frames))
+    if declared.zero_time:
+        stream = replace(stream, t=stream.t - stream.t[0])
     search = dict(emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    result = calibrate_events(read, size, given, reading, name=os.fspath(recording), **search)
-    result.warnings.extend(said)
-    return result
+    result = calibrate_events(stream, size, given, reading, name=os.fspath(recording), **search)
+    return replace(result, notes=[*result.notes, *said])
 
 
 def calibrate_events(
@@ -220,7 +224,7 @@ def calibrate_events(
         streams[0],
         streams[1],
         notes,
-        None if frames is None else reading.gamma,
+        clip.gamma,
         warnings,
     )
 
@@ -361,7 +365,7 @@ def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]
         ),
     ]
     notes.append(
-        f"The frames' codes were taken as `--gamma {reading.gamma}`; the sensor file tells `simulate`, which takes "
+        f"The frames' codes were taken as `--gamma {clip.gamma}`; the sensor file tells `simulate`, which takes "
         "grey images of the sensor's size for the camera's own."
     )
     if "bursts" in facts:

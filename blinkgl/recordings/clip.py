@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -20,12 +20,12 @@ from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.formats import open_events
-from blinkgl.io.frames import RECORDING, open_frames
+from blinkgl.io.frames import NOTHING, Declared, FrameSource, open_frames
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
-from blinkgl.recordings.decoding import Decoder, noise_of
-from blinkgl.recordings.frame_noise import LOOKED_AT, Steadied
+from blinkgl.recordings.decoding import UNKNOWN, Codes, OwnFrames, meaning
+from blinkgl.recordings.frame_noise import Steadied
 from blinkgl.timeline.interpolate import Displacement, motion
 from blinkgl.types.events import Events
 
@@ -63,7 +63,7 @@ class Clip:
     light : (h, w) uint8, eighth of the brightness, 0 the darkest.   change : (K, h, w) float32, of ln(I + 10).
     sensor : (height, width) of the camera.   share : of its pixels that are in the clip.
     bursts : (N, 2) int64 µs, of events that the camera's frames set off: what lies there counts, but not when.
-    facts : what was found out on the way, by name."""
+    facts : what was found out on the way, by name.   gamma : curve of the frames' codes; None: there are no frames."""
 
     frames: list[tuple[int, np.ndarray]]
     clock_us: np.ndarray
@@ -77,6 +77,7 @@ class Clip:
     share: float = 1.0
     bursts: np.ndarray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     facts: dict[str, float] = field(default_factory=dict)
+    gamma: str | float | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -107,11 +108,12 @@ class Clip:
 class FrameReading:
     """How the frames beside a recording are interpreted.
 
-    gamma : of their codes, "linear", "srgb" or an exponent.   interpolate : between two frames, "motion" or "linear";
-    max_px : of motion, px per step.   delay_ms : of the frames' clock against the events'; None: estimated from both.
-    exposures : whether their times are known to be the middles of exposures.   name : for messages."""
+    codes : what is known of their codes; grey ones of the sensor's size are its own, linear.   interpolate : between
+    two frames, "motion" or "linear"; max_px : of motion, px per step.   delay_ms : of the frames' clock against the
+    events'; None: estimated from both. exposures : whether their times are known to be the middles of exposures.   name
+    : for messages."""
 
-    gamma: str | float = "linear"
+    codes: Codes = UNKNOWN
     interpolate: str = "motion"
     max_px: float = 1.0
     delay_ms: float | None = None
@@ -120,7 +122,7 @@ class FrameReading:
 
 
 PLAIN = FrameReading()
-"""Linear codes at times that are estimated."""
+"""A camera's own frames at times that are estimated."""
 
 
 def clip_of_frames(
@@ -136,7 +138,7 @@ def clip_of_frames(
 
     frames : (array, t_ns, name), at the middle of their exposures.   size : (height, width) of the events' sensor.
     Raises EventDataError: frames of another size, no common time, saturated frames, clocks that do not match."""
-    grey, steady, clock, full = _greys(frames, size, reading)
+    grey, steady, clock, full, gamma = _greys(frames, size, reading)
     facts: dict[str, float] = {"saturated": float(full.mean())}
     full |= stuck_pixels(events, size)
     bursts = frame_bursts(events, float(np.median(np.diff(clock)))) if len(clock) > 1 else np.empty((0, 2), np.int64)
@@ -180,6 +182,7 @@ def clip_of_frames(
         tiles.share,
         bursts,
         facts,
+        gamma,
     )
 
 
@@ -191,11 +194,11 @@ def _changes(grey: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
 
 def _greys(
     frames: Iterable[tuple[np.ndarray, int, str]], size: tuple[int, int], reading: FrameReading
-) -> tuple[list[np.ndarray], Callable[[list[np.ndarray]], list[np.ndarray]], np.ndarray, np.ndarray]:
-    """Return the frames' luminance, the removal of their noise, their times in µs, and (H, W) bool, pixels saturated in
-    any frame."""
-    decode = Decoder(reading.gamma)
-    grey, times, full, first = [], [], np.zeros(size, bool), []
+) -> tuple[list[np.ndarray], Callable[[list[np.ndarray]], list[np.ndarray]], np.ndarray, np.ndarray, str | float]:
+    """Return the frames' luminance, the removal of their noise, their times in µs, (H, W) bool, pixels saturated in
+    any frame, and the curve of their codes."""
+    decode, steadied, white = None, None, None
+    grey, times, full = [], [], np.zeros(size, bool)
     for frame, t_ns, name in frames:
         if frame.shape[:2] != size:
             raise EventDataError(
@@ -204,11 +207,15 @@ def _greys(
                 value=f"{frame.shape[1]}x{frame.shape[0]}",
                 accepted=f"{size[1]}x{size[0]}, as its events",
             )
+        if decode is None:
+            found = meaning(frame, replace(reading.codes, own=OwnFrames(size, "linear")))
+            decode, white = found.decode, found.white
+            if frame.dtype.kind == "u":
+                # It takes luminance, of which no more than the distance of two codes is to be known.
+                steadied = Steadied(lambda light: light, decode.code_distance(frame.dtype))
         if frame.dtype.kind == "u":
-            top = frame >= np.iinfo(frame.dtype).max
+            top = frame >= (white or np.iinfo(frame.dtype).max)
             full |= top.any(axis=2) if top.ndim == 3 else top
-        if len(first) < LOOKED_AT:
-            first.append(frame)
         grey.append(decode(frame, name))
         times.append(t_ns)
     if full.mean() > MOST_SATURATED:
@@ -218,9 +225,15 @@ def _greys(
             value=f"{100 * full.mean():.0f} %",
             accepted=f"at most {100 * MOST_SATURATED:.0f} % (a shorter exposure)",
         )
-    noise = noise_of(first, decode) if first else None
-    steady = lambda lights: lights if noise is None else list(map(Steadied(noise), lights))
-    return grey, steady, np.array(times, np.int64) // 1000, full
+
+    def steady(lights: list[np.ndarray]) -> list[np.ndarray]:
+        if steadied is None:
+            return lights
+        quiet = (steadied(light, light) for light in lights)
+        return [light if values is None else values for light, values in zip(lights, quiet)]
+
+    gamma = "linear" if decode is None else decode.gamma
+    return grey, steady, np.array(times, np.int64) // 1000, full, gamma
 
 
 def _delay(found_us: int, correlation: float, reading: FrameReading) -> int:
@@ -439,14 +452,11 @@ def read_recording(
             accepted=f"{least:,} or more",
         )
     assert file.height is not None and file.width is not None
-    return events, (file.height, file.width), file.said
+    return events, (file.height, file.width), file.notes
 
 
-def timed_frames(
-    path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
-) -> tuple[Iterator[tuple[np.ndarray, int, str]], bool]:
+def timed_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> tuple[FrameSource, bool]:
     """Return frames as :func:`~blinkgl.io.frames.open_frames` does, and whether their times are known to be the middles
     of exposures."""
-    source = open_frames(path, fps=fps, timestamps=timestamps)
-    exposures = source.path.suffix.lower() in RECORDING and fps is None and timestamps is None
-    return iter(source), exposures
+    source = open_frames(path, declared)
+    return source, source.origin == "camera" and declared.fps is None and declared.timestamps is None

@@ -17,6 +17,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
+from blinkgl.io.frames import NOTHING, Declared
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
@@ -88,8 +89,8 @@ class Comparison:
     """how well a judge distinguishes b from a; None: not requested, or there is no b"""
     halves: tuple[Judgement, ...] = ()
     """how well it distinguishes the halves of each recording, a's first"""
-    said: tuple[str, ...] = ()
-    """what was guessed or left out when the files were read, a line each"""
+    notes: list[str] = field(default_factory=list)
+    """what was guessed, left out or unusual when files and frames were read, a line each"""
 
     @property
     def same_size(self) -> bool:
@@ -116,6 +117,7 @@ class Comparison:
     def rows(self) -> list[tuple[str, str, str]]:
         """Return (quantity, a, b) as text, for a table; quantities of the pair are in the last column."""
         sides = [self.a] + ([self.b] if self.b else [])
+        spread = lambda values: _spread(values, np.diff(self.edges_us))
         each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))
         rows = [
             ("sensor", *each(lambda s: s.size)),
@@ -128,14 +130,14 @@ class Comparison:
         ]
         if self.a.frame_correlation is not None:
             rows += [
-                ("polarity sum : Δ ln(I+10), correlation", *each(lambda s: _spread(s.frame_correlation))),
-                ("implied contrast threshold", *each(lambda s: _spread(s.implied_threshold))),
+                ("polarity sum : Δ ln(I+10), correlation", *each(lambda s: spread(s.frame_correlation))),
+                ("implied contrast threshold", *each(lambda s: spread(s.implied_threshold))),
             ]
         if self.b:
-            rows += [("event-rate ratio B / A per interval", "", _spread(self.rate_ratio))]
+            rows += [("event-rate ratio B / A per interval", "", spread(self.rate_ratio))]
             if self.same_size:
                 rows += [
-                    ("polarity sums A : B per interval, correlation", "", _spread(self.polarity_correlation)),
+                    ("polarity sums A : B per interval, correlation", "", spread(self.polarity_correlation)),
                     ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}"),
                 ]
             rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
@@ -189,9 +191,8 @@ def compare(
     b: str | os.PathLike | None = None,
     *,
     frames: str | os.PathLike | None = None,
-    fps: float | None = None,
-    timestamps: str | os.PathLike | None = None,
-    gamma: str | float = "linear",
+    declared: Declared = NOTHING,
+    gamma: str | float | None = None,
     frame_delay_ms: float = 0.0,
     interval_ms: float = 20.0,
     zero_time: bool = False,
@@ -204,11 +205,13 @@ def compare(
     Recordings of different sensor sizes are described side by side; pixel-wise results are then None.
 
     Intervals are those between frames where frames are given, else ``interval_ms``. ``b`` may itself be frames (a
-    folder, video, .npy of frames): anything that is not an event file. gamma : of the frames; "linear" uses the codes
-    as intensities, as for a DAVIS's frames.
+    folder, video, .npy of frames): anything that is not an event file. declared : what the user says of the frames.
+    gamma : of their codes; None: as of :func:`~blinkgl.recordings.decoding.meaning`, where grey images count as the
+    camera's own, whose codes are intensities.
     frame_delay_ms : added to the frames' times; a stamp of the exposure's start is before its centre. zero_time : count
-    both recordings from their first event. judge : also train a classifier to distinguish them
-    (:mod:`~blinkgl.recordings.judge`), which holds their events in memory. reading : what is declared of both.
+    both recordings from their first event, and frames from the first of them. judge : also train a classifier to
+    distinguish them (:mod:`~blinkgl.recordings.judge`), which holds their events in memory. reading : what is declared
+    of both event files.
 
     Raises EventDataError: frames of another size than a recording, no common time, too few events for a judge.
     AssetError: unreadable.
@@ -220,13 +223,17 @@ def compare(
     shifts = [s[0] if zero_time else 0 for s in spans]
     start, stop = max(s[0] - d for s, d in zip(spans, shifts)), min(s[1] - d for s, d in zip(spans, shifts))
     changes: Iterator[np.ndarray | None]
+    notes: list[str] = []
     if frames is not None:
-        edges, changes = _frame_intervals(
-            frames, fps, timestamps, gamma, round(frame_delay_ms * 1000), start, stop, files
+        declared = replace(declared, zero_time=zero_time or declared.zero_time)
+        edges, changes, notes = _frame_intervals(
+            frames, declared, gamma, round(frame_delay_ms * 1000), start, stop, files
         )
     else:
-        count = int(np.ceil(max(stop - start, 0) / (interval_ms * 1000)))
-        edges = start + np.arange(count + 1) * round(interval_ms * 1000)
+        step = round(interval_ms * 1000)
+        # What remains at the end is an interval of its own length, or lengthens the last one.
+        count = max(round((stop - start) / step), 1) if stop > start else 0
+        edges = np.append(start + np.arange(count) * step, stop) if count else np.empty(0, np.int64)
         changes = iter([None] * count)
     if len(edges) < 2:
         raise EventDataError(
@@ -236,7 +243,8 @@ def compare(
             accepted="recordings that overlap (seconds shown), or --zero-time",
         )
     result = _accumulate(files, shifts, edges, changes)
-    result.said = tuple(f"{file.path}: {line}" for file in files for line in file.said)
+    result.notes += [f"{file.path}: {line}" for file in files for line in file.notes]
+    result.notes += notes
     if judge:
         result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))
     return result
@@ -360,12 +368,21 @@ def _span(file: EventFile) -> tuple[int, int]:
     return first, last + 1
 
 
-def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, stop: int, files: list[EventFile]):
-    """Edges (µs) of the frame intervals inside [start, stop) and, lazily, the change of ln(I + 10) over each."""
+def _frame_intervals(
+    path: str | os.PathLike,
+    declared: Declared,
+    gamma: str | float | None,
+    delay_us: int,
+    start: int,
+    stop: int,
+    files: list[EventFile],
+) -> tuple[np.ndarray, Iterator[np.ndarray], list[str]]:
+    """Return the edges (µs) of the frame intervals inside [start, stop), lazily the change of ln(I + 10) over each, and
+    notes on the frames."""
     from blinkgl.io.frames import open_frames
-    from blinkgl.recordings.decoding import Decoder
+    from blinkgl.recordings.decoding import Codes, OwnFrames, meaning
 
-    source = open_frames(path, fps=fps, timestamps=timestamps)
+    source = open_frames(path, declared)
     if any((f.height, f.width) != (source.height, source.width) for f in files):
         sizes = "; ".join(
             f"{name}: {width}x{height}"
@@ -388,20 +405,22 @@ def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, st
         if times[k] >= start - slack(times[k], times[k + 1]) and times[k + 1] <= stop + slack(times[k], times[k + 1])
     ]
     if not inside:
-        return np.empty(0, np.int64), iter(())
+        return np.empty(0, np.int64), iter(()), source.notes
     lo, hi = inside[0], inside[-1] + 1
-    decode = Decoder(gamma)
+    own = OwnFrames((source.height, source.width), "linear")
+    codes = Codes(gamma, declared.white_level, declared.range, own).of(source)
+    found = meaning(next(iter(source))[0], codes)
 
     def changes() -> Iterator[np.ndarray]:
         before = None
         for k, (frame, _, name) in enumerate(source):
             if lo <= k <= hi:
-                log = np.log(decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
+                log = np.log(found.decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
                 if before is not None:
                     yield log - before
                 before = log
 
-    return times[lo : hi + 1], changes()
+    return times[lo : hi + 1], changes(), [*source.notes, *found.notes]
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:
@@ -427,9 +446,15 @@ def _is_event_file(path) -> bool:
     return path.suffix.lower() in ENDINGS and not path.is_dir()
 
 
-def _spread(values: np.ndarray) -> str:
-    values = values[np.isfinite(values)]
-    return f"{np.mean(values):.3f} ({np.min(values):.3f} … {np.max(values):.3f})" if len(values) else "–"
+def _spread(values: np.ndarray, lengths: np.ndarray) -> str:
+    """Return the mean over intervals, weighed by their lengths, the least and the largest value."""
+    known = np.isfinite(values)
+    values, lengths = values[known], lengths[known]
+    return (
+        f"{np.average(values, weights=lengths):.3f} ({np.min(values):.3f} … {np.max(values):.3f})"
+        if len(values)
+        else "–"
+    )
 
 
 def _plain(value: Any) -> Any:

@@ -30,7 +30,15 @@ class Fitting:
         way = cv2.INTER_AREA if self.wanted[0] <= height else cv2.INTER_LINEAR
         return cv2.resize(cut, self.wanted[::-1], interpolation=way)
 
+    @property
+    def loses_much(self) -> bool:
+        """Return whether less than half of the picture remains, as of a portrait video on a landscape sensor."""
+        return self.part[0] * self.part[1] < 0.5 * self.given[0] * self.given[1]
+
     def __str__(self) -> str:
         named = lambda size: f"{size[1]}x{size[0]}"
-        cropped = "" if self.part == self.given else f"cropped to {named(self.part)} and "
+        share = 100 * self.part[0] * self.part[1] / (self.given[0] * self.given[1])
+        y, x = (self.given[0] - self.part[0]) // 2, (self.given[1] - self.part[1]) // 2
+        kept = f"cropped to {named(self.part)}, {share:.0f} % of the picture, from x {x}, y {y} on, and "
+        cropped = "" if self.part == self.given else kept
         return f"frames of {named(self.given)} are {cropped}scaled to {named(self.wanted)}"

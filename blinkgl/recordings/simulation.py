@@ -16,7 +16,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,12 @@ from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.io.frames import VIDEO, open_frames
-from blinkgl.recordings.decoding import Decoder, checked_gamma, noise_of
+from blinkgl.io.clock import NANOSECONDS, checked_unit
+from blinkgl.io.frames import NOTHING, Declared, open_frames
+from blinkgl.recordings.decoding import UNKNOWN, Codes, Decoder, OwnFrames, checked_gamma, meaning
 from blinkgl.recordings.fitting import Fitting
-from blinkgl.recordings.frame_noise import LOOKED_AT, FrameNoise, Steadied, caveats
+from blinkgl.recordings.frame_checks import FrameChecks
+from blinkgl.recordings.frame_noise import FrameNoise, Steadied
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
@@ -37,17 +39,7 @@ if TYPE_CHECKING:
     from blinkgl.config.sensor import SensorConfig
     from blinkgl.sequence_files.preview import PreviewWriter
 
-_SPARSE = 8
-"""A frame's brightness uses every n-th row and column."""
 INTERPOLATIONS = ("linear", "motion")
-
-
-class OwnFrames(NamedTuple):
-    """Properties of a sensor's own frames: grey, of the sensor's (height, width), with this curve from codes to
-    light."""
-
-    size: tuple[int, int]
-    gamma: str | float
 
 
 def own_frames(sensor: SensorConfig | None) -> OwnFrames | None:
@@ -61,11 +53,10 @@ def own_frames(sensor: SensorConfig | None) -> OwnFrames | None:
 class FrameUse:
     """How given frames are converted to light; see :func:`frames_to_events`."""
 
-    gamma: str | float | None = None
+    codes: Codes = UNKNOWN
     interpolate: str = "linear"
     max_px: float = 1.0
     keep_noise: bool = False
-    own: OwnFrames | None = None
 
 
 @dataclass
@@ -93,13 +84,16 @@ class SimulationReport:
     moved_px: list[float] = field(default_factory=list)
     """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
     assumed_gamma: str | float | None = None
-    """assumed curve of integer codes without a given one: that of the sensor's own frames, or srgb"""
+    """assumed curve of codes without a given one: that of the sensor's own frames, srgb of integers, linear of
+    floats"""
     fitting: Fitting | None = None
     """conversion of frames to the sensor's size; None: not needed"""
     noise: FrameNoise | None = None
     """noise of the frames, from which no events were made; None: exact frames, or it was kept"""
+    notes: list[str] = field(default_factory=list)
+    """what was read that is unusual, guessed or left out, a line each, with the option that overrules it"""
     caveats: list[str] = field(default_factory=list)
-    """problems of the frames, a line each: few codes, clipped, flicker"""
+    """problems of the frames, a line each: few codes, clipped, repeated, flicker"""
 
     @property
     def duration_s(self) -> float:
@@ -126,57 +120,82 @@ class SimulationReport:
 
 def frames_to_events(
     frames: Iterable,
+    use: FrameUse = FrameUse(),
     *,
     fps: float | None = None,
+    unit: str = "ns",
+    zero_time: bool = False,
     emulator: str | EmulatorConfig = EmulatorConfig.members.default,
-    gamma: str | float | None = None,
-    interpolate: str = "linear",
-    max_px: float = 1.0,
-    keep_noise: bool = False,
-    own: OwnFrames | None = None,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     report: SimulationReport | None = None,
+    **given: Any,
 ) -> Iterator[Events]:
-    """Yield the events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
+    """Yield the events of a stream of frames, one chunk per given frame as soon as it has come, an empty one too,
+    sorted, int64 µs on the frames' clock. Arrays are used before the next is asked for, so that one buffer may serve
+    all.
 
     Parameters
     ----------
-    frames : iterable of (H, W) or (H, W, 3) RGB arrays with ``fps``, of (array, t_ns) pairs or (array, t_ns, name)
-        triples (such as a :class:`~blinkgl.io.frames.FrameSource`). uint8, uint16 (full scale 1.0) or float (1.0 is
-        white, more is allowed).
+    frames : iterable of (H, W) or (H, W, 3) RGB arrays with ``fps``, of (array, time) pairs or (array, time, name)
+        triples (such as a :class:`~blinkgl.io.frames.FrameSource`). uint8, uint16 or float.
+    unit : of the times: "ns", which are whole numbers, or "s", "ms", "us", which may be floats.   zero_time : count
+        them from the first frame.
     emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
-    gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: linear for floats; for integers that of
-        ``own`` where frames match it, else srgb.
-    interpolate : "linear": the given frames, between which the emulators interpolate linearly; "motion": dense-flow
-        warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
-    keep_noise : make events of the noise of integer frames, too; else the noise is estimated from the first frames and
-        changes that it explains cause no events (:mod:`blinkgl.recordings.frame_noise`). Floats, and frames without
-        noise, are used unchanged.
-    own : properties of the sensor's own frames; None: unknown.
+    use : how frames are converted to light. ``codes`` says what codes mean (:func:`~blinkgl.recordings.decoding
+        .meaning`). ``interpolate`` "linear": the given frames, between which the emulators interpolate linearly;
+        "motion": dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
+        ``keep_noise``: make events of the noise of integer frames, too; else it is estimated all along, and changes
+        that it explains cause no events (:mod:`blinkgl.recordings.frame_noise`). Floats, and frames without noise, are
+        used unchanged.
+    given : the fields of ``use`` and of its codes by themselves: gamma, white_level, range, own, interpolate, max_px,
+        keep_noise.
     seed : of the emulator. readout : read-out of the sensor (``load_sensor(name).readout``); None: none. report :
         filled during the simulation.
 
     Raises
     ------
-    EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed size, fewer than two frames;
-        names the frame.
-    ConfigError : unknown emulator, gamma or interpolation.
+    EventDataError : NaN, infinite or negative intensities, non-increasing times, float times in ns, a changed size,
+        fewer than two frames; names the frame.
+    ConfigError : unknown emulator, gamma, unit or interpolation.
     """
     report = report if report is not None else SimulationReport()
-    use = FrameUse(gamma, interpolate, max_px, keep_noise, own)
-    steps = simulated_steps(frames, use, fps=fps, emulator=emulator, seed=seed, readout=readout, report=report)
-    return (step.events for step in steps if len(step.events))
+    of_codes = {key: given.pop(key) for key in ("gamma", "white_level", "range", "own") if key in given}
+    use = replace(use, codes=replace(use.codes, **of_codes), **given)
+    checked_unit(unit, "unit")
+    steps = simulated_steps(
+        frames,
+        use,
+        fps=fps,
+        unit=unit,
+        zero_time=zero_time,
+        emulator=emulator,
+        seed=seed,
+        readout=readout,
+        report=report,
+    )
+    return _by_frame(steps)
+
+
+def _by_frame(steps: Iterator[Step]) -> Iterator[Events]:
+    """Yield the events of all steps up to each given frame."""
+    chunks: list[Events] = []
+    for step in steps:
+        chunks.append(step.events)
+        if step.given:
+            yield chunks[0] if len(chunks) == 1 else Events.concatenate(chunks)
+            chunks = []
 
 
 class Step(NamedTuple):
     """One step of an emulator. events : new events before t_ns.   frame : (H, W) float32 linear luminance or uint8
-    codes, at t_ns."""
+    codes, at t_ns.   given : whether it is a given frame's, not an interpolated one's."""
 
     t_ns: int
     events: Events
     frame: np.ndarray
     decode: Decoder
+    given: bool
 
     def luminance(self) -> np.ndarray:
         """Return linear luminance, (H, W) float32."""
@@ -189,6 +208,8 @@ def simulated_steps(
     *,
     report: SimulationReport,
     fps: float | None = None,
+    unit: str = "ns",
+    zero_time: bool = False,
     emulator: str | EmulatorConfig = EmulatorConfig.members.default,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
@@ -200,8 +221,8 @@ def simulated_steps(
         raise ConfigError(
             "unknown interpolation", where="interpolate", value=use.interpolate, accepted=", ".join(INTERPOLATIONS)
         )
-    use = replace(use, gamma=checked_gamma(use.gamma))
-    return _run(timed(frames, fps), use, config, seed, readout, report, fitting)
+    checked_gamma(use.codes.gamma)
+    return _run(timed(frames, fps, unit, zero_time), use, config, seed, readout, report, fitting)
 
 
 def _run(frames, use, config, seed, readout, report, fitting) -> Iterator[Step]:
@@ -224,9 +245,7 @@ def stepped(
     """Yield steps of frames (array, t_ns, name), interpolated ones included, through an event camera. Raises
     EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
-    given = _Given(frames, use, report, fitting)
-    if given.by_codes:
-        camera.emulator.set_decode(given.decode.table(np.uint8))
+    given = _Given(frames, use, report, fitting, camera)
     stream = iter(given)
     if use.interpolate == "motion":
         report.displacement = between.Displacement()
@@ -242,13 +261,15 @@ def stepped(
 
     for t_ns, events in emulate(shown(), camera):
         report.add(t_ns, events, camera)
-        yield Step(t_ns, events, seen[0], given.decode)
+        yield Step(t_ns, events, seen[0], given.decode, t_ns == given.t_ns)
 
 
 class _Given:
-    """Light of the given frames, (luminance, t_ns) in order: decoded, of the sensor's size, without their noise.
+    """Light of the given frames, (luminance, t_ns) in order: decoded, of the sensor's size, without their noise. Grey
+    bytes stay codes where nothing has to be done to them: the emulator has a table. t_ns : of the last frame."""
 
-    by_codes : whether frames stay codes, for an emulator with a table of them."""
+    decode: Decoder
+    t_ns: int | None = None
 
     def __init__(
         self,
@@ -256,54 +277,67 @@ class _Given:
         use: FrameUse,
         report: SimulationReport,
         fitting: Fitting | None,
+        camera: EventCamera,
     ):
-        self._fitting, self._report = fitting, report
-        ahead = list(itertools.islice(frames, LOOKED_AT))
-        self._frames, self._first = itertools.chain(ahead, frames), [frame for frame, _, _ in ahead]
-        self._shape = ahead[0][0].shape
-        gamma = use.gamma
-        if gamma is None and ahead[0][0].dtype.kind == "u":
-            own = use.own is not None and self._shape == use.own.size
-            gamma = report.assumed_gamma = use.own.gamma if own else "srgb"
-        self.decode = Decoder(gamma)
-        if not use.keep_noise:
-            report.noise = noise_of(self._first, self.decode, fitting)
-        self._steadied = None if report.noise is None else Steadied(report.noise)
-        dtype, axes = ahead[0][0].dtype, ahead[0][0].ndim
-        exact = report.noise is None and fitting is None
-        self.by_codes = use.interpolate == "linear" and dtype == np.uint8 and axes == 2 and exact
+        self._frames, self._use, self._report = frames, use, report
+        self._fitting, self._camera = fitting, camera
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int]]:
-        last, name, brightness = None, "", []
+        shape, name, checks = None, "", FrameChecks()
+        report = self._report
         for frame, t_ns, name in self._frames:
-            if frame.shape != self._shape:
+            if shape is None:
+                shape = frame.shape
+                white, steadied, by_codes = self._begin(frame)
+            if frame.shape != shape:
                 raise EventDataError(
-                    "frame size changed", where=name, value=frame.shape, accepted=f"{self._shape} as the first frame"
+                    "frame size changed", where=name, value=frame.shape, accepted=f"{shape} as the first frame"
                 )
-            if last is not None and t_ns <= last:
+            if self.t_ns is not None and t_ns <= self.t_ns:
                 raise EventDataError(
-                    "time stamps must increase", where=name, value=f"{t_ns} ns", accepted=f"more than {last} ns"
+                    "time stamps must increase", where=name, value=f"{t_ns} ns", accepted=f"more than {self.t_ns} ns"
                 )
-            last = t_ns
-            self._report.frames += 1
-            brightness.append(float(frame[::_SPARSE, ::_SPARSE].mean()))
-            if self.by_codes and frame.dtype == np.uint8:
-                yield frame, t_ns
-                continue
-            luminance = self.decode(frame, name)
-            luminance = luminance if self._fitting is None else self._fitting(luminance)
-            yield (luminance if self._steadied is None else self._steadied(luminance)), t_ns
-        if self._report.frames < 2:
+            self.t_ns = t_ns
+            report.frames += 1
+            checks.see(frame)
+            luminance = None if by_codes and frame.dtype == np.uint8 else self._luminance(frame, name)
+            quiet = None if steadied is None else steadied(frame, luminance)
+            yield quiet if quiet is not None else frame if luminance is None else luminance, t_ns
+        if report.frames < 2:
             raise EventDataError("events need at least two frames", where=name, value="1 frame")
-        self._report.caveats.extend(caveats(self._first, brightness))
+        report.caveats.extend(checks.lines(white))
+        if steadied is not None:
+            report.noise = steadied.noise
+            report.caveats.extend([steadied.doubt] if steadied.doubt else [])
+
+    def _begin(self, first: np.ndarray) -> tuple[float | None, Steadied | None, bool]:
+        """Decide by the first frame's type what codes mean. Return the code of white, what removes noise, and whether
+        frames may stay codes."""
+        found = meaning(first, self._use.codes)
+        self.decode, self._report.assumed_gamma = found.decode, found.assumed
+        self._report.notes.extend(found.notes)
+        by_codes = self._use.interpolate == "linear" and first.dtype == np.uint8 and first.ndim == 2
+        by_codes = by_codes and self._fitting is None
+        if by_codes:
+            self._camera.emulator.set_decode(self.decode.table(np.uint8))
+        if self._use.keep_noise or first.dtype.kind != "u":
+            return found.white, None, by_codes
+        light = lambda frame: self._luminance(frame, "")
+        return found.white, Steadied(light, self.decode.code_distance(first.dtype)), by_codes
+
+    def _luminance(self, frame: np.ndarray, name: str) -> np.ndarray:
+        luminance = self.decode(frame, name)
+        if self._fitting is not None:
+            return self._fitting(luminance)
+        # Floats may come back as they are, in a buffer that the caller fills again before interpolation is done.
+        return luminance.copy() if np.may_share_memory(luminance, frame) else luminance
 
 
 def file_to_events(
     source: str | os.PathLike,
     target: str | os.PathLike,
     *,
-    fps: float | None = None,
-    timestamps: str | os.PathLike | None = None,
+    declared: Declared = NOTHING,
     size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
@@ -314,23 +348,23 @@ def file_to_events(
     progress: Callable[[SimulationReport, float | None], None] | None = None,
 ) -> SimulationReport:
     """Convert the frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending
-    selects the format (.h5 .raw .txt .csv .npz .npy); emulator, seed, readout and the content of ``use`` as in
+    selects the format (.h5 .raw .txt .csv .npz .npy); emulator, seed, readout and ``use`` as in
     :func:`frames_to_events`. The files appear completely or not at all.
 
-    size : (height, width) of the sensor; frames of another size are cropped and scaled; None: that of the frames.
-    preview : video of frames and events. progress : called with (report so far, fraction done or None) per given
-    frame.
+    declared : what the user says of the frames.   size : (height, width) of the sensor; frames of another size are
+    cropped and scaled; None: that of the frames. preview : video of frames and events. progress : called with (report
+    so far, fraction done or None) per given frame.
     """
     from blinkgl.io.formats import event_writer
 
     _check_target(target, emulator)
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
-    frames = open_frames(source, fps=fps, timestamps=timestamps)
+    frames = open_frames(source, declared)
     height, width = (frames.height, frames.width) if size is None else size
-    report = SimulationReport()
-    if use.gamma is None and frames.linear:
-        use = replace(use, gamma="linear")
+    report = SimulationReport(notes=frames.notes)
+    codes = replace(use.codes, white_level=declared.white_level, range=declared.range)
+    use = replace(use, codes=codes.of(frames))
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
     iterator = iter(frames)
@@ -363,8 +397,6 @@ def file_to_events(
                 done = report.frames
                 progress(report, min(done / frames.count, 1.0) if frames.count else None)
         out.t_end_us = report.last_ns // 1000
-    if frames.path.suffix.lower() in VIDEO:  # made for viewing: sRGB is certain there
-        report.assumed_gamma = None
     return report
 
 
@@ -412,18 +444,33 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     return validate(members.models[kind], data, where=kind)
 
 
-def timed(frames: Iterable, fps: float | None = None) -> Iterator[tuple[np.ndarray, int, str]]:
+def timed(
+    frames: Iterable, fps: float | None = None, unit: str = "ns", zero_time: bool = False
+) -> Iterator[tuple[np.ndarray, int, str]]:
     """Yield (frame, t_ns, name) from the three kinds of iterables of :func:`frames_to_events`."""
+    start = None
     for i, item in enumerate(frames):
+        name = item[2] if isinstance(item, tuple) and len(item) > 2 else f"frame {i}"
         if isinstance(item, tuple):
-            frame, t_ns = np.asarray(item[0]), int(item[1])
-            name = item[2] if len(item) > 2 else f"frame {i}"
+            frame, t_ns = np.asarray(item[0]), _nanoseconds(item[1], unit, name)
         elif fps:
-            frame, t_ns, name = np.asarray(item), round(i * 1e9 / fps), f"frame {i}"
+            frame, t_ns = np.asarray(item), round(i * 1e9 / fps)
         else:
             raise EventDataError("frames without times", where=f"frame {i}", accepted="fps, or (frame, t_ns) pairs")
         if frame.ndim == 3 and frame.shape[2] == 1:
             frame = frame[..., 0]
         if frame.ndim not in (2, 3) or (frame.ndim == 3 and frame.shape[2] != 3):
             raise EventDataError("not a frame", where=name, value=frame.shape, accepted="(H, W) or (H, W, 3)")
-        yield frame, t_ns, name
+        start = t_ns if start is None else start
+        yield frame, t_ns - start if zero_time else t_ns, name
+
+
+def _nanoseconds(time: Any, unit: str, name: str) -> int:
+    """Return a time as whole ns. Raises EventDataError: not a number, not finite, or a float of ns."""
+    if isinstance(time, (int, np.integer)) and not isinstance(time, bool):
+        return int(time) * NANOSECONDS[unit]
+    if isinstance(time, (float, np.floating)) and np.isfinite(time) and unit != "ns":
+        return round(float(time) * NANOSECONDS[unit])
+    raise EventDataError(
+        "not a time", where=name, value=time, accepted='whole ns, or a number with unit="s", "ms" or "us"'
+    )

@@ -149,7 +149,8 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
             if part.mesh not in _trees:
                 _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
             trees.append(_trees[part.mesh])
-        kept[key] = join_trees(trees, [part.culled for _, part in parts], [_holes_of(part) for _, part in parts])
+        sides = [part.side(t_ns) for _, part in parts]
+        kept[key] = join_trees(trees, sides, [_holes_of(part) for _, part in parts])
         while len(kept) > KEPT:
             kept.pop(next(iter(kept)))
     return kept[key]
@@ -361,10 +362,10 @@ def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.n
     shown = np.ones(len(rows), bool)
     for p, (thing, part) in enumerate(scene_parts(scene)):
         on = np.flatnonzero(rows & (hits.part == p))
-        if len(on) and part.culled:
+        if len(on) and (side := part.side(t_ns)):
             m = relative_pose_at(scene, thing, t_ns)
             eye = -m[:3, :3].T @ m[:3, 3]
             a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
-            # The eye is on the outer side of the triangle's plane.
-            shown[on] = (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0.0
+            # The eye is on the drawn side of the triangle's plane.
+            shown[on] = side * (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0.0
     return shown

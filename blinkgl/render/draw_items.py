@@ -96,7 +96,8 @@ class DrawItem:
     times.
     corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
-    two_sided : no culling, and the normal is turned towards the camera.   hued, faceted : as in :class:`Kind`.
+    two_sided : the normal is turned towards the camera; faces are drawn from both sides unless the shape ``mirrors``:
+    then from one, which its deformer knows (:meth:`side`).   hued, faceted : as in :class:`Kind`.
     casts : whether it casts shadows: objects and walls do, unless they are unlit (screens, skies of files).
     facet_slope : tangent of the angle between its facets and the normals that smooth them.
     extended : whether its material has more than a base colour: maps and numbers to pass to programs.
@@ -119,6 +120,7 @@ class DrawItem:
     casts: bool = False
     faceted: bool = False
     facet_slope: float = 0.0
+    mirrors: bool = False
 
     def __post_init__(self) -> None:
         self.textured = self.material.texture is not None
@@ -128,6 +130,13 @@ class DrawItem:
         self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.hued, masked, more, self.faceted)
         self.extended = masked or bool(more)
         self.corners = box_corners(self.low, self.high)
+
+    def side(self, t_ns: int) -> int:
+        """Return the side from which faces are drawn, as :meth:`blinkgl.scene.types.Part.side`."""
+        if self.mirrors:
+            assert self.deformer is not None
+            return self.deformer.side(t_ns)
+        return 0 if self.two_sided else 1
 
 
 MAX_RADIUS = 1e18
@@ -216,6 +225,7 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
             value=radius,
             accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite",
         )
+    mirrors = part.culled and mesh.deformer is not None and mesh.deformer.mirrors
     return DrawItem(
         index,
         mesh,
@@ -225,13 +235,14 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
         low,
         high,
         _LAYER[category],
-        not part.culled,
+        not part.culled or mirrors,
         not material.unlit,
         not thing.is_static,
         hued=grey.hued(material, mesh),
         casts=category in ("object", "wall") and not material.unlit,
         faceted=not material.unlit and facets.flat(mesh),
         facet_slope=0.0 if material.unlit else facets.slope(mesh),
+        mirrors=mirrors,
     )
 
 

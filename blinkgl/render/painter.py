@@ -66,7 +66,7 @@ class Painter:
         self.lens: Lens | None = None
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
-        self._culling = False
+        self._side = 0
         self.strokes = Strokes(gl, self.uniforms)
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
@@ -85,8 +85,7 @@ class Painter:
         ctx.depth_func = ">"
         # Reversed depth: 1 at the near plane, so larger is nearer.
         ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
-        ctx.cull_face = "back"
-        self._culling = False
+        self._side = 0
 
     def programs(self, pass_: Pass) -> Programs:
         programs = self._programs.get(pass_)
@@ -198,12 +197,13 @@ class Painter:
             -(1 + P[1, 2]) / P[1, 1],
         )
 
-    def draw(self, uniforms: Uniforms, item: DrawItem) -> None:
-        cull = not item.two_sided
+    def draw(self, uniforms: Uniforms, item: DrawItem, t_ns: int) -> None:
+        side = item.side(t_ns)
         # State changes are expensive: culling is switched only where it differs.
-        if cull != self._culling:
-            (self.gl.ctx.enable if cull else self.gl.ctx.disable)(moderngl.CULL_FACE)
-            self._culling = cull
+        if side != self._side:
+            (self.gl.ctx.enable if side else self.gl.ctx.disable)(moderngl.CULL_FACE)
+            self.gl.ctx.cull_face = "front" if side < 0 else "back"
+            self._side = side
         self.resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)
         self.stats.triangles += len(item.mesh.faces)
 

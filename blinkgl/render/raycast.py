@@ -11,6 +11,7 @@ The triangle test is the watertight one of Woop, Benthin and Wald, "Watertight R
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -48,7 +49,8 @@ class Forest(NamedTuple):
     """The trees of all parts, one after the other, in the kernels' form.
 
     root, first, size : (P,) int32 root node, first triangle and number of triangles of each part.
-    cull : (P,) bool, back faces of this part are not hit.   extent : (P,) largest local coordinate.
+    side : (P,) int8: a part is hit from both sides (0), from the front (1), from behind (-1).
+    extent : (P,) largest local coordinate.
     mask : (P,) int32 row of ``masks`` with a part's holes, -1: none.   uvs : (M, 3, 2) float64 texture coordinates of
     the corners of all faces of parts with holes.
     masks : (K, 6) int64 of each: first face in ``uvs``; first texel in ``texels``, height, width; wrap modes along u
@@ -64,7 +66,7 @@ class Forest(NamedTuple):
     root: np.ndarray
     first: np.ndarray
     size: np.ndarray
-    cull: np.ndarray
+    side: np.ndarray
     extent: np.ndarray
     mask: np.ndarray
     uvs: np.ndarray
@@ -162,7 +164,7 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> Tree:
     return Tree(corners[order], order.astype(np.int32), lower[:nodes], upper[:nodes], child[:nodes], count[:nodes])
 
 
-def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | None = None) -> Forest:
+def join_trees(trees: list[Tree], side: Sequence[int], holes: list[Holes | None] | None = None) -> Forest:
     """Return one forest; its part p is ``trees[p]``, with the holes ``holes[p]``."""
     mask, uvs, masks, cutoffs, texels = _holes(len(trees), holes or [])
 
@@ -187,7 +189,7 @@ def join_trees(trees: list[Tree], cull: list[bool], holes: list[Holes | None] | 
         root=root[:-1],
         first=first[:-1],
         size=size,
-        cull=np.array(cull, np.bool_),
+        side=np.array(side, np.int8),
         extent=np.array([np.abs(tree.triangles).max() for tree in trees], np.float64),
         mask=mask,
         uvs=uvs,
@@ -334,7 +336,7 @@ def nearest_tree(
     Output: hit (N, 3) int32 (part, face, 1 when seen from the front) or -1; bary (N, 3); depth (N,), inf when nothing
     is hit.
     """
-    triangles, face, lower, upper, child, count, root, _, size, cull, extent, mask, uvs, masks, cutoffs, texels = forest
+    triangles, face, lower, upper, child, count, root, _, size, side, extent, mask, uvs, masks, cutoffs, texels = forest
     o, d, inverse, o_lo, o_hi = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     stack, entry = np.empty(_STACK, np.int64), np.empty(_STACK)
     centre, radius, outside = _balls(forest, origins, axes)
@@ -377,7 +379,7 @@ def nearest_tree(
                         if skip[i, 0] == p and skip[i, 1] == face[j]:
                             continue
                         s, u, v, w, front = _triangle(triangles[j], o, kx, ky, kz, sx, sy, sz)
-                        if not (near <= s <= best and s < far[i]) or (cull[p] and not front):
+                        if not (near <= s <= best and s < far[i]) or (side[p] != 0 and (side[p] > 0) != front):
                             continue
                         # Equal depths are decided by the lower (part, triangle), independent of the order.
                         if s == best and (hit[i, 0] < p or hit[i, 1] < face[j]):

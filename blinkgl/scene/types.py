@@ -56,7 +56,7 @@ class Mesh:
     vertices : (V, 3) float64.   faces : (F, 3) int32, counter-clockwise seen from outside.
     normals  : (V, 3) float32, unit.
     uvs      : (V, 2) float32; (0, 0) is the top-left corner of the texture image, v grows downwards; repeats.
-    closed   : watertight with consistent outward winding, so back faces can be culled.
+    closed   : watertight and wound outwards: its back faces are not seen from outside. Only primitives know it.
     name, source_hash : its source; ``source_hash`` is a stable hash of the content (train/test splits).
     deformer : how its shape changes with time, in object-local coordinates; None: it does not.
     colours  : (V, 3) float32 linear factors on the albedo; None: white.
@@ -142,7 +142,7 @@ class Material:
     texture      : None means white.
     base_color   : (3,) linear factor.
     unlit        : radiance = albedo, independent of the light (sky boxes, screens).
-    double_sided : draw back faces with the normal reversed; otherwise they are culled when the mesh is closed.
+    both_sides   : whether faces are drawn from behind, too, with the normal reversed; None: unless the mesh is closed.
     wrap         : continuation beyond the texture, along u and v.
     gloss        : None: Lambert.
     bumps        : normal map, x right in the texture, y up, z outwards, 0 to 1 for -1 to 1; None: none.
@@ -155,7 +155,7 @@ class Material:
     base_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     uv_scale: tuple[float, float] = (1.0, 1.0)
     unlit: bool = False
-    double_sided: bool = False
+    both_sides: bool | None = None
     wrap: tuple[Wrap, Wrap] = REPEAT
     gloss: Gloss | None = None
     bumps: Map | None = None
@@ -174,8 +174,17 @@ class Part:
 
     @property
     def culled(self) -> bool:
-        """Return whether its back faces are not drawn: for closed surfaces without holes that are not double-sided."""
-        return self.mesh.closed and not self.material.double_sided and self.material.mask is None
+        """Return whether its faces are drawn from one side only: what its material says, else for closed surfaces
+        without holes."""
+        both = self.material.both_sides
+        return self.mesh.closed and self.material.mask is None if both is None else not both
+
+    def side(self, t_ns: int) -> int:
+        """Return the side from which its faces are drawn at a time: 0 both, 1 the front, -1 the back, which faces
+        outwards while its deformer mirrors it."""
+        if not self.culled:
+            return 0
+        return 1 if self.mesh.deformer is None or not self.mesh.deformer.mirrors else self.mesh.deformer.side(t_ns)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,18 @@ from blinkgl.config.base import Refused
 from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.io.flow import read_flow
+from blinkgl.io.flow import READ_ENDINGS, flow_form, read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
+from blinkgl.io.names import natural_order, series
+from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.stills import open_stills
 from blinkgl.labels import Flow, LabelFrame, asked_for
-from blinkgl.recordings.simulation import FrameUse, Step, stepped, timed
+from blinkgl.recordings.decoding import Codes
+from blinkgl.recordings.simulation import FrameUse, SimulationReport, Step, stepped, timed
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.worlds.pool import resolve
+from blinkgl.sequence.given_flow import factor_that_fits
 from blinkgl.sequence.request import GroundTruth, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.simulate import Simulation
 from blinkgl.tensors.choice import make_on_device
@@ -37,7 +42,11 @@ from blinkgl.types.events import Events
 # outside the image in the next frame). All are used in the order of their names. A third may hold the backward flow,
 # one file per pair of frames, too.
 
-_FLOW = (".npy", ".flo", ".png")
+_FLOW = READ_ENDINGS
+_UNEQUAL = 0.05
+"""Part of a frame's interval by which times beside the images may differ from ``frames.fps``."""
+_CHECKED_PAIRS = 3
+"""Pairs of frames whose flow is compared with the images."""
 
 
 def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
@@ -81,8 +90,19 @@ def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
 def used_images(config: FramesConfig, folder: Path) -> list[Path]:
     """Return the images of ``folder`` that become a sequence, in order. Raises AssetError: too few; ConfigError: they
     last longer than an event file can hold."""
-    files = _listed(folder / config.images, IMAGE)[config.first :]
-    files = files[: config.count]
+    if not (folder / config.images).is_dir():
+        raise AssetError("no such folder", where=str(folder / config.images))
+    found = series(folder / config.images, IMAGE)
+    used = slice(config.first, None if config.count is None else config.first + config.count)
+    files = found.files[used]
+    if missing := replace(found, files=files, numbers=found.numbers and found.numbers[used]).missing():
+        # Its flow is missing, too, or would be half of what the images show.
+        raise AssetError(
+            missing[0].partition(":")[0],
+            where=str(folder / config.images),
+            accepted="every frame, or frames.first and frames.count for a part without a gap",
+        )
+    _check_stamps(folder / config.images, files, config.fps, used)
     if len(files) < 3 or (config.count and len(files) < config.count):
         raise AssetError(
             "too few frames",
@@ -97,10 +117,27 @@ def used_images(config: FramesConfig, folder: Path) -> list[Path]:
     return files
 
 
+def _check_stamps(folder: Path, files: list[Path], fps: float, used: slice) -> None:
+    """Raise ConfigError where a list of times beside the images says another rate than ``fps``, or unequal steps."""
+    path = next((p for p in (folder / "timestamps.txt", folder.parent / "timestamps.txt") if p.is_file()), None)
+    if path is None:
+        return
+    steps = np.diff(np.array(read_timestamps(path).times_ns[used], np.float64)) * 1e-9
+    if len(steps) + 1 != len(files) or not len(steps):
+        return
+    if np.abs(steps * fps - 1).max() > _UNEQUAL:
+        raise ConfigError(
+            f"{path} says other times",
+            where="frames.fps",
+            value=fps,
+            accepted=f"{1 / np.median(steps):.6g}, and equal steps (they are {steps.min():.6g} to {steps.max():.6g} s)",
+        )
+
+
 def _listed(folder: Path, suffixes) -> list[Path]:
     if not folder.is_dir():
         raise AssetError("no such folder", where=str(folder))
-    return sorted(
+    return natural_order(
         p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
     )
 
@@ -111,7 +148,10 @@ def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[
     AssetError: no folder, too few, or, by the numbers in their names, one missing in between."""
     if frames.flow is None:
         return [], []
-    return _flow_and_masks(folder / frames.flow, frames.first, images)
+    # {0} is the folder's own name, {1} its parent's, …: other sets keep the flow of a scene in a tree of its own.
+    parts = folder.absolute().parts[::-1]
+    named = re.sub(r"\{(\d)\}", lambda found: parts[min(int(found[1]), len(parts) - 1)], frames.flow)
+    return _flow_and_masks(Path(os.path.normpath(folder / named)), frames.first, images)
 
 
 def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -155,10 +195,10 @@ def _number(path: Path) -> int | None:
     return None if found is None else int(found[0])
 
 
-def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def read_flow_of(path: Path, size: tuple[int, int], form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px and valid (H, W) bool of frames of (H, W) px. Raises AssetError: unreadable,
     another size."""
-    flow, valid = read_flow(path)
+    flow, valid = read_flow(path, form)
     if flow.shape[:2] != size:
         raise AssetError("flow and image differ in size", where=str(path), value=flow.shape[:2], accepted=str(size))
     return flow, valid
@@ -166,16 +206,15 @@ def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
 
 def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Return a mask, (H, W) bool, of frames of (H, W) px. Raises AssetError: unreadable, another size."""
-    mask = read_npy(path)
+    mask = read_npy(path) if path.suffix == ".npy" else read_any_image(path)
     if mask.shape != size:
         raise AssetError("mask and image differ in size", where=str(path), value=mask.shape, accepted=str(size))
     return mask != 0
 
 
 def read_frame(path: Path) -> np.ndarray:
-    """Return (H, W) or (H, W, 3) RGB of an image file, without alpha. Raises AssetError."""
-    image = read_any_image(path)
-    return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])
+    """Return (H, W) or (H, W, 3) RGB of an image file, upright, without alpha. Raises AssetError."""
+    return read_any_image(path)
 
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
@@ -194,6 +233,7 @@ class RecordedSequence(Simulation):
         config, clock, frames = request.config, StageClock(), request.config.frames
         assert frames is not None
         self._recorded = frames
+        self._report = SimulationReport()
         self.folder = folder_of(frames, request.index, request.base)
         self.files = used_images(frames, self.folder)
         self.flows, self.masks = flow_files(self.folder, frames, self.files)
@@ -201,10 +241,16 @@ class RecordedSequence(Simulation):
             0: read_frame(self.files[0])
         }  # read already, together with an image of a later label
         size = self._kept[0].shape[:2]
-        if frames.max_displacement is not None:
-            with clock("scene"):
+        self._form = None if frames.flow_format == "auto" else frames.flow_format
+        if self.flows and self._form is None:
+            self._form, note = flow_form(self.flows[0])
+            self._report.notes += [note] if note else []
+        with clock("scene"):
+            if frames.max_displacement is not None:
                 for first, flow in zip(self.files, self.flows):
-                    _refuse_far_apart(first, *read_flow_of(flow, size), frames.max_displacement)
+                    _refuse_far_apart(first, *read_flow_of(flow, size, self._form), frames.max_displacement)
+            if frames.check_flow:
+                self._check_flow(size)
         resolved = config.model_copy(
             update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, request.base),)})}
         )
@@ -232,6 +278,23 @@ class RecordedSequence(Simulation):
     def _resume(self) -> None:
         """Nothing is drawn here."""
 
+    def _check_flow(self, size: tuple[int, int]) -> None:
+        """Raise AssetError for flow that contradicts the images, on a few pairs spread over the sequence."""
+        chosen = np.unique(np.linspace(0, len(self.flows) - 1, _CHECKED_PAIRS).astype(int)) if self.flows else ()
+        pairs = [
+            (read_frame(self.files[k]), read_frame(self.files[k + 1]), *read_flow_of(self.flows[k], size, self._form))
+            for k in chosen
+        ]
+        if (found := factor_that_fits([pair for pair in pairs if pair[0].shape == pair[1].shape])) is not None:
+            factor, error, own = found
+            what = {0.0: "no motion at all", -1.0: "its negative (flow to the frame before?)"}
+            raise AssetError(
+                f"the flow contradicts its images: {what.get(factor, f'its {factor:g}-fold')} explains them better",
+                where=str(self.flows[int(chosen[0])]),
+                value=f"error {error:.2g} for {own:.2g} of the contrast, flow read as {self._form}",
+                accepted="frames.flow_format, frames.flow with the flow to the next frame, or frames.check_flow: false",
+            )
+
     @staticmethod
     def _time_of(k: int, fps: float) -> int:
         return round(k * 1e9 / fps)
@@ -245,11 +308,18 @@ class RecordedSequence(Simulation):
             yield frame, self._time_of(k, self._recorded.fps), str(file)
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
-        frames = self._recorded
+        frames, stated = self._recorded, open_stills(self.files[0])
+        levels = None if stated.white is None else (0.0, float(stated.white))
         steps = stepped(
             timed(self._given()),
             self.camera,
-            FrameUse(frames.gamma, frames.interpolate, frames.max_px, frames.keep_noise),
+            FrameUse(
+                Codes(frames.gamma, frames.white_level, frames.range, transfer=stated.transfer, levels=levels),
+                frames.interpolate,
+                frames.max_px,
+                frames.keep_noise,
+            ),
+            report=self._report,
         )
         while True:
             with self.clock("events"):  # reading and interpolating, too
@@ -269,7 +339,7 @@ class RecordedSequence(Simulation):
         if number == len(self.files) - 1 or not self.flows or "flow_forward" not in request:
             return GroundTruth(k, t_ns, LabelFrame(t_ns, values))
         size = (self.height, self.width)
-        values["flow_forward"] = Flow(*read_flow_of(self.flows[number], size))
+        values["flow_forward"] = Flow(*read_flow_of(self.flows[number], size, self._form))
         if self.masks and "occlusion_forward" in request:
             values["occlusion_forward"] = read_mask_of(self.masks[number], size)
         return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self._recorded.fps))
@@ -290,6 +360,7 @@ class RecordedSequence(Simulation):
                 "images": len(self.files),
                 "first": self.files[0].name,
                 "last": self.files[-1].name,
+                **({"notes": notes} if (notes := [*self._report.notes, *self._report.caveats]) else {}),
             },
         }
 

@@ -121,8 +121,7 @@ def _surface(parts, p, triangle, bary) -> dict:
         "texture": part.material.texture.name if part.material.texture else None,
         "triangle": triangle,
         "bary": _plain(bary),
-        "double_sided": part.material.double_sided,
-        "closed": part.mesh.closed,
+        "both_sides": not part.culled,
         "unlit": part.material.unlit,
     }
 

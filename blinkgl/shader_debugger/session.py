@@ -168,12 +168,12 @@ class DebugPainter(Painter):
     def uniforms(self, program: Any) -> Any:
         return _Uniforms(program, self.unused)
 
-    def draw(self, uniforms: Any, item: Any) -> None:
+    def draw(self, uniforms: Any, item: Any, t_ns: int) -> None:
         # Vertex arrays silently leave out attributes that a program does not have.
         program, shape = uniforms[""], item.deformer
         if shape is not None:
             self.unused |= {(program.extra, name) for name in shape.attributes if name not in program}
-        super().draw(uniforms, item)
+        super().draw(uniforms, item, t_ns)
 
     def forget(self) -> None:
         super().forget()

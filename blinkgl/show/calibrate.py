@@ -13,9 +13,11 @@ from rich.table import Table
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.frames import Declared
 from blinkgl.machine.terminal import plain_column, plain_console, say
 from blinkgl.recordings.calibration import calibrate
 from blinkgl.recordings.clip import FrameReading
+from blinkgl.recordings.decoding import Codes
 from blinkgl.recordings.pixel_noise import fit_pixels
 from blinkgl.report import pixel_noise
 from blinkgl.report.calibration import page, parameters, rows
@@ -48,8 +50,9 @@ def run(
             raise OutputError("output file exists", where=str(path), accepted="a new name, or --overwrite")
     if emulator == PIXELS:
         return _pixels(recording, frames, target, sensor, overrides, overwrite, quiet, options)
-    said = (options.pop(key) for key in ("gamma", "interpolate", "max_px", "frame_delay_ms"))
-    reading = FrameReading(*said)
+    gamma, *said = (options.pop(key) for key in ("gamma", "interpolate", "max_px", "frame_delay_ms"))
+    reading = FrameReading(Codes(gamma), *said)
+    options["declared"] = Declared(**options.pop("declared"))
     base = emulator_options(emulator, None, overrides, sensor)["emulator"]
     fixed = [item.partition("=")[0].strip() for item in overrides]
     console = plain_console(quiet=quiet)

@@ -33,8 +33,8 @@ def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:
     for quantity, first, second in result.rows():
         table.add_row(*((quantity, first, second) if result.b else (quantity, first)))
     console.print(table, highlight=False)
-    for line in result.said:
-        say(plain_console(stderr=True), line)
+    for note in result.notes:
+        say(console, note)
     if out is not None:
         with atomic_file(os.path.join(out, "compare.json")) as path:
             path.write_text(json.dumps(result.to_dict(), indent=1) + "\n", encoding="utf-8")

@@ -17,7 +17,7 @@ def run(source: str, target: str, *, reading: EventReading, **options: Any) -> i
     written = output_format(target)
     if file.causes and written not in WITH_CAUSES:
         say(plain_console(), "the causes of the events are left out: the format cannot hold them")
-    for line in file.said:
+    for line in file.notes:
         say(plain_console(stderr=True), f"{source}: {line}")
     if reading.time_unit and written in ("text", "csv") and options.get("write_unit") == "s":
         say(plain_console(stderr=True), "--time-unit is the unit of IN; --write-unit us writes OUT in µs")

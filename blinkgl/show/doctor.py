@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -310,18 +310,19 @@ def _codecs() -> Iterator[Check]:
         return f"round trip, {ratio:.0f}:1 (h5py {h5py.__version__}, HDF5 {h5py.version.hdf5_version})"
 
     def x264() -> str:
-        import imageio_ffmpeg
+        import av
 
-        options = "-hide_banner -loglevel error -f rawvideo -pix_fmt rgb24 -s 64x64 -r 10 -i -"
-        command = [
-            imageio_ffmpeg.get_ffmpeg_exe(),
-            *options.split(),
-            *"-c:v libx264 -pix_fmt yuv420p -f null -".split(),
-        ]
-        done = subprocess.run(command, input=bytes(64 * 64 * 3 * 3), capture_output=True, timeout=60)
-        if done.returncode:
-            raise ValueError(done.stderr.decode(errors="replace"))
-        return f"encodes (ffmpeg {imageio_ffmpeg.get_ffmpeg_version()})"
+        from blinkgl.io.video import VideoReader, VideoWriter
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = os.path.join(folder, "doctor.mp4")
+            with VideoWriter(path, 64, 64, 10.0) as video:
+                for level in (60, 120, 180):
+                    video.write(np.full((64, 64, 3), level, np.uint8))
+            means = [frame.mean() for frame, _ in VideoReader(path)]
+        if np.abs(np.array(means) - [60, 120, 180]).max() > 3:
+            raise ValueError("read other values than written")
+        return f"round trip (PyAV {av.__version__}, libavcodec {'.'.join(map(str, av.library_versions['libavcodec']))})"
 
     def png16() -> str:
         import cv2
@@ -335,7 +336,7 @@ def _codecs() -> Iterator[Check]:
 
     pip = f"{python()} -m pip install --force-reinstall"
     yield _try(section, "HDF5 blosc-zstd", blosc, f"{pip} h5py hdf5plugin")
-    yield _try(section, "libx264 video", x264, f"{pip} imageio-ffmpeg")
+    yield _try(section, "libx264 video", x264, f"{pip} av")
     yield _try(section, "16-bit RGB PNG", png16, f"{pip} opencv-python-headless")
 
 

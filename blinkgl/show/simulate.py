@@ -65,16 +65,20 @@ def run(
     interpolate: str = "linear",
     max_px: float = 1.0,
     keep_noise: bool = False,
+    declared: dict[str, Any] | None = None,
     **options: Any,
 ) -> int:
-    """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``options``: of
-    :func:`~blinkgl.recordings.simulation.file_to_events`."""
+    """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``declared``: of the frames, as of
+    :class:`~blinkgl.io.frames.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.config.sensor import load_sensor
+    from blinkgl.io.frames import Declared
     from blinkgl.machine.compiling import announced_compiling
+    from blinkgl.recordings.decoding import Codes
     from blinkgl.recordings.simulation import FrameUse, file_to_events
 
     options |= emulator_options(emulator, config, overrides, sensor)
-    options["use"] = FrameUse(gamma, interpolate, max_px, keep_noise, options.pop("own"))
+    options["use"] = FrameUse(Codes(gamma, own=options.pop("own")), interpolate, max_px, keep_noise)
+    options["declared"] = Declared(**(declared or {}))
     if size is not None:
         options["size"] = parsed_size(size)
     console = plain_console(quiet=quiet)
@@ -118,11 +122,10 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
         "steps",
     )
     if report.fitting is not None:
-        say(console, f"{report.fitting} (--size WIDTHxHEIGHT for another)")
-    if report.assumed_gamma == "srgb":
-        say(console, "integer codes taken as sRGB (--gamma linear for a camera's raw frames)")
-    elif report.assumed_gamma is not None:
-        say(console, f"images of the sensor's size taken for its own: --gamma {report.assumed_gamma}")
+        warning = "warning: " if report.fitting.loses_much else ""
+        say(console, f"{warning}{report.fitting} (--size WIDTHxHEIGHT for another)")
+    for note in report.notes:
+        say(console, note)
     if report.noise is not None:
         say(console, f"{report.noise}; changes that it explains make no events (--keep-noise: they do)")
     for caveat in report.caveats:

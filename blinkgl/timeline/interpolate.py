@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from blinkgl.errors import EventDataError
 from blinkgl.machine.kernels import kernel
 from blinkgl.srgb import to_srgb8
 
@@ -78,48 +77,44 @@ def motion(
 
 def watched(frames: Iterable[Timed], moved_px: list[float]) -> Iterator[Timed]:
     """Yield the frames unchanged. ``moved_px`` gets the 99th percentile of the dense flow between a few pairs: those
-    that end at frame 1, 2, 4 and 8, and at every 16th. Frames too small for dense flow are skipped.
+    that end at frame 1, 2, 4 and 8, and at every 16th.
 
-    frames : luminance (H, W) float32, or uint8 codes, and t_ns."""
+    frames : luminance (H, W) float32, or uint8 codes, and t_ns; a frame may be overwritten when the next is asked
+    for."""
     # It takes a quarter of the time of the medium preset and is as good for a percentile.
     dense = DenseFlow(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     last: np.ndarray | None = None
     for number, (frame, t) in enumerate(frames):
-        if min(frame.shape[:2]) >= DenseFlow.LEAST:
-            if last is not None:
-                speed = np.hypot(*np.moveaxis(dense.forward(dense.codes(last), dense.codes(frame)), -1, 0))
-                moved_px.append(float(np.percentile(speed, 99)))
-            following = number + 1
-            last = frame if 16 % following == 0 or following % 16 == 0 else None
+        if last is not None:
+            speed = np.hypot(*np.moveaxis(dense.forward(last, dense.codes(frame)), -1, 0))
+            moved_px.append(float(np.percentile(speed, 99)))
+        following = number + 1
+        last = dense.codes(frame).copy() if 16 % following == 0 or following % 16 == 0 else None
         yield frame, t
 
 
 class DenseFlow:
     """OpenCV's DIS flow (Kroeger et al. 2016): the medium preset, which :func:`motion` uses, or another."""
 
-    LEAST = 16
-    """Smallest side, px: below it OpenCV's dense flow raises, returns NaN or ends the process, depending on the other
-    side."""
+    LEAST = 32
+    """Smallest side, px, that OpenCV is given: below it dense flow raises, returns NaN or ends the process, depending
+    on preset and the other side. Smaller pictures are continued at their borders, and the flow is cut out again."""
 
     def __init__(self, preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) -> None:
         self._dis = cv2.DISOpticalFlow_create(preset)
 
-    @classmethod
-    def codes(cls, frame: np.ndarray) -> np.ndarray:
-        """Return the input of the flow, (H, W) uint8, from linear light or codes. Raises EventDataError: a side below
-        ``LEAST``."""
-        if min(frame.shape[:2]) < cls.LEAST:
-            raise EventDataError(
-                "too small for dense flow",
-                where="interpolate: motion",
-                value=f"{frame.shape[1]}x{frame.shape[0]}",
-                accepted=f"at least {cls.LEAST}x{cls.LEAST}, or interpolate: linear",
-            )
+    @staticmethod
+    def codes(frame: np.ndarray) -> np.ndarray:
+        """Return the input of the flow, (H, W) uint8, from linear light or codes."""
         return frame if frame.dtype == np.uint8 else to_srgb8(frame)
 
     def forward(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32 px from a to b, of codes."""
-        return self._dis.calc(a, b, None)
+        height, width = a.shape
+        below, right = max(0, self.LEAST - height), max(0, self.LEAST - width)
+        if below or right:
+            a, b = (cv2.copyMakeBorder(one, 0, below, 0, right, cv2.BORDER_REPLICATE) for one in (a, b))
+        return self._dis.calc(a, b, None)[:height, :width]
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the flow (H, W, 2) float32 px from a to b and from b to a, of codes."""

@@ -379,7 +379,7 @@ def wall(camera):
     path = KeyframePath(
         [0, SECOND], [(0, 0, 4.0), (0.3, 0, 3.5)], Rotation.concatenate([Rotation.identity()] * 2), "linear"
     )
-    sheet = SceneObject("wall", 1, (Part(grid(width=40, depth=40), Material(double_sided=True)),), path)
+    sheet = SceneObject("wall", 1, (Part(grid(width=40, depth=40), Material(both_sides=True)),), path)
     return Scene((sheet,), Rig.alone(camera, StaticPath(np.eye(4))), 0, SECOND)
 
 

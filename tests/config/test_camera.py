@@ -1,15 +1,18 @@
 """``camera:``: lenses, calibrations, and what is said of those that cannot be drawn."""
 
+import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 
 import blinkgl
 from blinkgl.camera import Equidistant, PinHole, Radtan
-from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain
+from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml, read_camchain, read_place_on_body
 from blinkgl.config.camera import CameraConfig, camera_keys
 from blinkgl.config.problems import validate
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 
@@ -69,10 +72,126 @@ def test_a_calibration_goes_out_and_comes_in_again(tmp_path):
     for text in (camchain_yaml(chain), cam_to_cam_yaml([*chain.values()])):
         (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
         again = read_camchain(tmp_path / "c.yaml")
-        assert list(again) == list(chain)
-        assert [one.camera for one in again.values()] == models
+        flat = [name for name in again if name.startswith("camRect")]
+        assert [name for name in again if name not in flat] == list(chain) and len(flat) in (0, 4)
+        assert [again[name].camera for name in chain] == models
+        assert all(again[name].camera.kind == "pinhole" for name in flat)
         assert again["cam0"].T_cam_before is None
         np.testing.assert_array_equal(again["cam2"].T_cam_before, T)
+
+
+K, SIZE = [[95.0, 0, 60.5], [0, 99.0, 43.0], [0, 0, 1]], (120, 90)
+RADIAL, EQUI = [-0.32, 0.11, 0.001, -0.002], [0.02, -0.004, 0.001, 0.0003]
+FLAT = [v for row in K for v in row]
+OPENCV = """%YAML:1.0
+---
+image_width: 120
+image_height: 90
+{name}: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {K}
+distortion_coefficients: !!opencv-matrix
+   rows: {n}
+   cols: 1
+   dt: d
+   data: {D}
+{more}
+"""
+ROS = """image_width: 120
+image_height: 90
+camera_name: dvs
+camera_matrix: {{rows: 3, cols: 3, data: {K}}}
+distortion_model: {model}
+distortion_coefficients: {{rows: 1, cols: {n}, data: {D}}}
+rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
+"""
+TABLE = """cam0:
+  camera_model: pinhole
+  distortion_model: {model}
+  distortion_coeffs: {D}
+  intrinsics: [95.0, 99.0, 60.5, 43.0]
+  resolution: [120, 90]
+"""
+COLMAP_HEAD = "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+
+
+def opencv(D, name="camera_matrix", more=""):
+    return OPENCV.format(name=name, K=FLAT, D=D, n=len(D), more=more)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "D", "fisheye"),
+    [
+        ("c.yaml", opencv(RADIAL), RADIAL, False),
+        ("c.yaml", opencv([*RADIAL, 0.01], "K"), [*RADIAL, 0.01], False),
+        ("c.yaml", opencv([*RADIAL, 0.01, 0, 0, 0]), [*RADIAL, 0.01], False),
+        ("c.yml", "\ufeff" + opencv(EQUI, more="fisheye_model: 1"), EQUI, True),
+        ("c.yaml", ROS.format(K=FLAT, D=RADIAL + [0.0], n=5, model="plumb_bob"), RADIAL, False),
+        ("c.yaml", ROS.format(K=FLAT, D=EQUI, n=4, model="fisheye"), EQUI, True),
+        ("c.yaml", ROS.format(K=FLAT, D=EQUI, n=4, model="equidistant"), EQUI, True),
+        ("c.yaml", TABLE.format(D=RADIAL, model="plumb_bob"), RADIAL, False),
+        ("c.yaml", TABLE.format(D=EQUI, model="kannala_brandt"), EQUI, True),
+        ("c.yaml", TABLE.format(D=[0, 0, 0, 0], model="none"), [0.0] * 4, False),
+        ("c.json", json.dumps({"type": "pinhole", "img_size": SIZE, "K": FLAT, "D": [*RADIAL, 0.0]}), RADIAL, False),
+        ("c.json", json.dumps({"camera_model": {"img_size": SIZE, "K": FLAT, "D": RADIAL}}), RADIAL, False),
+        ("cameras.txt", COLMAP_HEAD + "1 OPENCV 120 90 95 99 61 43.5 -0.32 0.11 0.001 -0.002\n", RADIAL, False),
+        ("cameras.txt", COLMAP_HEAD + "1 OPENCV_FISHEYE 120 90 95 99 61 43.5 0.02 -0.004 0.001 0.0003\n", EQUI, True),
+        ("cameras.txt", COLMAP_HEAD + "3 PINHOLE 120 90 95 99 61 43.5\n", [0.0] * 4, False),
+        ("cameras.txt", COLMAP_HEAD + "1 FULL_OPENCV 120 90 95 99 61 43.5 -0.32 0.11 0.001 -0.002 0.01 0 0 0\n",
+         [*RADIAL, 0.01], False),
+    ],
+)  # fmt: skip
+def test_calibrations_of_others_project_as_opencv_does(tmp_path, name, text, D, fisheye):
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    (made,) = read_camchain(tmp_path / name).values()
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (50, 2)), np.ones(50)])
+    zero = np.zeros(3)
+    if fisheye:
+        seen = cv2.fisheye.projectPoints(points[:, None], zero, zero, np.array(K), np.array(D))[0][:, 0]
+    else:
+        seen = cv2.projectPoints(points, zero, zero, np.array(K), np.array(D))[0][:, 0]
+    assert (made.camera.width, made.camera.height) == SIZE
+    np.testing.assert_allclose(made.camera.project(points), seen, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (TABLE.format(D=RADIAL, model="radtan").replace("  distortion_model: radtan\n", ""),
+         "cam0.distortion_coeffs: distortion coefficients without a model"),
+        (TABLE.format(D=RADIAL, model="none"), "cam0.distortion_coeffs: coefficients of a lens of model none"),
+        (TABLE.format(D=RADIAL, model="fov"), "cam0.distortion_model: unknown distortion model (got 'fov')"),
+        (TABLE.format(D=RADIAL, model="radtan").replace("pinhole", "omni"), "unsupported camera model (got 'omni')"),
+        (TABLE.format(D=RADIAL, model="radtan").replace("pinhole", "ds"), "unsupported camera model (got 'ds')"),
+        (TABLE.format(D=RADIAL[:2], model="radtan"), "wrong numbers"),
+        (opencv([*RADIAL, 0.01, 0.1, 0.2, 0.3]), "the rational model's further coefficients (k4, k5, k6 …) are not"),
+        (opencv(RADIAL).replace("95.0, 0, 60.5", "95.0, 2.0, 60.5"), "the pixels are skewed"),
+        (COLMAP_HEAD + "1 THIN_PRISM_FISHEYE 120 90 1 2 3 4\n", "camera 1: unsupported camera model"),
+        (COLMAP_HEAD + "1 PINHOLE 120 90 95 99 61\n", "camera 1: wrong numbers"),
+    ],
+)  # fmt: skip
+def test_what_a_calibration_says_is_never_dropped(tmp_path, text, said):
+    (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        read_camchain(tmp_path / "c.yaml")
+    assert said in str(caught.value) and "c.yaml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["T_BS", "T_body_sensor", "T_imu_cam", "T_cam_imu"])
+def test_the_place_on_a_body_by_any_name(tmp_path, key):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0, 0.02]
+    given = np.linalg.inv(T) if key == "T_cam_imu" else T
+    table = (
+        {"cam0": {key: given.tolist()}}
+        if "imu" in key
+        else {key: {"rows": 4, "cols": 4, "data": given.ravel().tolist()}}
+    )
+    (tmp_path / "c.yaml").write_text(to_yaml(table))
+    np.testing.assert_allclose(read_place_on_body(tmp_path / "c.yaml"), T, atol=1e-12)
 
 
 KALIBR = """cam0:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.rig import PlaceConfig
-from blinkgl.config.run import RunTemplate
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 
@@ -137,3 +139,31 @@ def test_a_sensor_that_says_how_long_its_lens_is_does_not_have_it_of_the_top(top
 def test_two_ways_of_its_own_are_still_refused():
     said = refusal("{camera: {width: 40, focal: 60}, sensors: [{name: a, camera: {fov: 50, focal: 9}}]}")
     assert said == "sensors.0.camera: give fov or focal, not both"
+
+
+def test_a_calibration_places_its_cameras(tmp_path):
+    """Kalibr's T_cn_cnm1 leads from camera n - 1 to n; the rig's origin is the first camera."""
+    turned = np.eye(4)
+    turned[:3, :3], turned[:3, 3] = Rotation.from_euler("y", 10, degrees=True).as_matrix(), (-0.1, 0.01, 0.02)
+    shifted = np.eye(4)
+    shifted[:3, 3] = (-0.05, 0, 0)
+    lens = {"camera_model": "pinhole", "distortion_model": "none", "distortion_coeffs": [], "resolution": [64, 48],
+            "intrinsics": [50.0, 50.0, 31.5, 23.5]}  # fmt: skip
+    chain = {
+        "cam0": lens,
+        "cam1": lens | {"T_cn_cnm1": turned.tolist(), "T_cam_imu": turned.tolist()},
+        "cam2": lens | {"T_cn_cnm1": shifted.tolist()},
+    }
+    (tmp_path / "k.yaml").write_text(yaml.safe_dump(chain))
+    sensors = [{"name": n, "camera": {"calibration": "k.yaml", "calibration_name": n}} for n in chain]
+    sensors.append({**sensors[2], "name": "own", "place": {"position": [1, 0, 0]}})
+    sensors[1]["imu"] = {"rate": 100}
+    (tmp_path / "run.yaml").write_text(yaml.safe_dump({"sensors": sensors}))
+    made = load_run(tmp_path / "run.yaml").sequence(0)
+    places = [sensor.place.T for sensor in made.sensors]
+    expected = [np.eye(4), np.linalg.inv(turned), np.linalg.inv(shifted @ turned)]
+    np.testing.assert_allclose(places[:3], expected, atol=1e-9)
+    np.testing.assert_allclose(places[3][:3, 3], (1, 0, 0))
+    unit = made.sensors[1].imu
+    np.testing.assert_allclose(unit.position, turned[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_euler("xyz", unit.rotation, degrees=True).as_matrix(), turned[:3, :3])

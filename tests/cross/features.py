@@ -127,8 +127,12 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "living": {"scene": _LIVING},
         "explicit, alive": {"scene": _ALIVE},
         "frames, motion": _frames(interpolate="motion", max_px=0.5),
-        "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear"),
-        "frames, part": _frames(interpolate="linear", flow=None, first=1, count=4, keep_noise=True),
+        "frames, linear": _frames(
+            interpolate="linear", flow="flow_flo", gamma="linear", range="limited", check_flow=False
+        ),
+        "frames, part": _frames(
+            interpolate="linear", gamma="hlg", range="full", flow=None, first=1, count=4, keep_noise=True
+        ),
     },
     "emulator": {
         "esim": {"events": {"emulator": "esim"}},

@@ -128,7 +128,7 @@ def explicit_scenes(interval: float, start: float):
         max_size=st.sampled_from([1, 7, 32]),
         color=st.lists(magnitude(1e-12, 1e9, 0.0, 1.0), min_size=3, max_size=3),
         unlit=st.booleans(),
-        double_sided=st.booleans(),
+        both_sides=st.booleans(),
         uv_scale=st.lists(signed(1e5), min_size=2, max_size=2),
     )
 

@@ -115,9 +115,9 @@ def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, tex
     corners = nasty()
     world = []
     for lit in (True, False):
-        for double_sided in (True, False):
-            paint = Material(texture=smooth_texture(1) if textured else None, unlit=not lit, double_sided=double_sided)
-            whole = replace(sheet(corners), closed=not double_sided)  # closed: culled, not two-sided
+        for both_sides in (True, False):
+            paint = Material(texture=smooth_texture(1) if textured else None, unlit=not lit, both_sides=both_sides)
+            whole = replace(sheet(corners), closed=not both_sides)  # closed: culled, not two-sided
             world.append(
                 scene(
                     [thing("nasty", 1, whole, drift((0, 0, 0), (0.1, 0.05, -0.3)), paint)],

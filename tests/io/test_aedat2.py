@@ -18,7 +18,7 @@ from blinkgl.cli import run
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.aedat2 import Aedat2Reader
 from blinkgl.io.formats import convert, open_events
-from blinkgl.io.frames import open_frames
+from blinkgl.io.frames import Declared, open_frames
 from blinkgl.types.events import Events
 from tests.io.some_events import same, some_events
 from tests.shared_data import shared
@@ -101,7 +101,7 @@ def test_frames_go_through_the_door_of_frames(tmp_path):
     source = open_frames(path)
     assert (source.height, source.width, source.count) == (H, W, None)
     assert [t for _, t, _ in source] == [1000 * (1000 + 40_000 * k + 3499) for k in range(3)]
-    assert [t for _, t, _ in open_frames(path, fps=100)] == [0, 10**7, 2 * 10**7]
+    assert [t for _, t, _ in open_frames(path, Declared(fps=100))] == [0, 10**7, 2 * 10**7]
     with pytest.raises(EventDataError, match=r"events need at least two frames \(got '0 frames'\)"):
         open_frames(put(tmp_path / "e.aedat", header() + records([0], [1])))
 

@@ -138,7 +138,7 @@ def test_a_packet_longer_than_the_file_is_refused_before_memory_is_set_aside(tmp
     with pytest.raises(AssetError, match=rf"a packet at byte {second} of 2147483632 bytes; .*or --damaged keep"):
         open_events(tmp_path / "e.aedat4").read()
     with open_events(tmp_path / "e.aedat4", EventReading(damaged="keep")) as file:
-        assert len(file.read()) == 100 and "kept: events before the damage: 100" in file.said[0]
+        assert len(file.read()) == 100 and "kept: events before the damage: 100" in file.notes[0]
     data[14:18] = (0x7FFFFFF0).to_bytes(4, "little")
     (tmp_path / "e.aedat4").write_bytes(data)
     with pytest.raises(AssetError, match="a header of 2147483632 bytes"):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.frames import open_frames, read_any_image, read_timestamps
+from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.frames import Declared, open_frames, read_any_image
 from blinkgl.io.images import write_pfm
+from blinkgl.io.stamps import read_timestamps
 from blinkgl.io.video import VideoWriter
+from tests.videos import put_exr
 
 
 def images(folder, count=3, size=(12, 16), ending="png"):
@@ -31,6 +31,7 @@ def listed(source):
     "name, text, expected",
     [
         ("timestamps.txt", "0\n1000\n2500\n", [0, 10**6, 2_500_000]),
+        ("data.csv", "#timestamp [ns],filename\n5,f0.png\n6,f1.png\n8,f2.png\n", [5, 6, 8]),
         ("timestamps.txt", "# seconds\n0.0\n1e-3\n0.0025\n", [0, 10**6, 2_500_000]),
         ("images.txt", "0.5 f0.png\n0.6 f1.png\n0.75 f2.png\n0.9 f3.png\n", [500_000_000, 600_000_000, 750_000_000]),
     ],
@@ -39,7 +40,7 @@ def test_time_stamp_files_are_found(tmp_path, name, text, expected):
     images(tmp_path)
     (tmp_path / name).write_text(text)
     assert [t for _, t, _ in open_frames(tmp_path)] == expected
-    assert [t for _, t, _ in open_frames(tmp_path, fps=1)] == [0, 10**9, 2 * 10**9], "--fps wins"
+    assert [t for _, t, _ in open_frames(tmp_path, Declared(fps=1))] == [0, 10**9, 2 * 10**9], "--fps wins"
 
 
 def test_video(tmp_path):
@@ -48,10 +49,11 @@ def test_video(tmp_path):
             video.write(np.full((32, 48, 3), 40 * i, np.uint8))
     source = open_frames(tmp_path / "v.mp4")
     assert source.count == 5 and [t for _, t, _ in source] == [i * 20_000_000 for i in range(5)]
-    assert [t for _, t, _ in open_frames(tmp_path / "v.mp4", fps=1000)] == [i * 10**6 for i in range(5)]
-    (tmp_path / "t.txt").write_text("0\n1\n2\n")
-    with pytest.raises(EventDataError, match="no time stamp for frame 3"):
-        list(open_frames(tmp_path / "v.mp4", timestamps=tmp_path / "t.txt"))
+    assert [t for _, t, _ in open_frames(tmp_path / "v.mp4", Declared(fps=1000))] == [i * 10**6 for i in range(5)]
+    for count in (3, 6):
+        (tmp_path / "t.txt").write_text("".join(f"{k}\n" for k in range(count)))
+        with pytest.raises(EventDataError, match=f"v.mp4: one time stamp per frame .got '{count} stamps, 5 frames'"):
+            open_frames(tmp_path / "v.mp4", Declared(timestamps=tmp_path / "t.txt"))
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8"])
@@ -61,7 +63,7 @@ def test_arrays(tmp_path, dtype, channels):
     np.save(tmp_path / "a.npy", frames)
     np.savez(tmp_path / "a.npz", frames=frames, timestamps_us=[0, 5, 10, 20])
     for source, times in (
-        (open_frames(tmp_path / "a.npy", fps=10), [0, 10**8, 2 * 10**8, 3 * 10**8]),
+        (open_frames(tmp_path / "a.npy", Declared(fps=10)), [0, 10**8, 2 * 10**8, 3 * 10**8]),
         (open_frames(tmp_path / "a.npz"), [0, 5000, 10000, 20000]),
     ):
         got = list(source)
@@ -74,27 +76,7 @@ def test_arrays(tmp_path, dtype, channels):
 def test_float_and_deep_images(tmp_path):
     rng = np.random.default_rng(0)
     colour = (rng.random((10, 14, 3)) * 4).astype(np.float32)
-    raw = np.ascontiguousarray(np.moveaxis(colour, -1, 0)[[1, 2, 0]]).tobytes()
-    subprocess.run(
-        [
-            imageio_ffmpeg.get_ffmpeg_exe(),
-            "-loglevel",
-            "error",
-            "-f",
-            "rawvideo",
-            "-pix_fmt",
-            "gbrpf32le",
-            "-s",
-            "14x10",
-            "-i",
-            "-",
-            "-format",
-            "float",
-            str(tmp_path / "a.exr"),
-        ],
-        input=raw,
-        check=True,
-    )
+    put_exr(tmp_path / "a.exr", colour)
     assert np.array_equal(read_any_image(tmp_path / "a.exr"), colour)
     cv2.imwrite(str(tmp_path / "a.hdr"), colour[..., ::-1])
     assert np.allclose(read_any_image(tmp_path / "a.hdr"), colour, rtol=0.02, atol=0.02)
@@ -131,13 +113,13 @@ def image_of(shape):
         (
             lambda f: (f / "timestamps.txt").write_text("0\n1\n"),
             None,
-            "one time stamp per image .got '2 stamps, 3 images'",
+            "one time stamp per frame .got '2 stamps, 3 frames'",
         ),
         (lambda f: (f / "timestamps.txt").write_text("0 f0.png\n1 f1.png\n"), None, "no time stamp for image f2.png"),
         (
             lambda f: (f / "timestamps.txt").write_text("0\n20\n10\n"),
             None,
-            r"frame 2 \(f2.png\): time stamps must increase \(got '1e-05 s'\); expected more than 2e-05 s",
+            r"frame 2 \(f2.png\): time stamps must increase \(got '0.01 s'\); expected more than 0.02 s, or --fps",
         ),
         (lambda f: (f / "f1.png").write_bytes(b"\x89PNG"), 1, "f1.png: cannot decode"),
         (image_of((12, 17)), 1, r"frame 1 \(f1.png\): frame size changed \(got \(12, 17\)\)"),
@@ -147,7 +129,7 @@ def test_bad_folders(tmp_path, spoil, fps, said):
     folder = images(tmp_path / "a")
     spoil(folder)
     with pytest.raises((AssetError, EventDataError), match=said):
-        list(open_frames(folder, fps=fps))
+        list(open_frames(folder, Declared(fps=fps)))
 
 
 @pytest.mark.parametrize(
@@ -165,18 +147,18 @@ def test_bad_arrays_and_files(tmp_path, name, arrays, fps, said):
         if arrays is not None:
             np.savez(file, **arrays) if isinstance(arrays, dict) else np.save(file, arrays)
     with pytest.raises((AssetError, EventDataError), match=said):
-        open_frames(tmp_path / name, fps=fps)
+        open_frames(tmp_path / name, Declared(fps=fps))
 
 
 def test_an_array_that_is_cut(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((3, 4, 5)))
     (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-10])
     with pytest.raises(AssetError, match="malformed array"):
-        open_frames(tmp_path / "a.npy", fps=1)
+        open_frames(tmp_path / "a.npy", Declared(fps=1))
 
 
 def times(path, **given):
-    return [t for _, t, _ in open_frames(path, **given)]
+    return [t for _, t, _ in open_frames(path, Declared(**given))]
 
 
 def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
@@ -192,28 +174,56 @@ def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
             path.write_text(f"0,f0.png\n{1000 * step},f1.png\n{2000 * step},f2.png\n")
             assert times(folder) == [0, step * 10**6, 2 * step * 10**6]
     (tmp_path / "mine.txt").write_text("5\n6\n8\n")
-    assert times(folder, timestamps=tmp_path / "mine.txt") == [5000, 6000, 8000]
-    assert times(folder, timestamps=tmp_path / "mine.txt", fps=10) == [0, 10**8, 2 * 10**8]
+    mine = {"timestamps": tmp_path / "mine.txt"}
+    assert times(folder, **mine, time_unit="us") == [5000, 6000, 8000]
+    assert times(folder, **mine, time_unit="frames", fps=10) == [5 * 10**8, 6 * 10**8, 8 * 10**8]
+    with pytest.raises(ConfigError, match="--fps, --timestamps: a frame rate and a list of times contradict"):
+        times(folder, **mine, fps=10)
+    with pytest.raises(ConfigError, match="--time-unit: times in frames need a frame rate"):
+        times(folder, **mine, time_unit="frames")
     with pytest.raises(AssetError, match="none.txt: cannot read: No such file"):
-        open_frames(folder, timestamps=tmp_path / "none.txt")
+        open_frames(folder, Declared(timestamps=tmp_path / "none.txt"))
 
 
-def test_lines_of_times(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "unit", "times", "names"),
+    [
+        ("time name\n0 a\n33333,b\n66667 c\n", None, [0, 33_333_000, 66_667_000], ["a", "b", "c"]),
+        ("-5 # before\n\n# nothing\n+7\n", "us", [-5000, 7000], None),
+        ("1e-3\n.5\n2.\n", "s", [10**6, 5 * 10**8, 2 * 10**9], None),
+        ("1\n1.01\n1.02\n", None, [10**9, 1_010_000_000, 1_020_000_000], None),  # one unit for all
+        ("#timestamp [ns],filename\n1403636579763555584,a.png\n1403636579813555456,b.png\n", None,
+         [1403636579763555584, 1403636579813555456], ["a.png", "b.png"]),
+        ("# color images\n# timestamp filename\n1305031102.175304 rgb/1.png\n1305031102.211214 rgb/2.png\n", None,
+         [1305031102175304000, 1305031102211214000], ["rgb/1.png", "rgb/2.png"]),
+        ("# exposure_start_timestamp_us,exposure_end_timestamp_us\n10,30\n110,130\n", None, [20_000, 120_000], None),
+        ("# timestamp format v2\n0\n16\n33\n", None, [0, 16_000_000, 33_000_000], None),
+        ("index;t_ms;name\n0;5;a b\n1;15;c\n2;25;d\n", None, [5_000_000, 15_000_000, 25_000_000], None),
+        ("0 0.5\n1 0.533\n2 0.567\n", None, [500_000_000, 533_000_000, 567_000_000], None),
+        ("a.png 0.5\nb.png 0.533\n", None, [500_000_000, 533_000_000], ["a.png", "b.png"]),
+        ("\ufefft_ns\n1\n2\n", None, [1, 2], None),
+    ],
+)  # fmt: skip
+def test_lines_of_times(tmp_path, text, unit, times, names):
     path = tmp_path / "t.txt"
-    for text, expected in (
-        ("time name\n1 a\n2,b\n", [(1000, "a"), (2000, "b")]),
-        ("-5 # before\n\n# nothing\n+7\n", [(-5000, None), (7000, None)]),
-        ("1e-3\n.5\n2.\n", [(10**6, None), (5 * 10**8, None), (2 * 10**9, None)]),
-        ("1 a.png more\n", [(1000, "a.png")]),
-    ):
-        path.write_text(text)
-        assert read_timestamps(path) == expected
+    path.write_text(text, encoding="utf-8")
+    stamps = read_timestamps(path, unit)
+    assert stamps.times_ns == times and (names is None or stamps.names == names)
+    stated = unit is not None or any(word in text for word in ("[ns]", "_us", "_ms", "_ns", "v2"))
+    assert (stamps.note is None) == stated and (stated or "--time-unit" in stamps.note)
+
+
+def test_lines_that_are_no_times(tmp_path):
+    path = tmp_path / "t.txt"
     for text, said in (
         ("", "no time stamps"),
         ("header\n", "no time stamps"),
-        ("1\ninf\n", "line 2 is not"),
+        ("1\ninf\n", "line 2 is not a time stamp .got 'inf'"),
         ("1\nnan\n", "line 2"),
+        ("1\n1e999999999\n", "line 2"),
         ("time\n0\nx\n", "line 3 is not a time stamp"),
+        ("1 a.png\n2\n", "times with a name and times without one"),
+        ("0.01\n0.02\n0.03\n40000\n50000\n60000\n", "frames 2 and 3: times in two units"),
     ):
         path.write_text(text)
         with pytest.raises(EventDataError, match=said):

@@ -113,7 +113,7 @@ def test_files_that_faery_makes(tmp_path, ending, seed):
     faery.events_stream_from_array(a, (346, 260)).to_file(path, **({} if ending == "aedat4" else {"zero_t0": False}))
     equal(path, (e.x, e.y, e.t, e.p))
     with open_events(path) as file:
-        assert (file.height, file.width) == (260, 346) and file.said == []
+        assert (file.height, file.width) == (260, 346) and file.notes == []
 
 
 @pytest.mark.parametrize("unit", SCALE)

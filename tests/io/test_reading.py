@@ -26,7 +26,7 @@ UNITS = {"s": 1e-6, "ms": 1e-3, "us": 1.0, "ns": 1e3}
 
 def read(path, **declared) -> tuple[Events, list[str]]:
     with open_events(path, EventReading.of(**declared)) as file:
-        return file.read(), file.said
+        return file.read(), file.notes
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -294,7 +294,7 @@ def test_a_guessed_size_is_no_fact(tmp_path):
         sized = file.sized()
         assert (sized.height, sized.width) == (240, 304)
         assert (
-            sized.said[-1]
+            sized.notes[-1]
             == "size taken as 304x240, the smallest sensor that holds all events (--size if that is wrong)"
         )
     for name in ("e.h5", "e.raw", "e.npz", "e.csv"):
@@ -433,7 +433,7 @@ def test_prophesees_dat(tmp_path):
     (tmp_path / "e.dat").write_bytes(head + bytes([12, 8]) + body)
     with open_events(tmp_path / "e.dat") as file:
         events = file.read()
-        assert (file.format, file.height, file.width, file.said) == ("dat", 2000, 16384, [])
+        assert (file.format, file.height, file.width, file.notes) == ("dat", 2000, 16384, [])
     assert [events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist()] == [
         x.tolist(), y.tolist(), t.tolist(), p.tolist(),
     ]  # fmt: skip

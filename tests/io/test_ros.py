@@ -68,14 +68,14 @@ def test_bags_of_every_kind(tmp_path, form, name, kind):
     for one in inner:  # the folder, and the file in it
         with open_events(one) as file:
             assert (file.format, file.height, file.width) == ("rosbag", 260, 346)
-            assert same(file.read(), E) and file.said == []
+            assert same(file.read(), E) and file.notes == []
 
 
 def test_several_topics_and_none(tmp_path):
     pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = bag(tmp_path / "e.bag", "bag", {"/right": ("dvs_msgs", E.part(slice(9))), "/left": ("dvs_msgs", E)})
     with open_events(path) as file:
-        assert same(file.read(), E) and file.said == ["2 topics of events: /left is read (--stream for another)"]
+        assert same(file.read(), E) and file.notes == ["2 topics of events: /left is read (--stream for another)"]
     with open_events(path, EventReading(stream=1)) as file:
         assert len(file.read()) == 9
     with pytest.raises(AssetError, match=r"no such topic of events .got 2.; expected --stream 0 ./left., --stream 1"):

@@ -227,7 +227,7 @@ def test_eventkubric(data, sequence, tmp_path, monkeypatch):
     for k, frame in enumerate(rgb):
         np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
     with open_events(folder / "train/sequence_000000/events/0000000000.npz") as file:  # says its own unit, ns
-        assert file.read().t.tolist() == (part.t - tracks["t_us"][0]).tolist() and file.said == []
+        assert file.read().t.tolist() == (part.t - tracks["t_us"][0]).tolist() and file.notes == []
 
 
 def test_generate_writes_a_layout_too_when_all_are_whole(tmp_path, capsys):
@@ -439,7 +439,7 @@ def test_rosbag_on_the_topics_of_esim(data, sequence, tmp_path):
         f"/cam0/{name}" for name in ("events", "image_raw", "camera_info", "depthmap", "optic_flow")
     }
     with open_events(path) as file:
-        assert (file.height, file.width) == (HEIGHT, WIDTH) and file.said == []
+        assert (file.height, file.width) == (HEIGHT, WIDTH) and file.notes == []
         same([getattr(file.read(), k) for k in "xytp"], events)
     rows = [e for _, message in found["/cam0/events"] for e in message.events]
     assert [(e.x, e.y, e.ts.sec * 10**6 + e.ts.nanosec // 1000, int(e.polarity)) for e in rows] == list(
@@ -474,6 +474,6 @@ def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
     pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = exported(stereo.parents[1], tmp_path, "rosbag") / "train/sequence_000000.bag"
     with open_events(path) as file:
-        assert file.said == ["2 topics of events: /cam0/events is read (--stream for another)"]
+        assert file.notes == ["2 topics of events: /cam0/events is read (--stream for another)"]
         same([getattr(file.read(), k) for k in "xytp"], read_events(stereo / "left/events.h5"))
     assert export_layout(bare, tmp_path / "bare", "rosbag").said == ()

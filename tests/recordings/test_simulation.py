@@ -14,14 +14,16 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
+from blinkgl.io.frames import Declared
 from blinkgl.io.video import VideoReader, VideoWriter
-from blinkgl.recordings.decoding import Decoder
+from blinkgl.recordings.decoding import Codes, Decoder
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.simulation import FrameUse, SimulationReport, file_to_events, frames_to_events
 from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
 
 H, W = 30, 40
+AT_100 = Declared(fps=100)
 
 
 def frames8(count=8, height=H, width=W, channels=()) -> np.ndarray:
@@ -67,13 +69,11 @@ def test_luminance_of_colour_and_gamma():
     codes = np.random.default_rng(0).integers(0, 256, (5, 6, 3)).astype(np.uint8)
     exact = lambda curve: curve(codes / 255.0) @ np.array([0.2126, 0.7152, 0.0722])
     srgb = lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-    assert np.allclose(Decoder(None)(codes, ""), exact(srgb), atol=1e-6)
+    assert np.allclose(Decoder("srgb")(codes, ""), exact(srgb), atol=1e-6)
     assert np.allclose(Decoder("linear")(codes, ""), exact(lambda x: x), atol=1e-6)
     assert np.allclose(Decoder(2.2)(codes, ""), exact(lambda x: x**2.2), atol=1e-6)
     real = np.random.default_rng(0).random((5, 6, 3)) * 10
-    assert np.allclose(Decoder(None)(real, ""), real @ np.array([0.2126, 0.7152, 0.0722]), rtol=1e-6), (
-        "floats are linear"
-    )
+    assert np.allclose(Decoder("linear")(real, ""), real @ np.array([0.2126, 0.7152, 0.0722]), rtol=1e-6)
 
 
 @pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
@@ -107,13 +107,15 @@ def test_slow_video_is_said(tmp_path, capsys, step_px, said):
 def test_what_integer_codes_were_taken_for_is_said(tmp_path, gamma):
     """A recording's own frames are linear; codes of images are taken as sRGB, and the report says where nobody did."""
     np.save(tmp_path / "v.npy", frames8())
-    report = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, use=FrameUse(gamma))
+    report = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", declared=AT_100, use=FrameUse(Codes(gamma)))
     assert report.assumed_gamma == ("srgb" if gamma is None else None)
-    sized = file_to_events(tmp_path / "v.npy", tmp_path / "e.h5", fps=100, use=FrameUse(gamma), size=(15, 20))
+    sized = file_to_events(
+        tmp_path / "v.npy", tmp_path / "e.h5", declared=AT_100, use=FrameUse(Codes(gamma)), size=(15, 20)
+    )
     assert sized.assumed_gamma == ("srgb" if gamma is None else None)
     own = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
-    file_to_events(own, tmp_path / "own.h5", use=FrameUse(gamma))
-    file_to_events(own, tmp_path / "linear.h5", use=FrameUse("linear"))
+    file_to_events(own, tmp_path / "own.h5", use=FrameUse(Codes(gamma)))
+    file_to_events(own, tmp_path / "linear.h5", use=FrameUse(Codes("linear")))
     alike = same(open_events(tmp_path / "own.h5").read(), open_events(tmp_path / "linear.h5").read())
     assert alike == (gamma != "srgb")
 
@@ -284,7 +286,7 @@ def test_real_frames_against_the_real_recording():
         file_to_events(
             root,
             f"{folder}/e.h5",
-            use=FrameUse("linear", "motion"),
+            use=FrameUse(Codes("linear"), "motion"),
             emulator=EsimConfig(contrast_threshold=0.5, log_eps=10 / 255),
         )
         result = compare(root / "events_chunk.txt", f"{folder}/e.h5", frames=root)

@@ -21,7 +21,7 @@ def nearest_exhaustive(
     any_will_do: bool = False,
 ) -> None:
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
-    triangles, face, _, _, _, _, root, first, size, cull, _, mask, uvs, masks, cutoffs, texels = forest
+    triangles, face, _, _, _, _, root, first, size, side, _, mask, uvs, masks, cutoffs, texels = forest
     d = np.empty(3)
     for i in range(rays.shape[0]):
         depth[i] = np.inf
@@ -34,7 +34,7 @@ def nearest_exhaustive(
                     continue
                 s, u, v, w, front = _triangle(triangles[j], origins[p], kx, ky, kz, sx, sy, sz)
                 # The same conditions as in nearest_tree, with depth[i] as the best.
-                if not (near <= s <= depth[i] and s < far[i]) or (cull[p] and not front):
+                if not (near <= s <= depth[i] and s < far[i]) or (side[p] != 0 and (side[p] > 0) != front):
                     continue
                 if s == depth[i] and (hit[i, 0] < p or hit[i, 1] < face[j]):
                     continue

@@ -84,7 +84,7 @@ def matt(light: Light, size=(64, 48), **paint) -> Scene:
                 4,
                 grid(width=0.9, depth=0.7),
                 (0.5, -0.9, 0.9),
-                Material(base_color=(0.7, 0.7, 0.3), double_sided=True, **paint),
+                Material(base_color=(0.7, 0.7, 0.3), both_sides=True, **paint),
                 (50, 0, 15),
             ),
         ],

@@ -165,7 +165,7 @@ def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, t
         thing("ball", 3, sphere(0.8, 4), curve(seed, (-0.9, 5.0, -0.3), 0.3, 0.4), paint(2)),
         thing("box", 4, cube(0.6), curve(seed + 1, (1.0, 4.5, -0.2), 0.3, 0.5), paint(3)),
         thing(
-            "sheet", 5, quad(0.5, 0.7), curve(seed + 2, (0.2, 3.6, 0.5), 0.25, 0.6, LEVEL), paint(4, double_sided=True)
+            "sheet", 5, quad(0.5, 0.7), curve(seed + 2, (0.2, 3.6, 0.5), 0.25, 0.6, LEVEL), paint(4, both_sides=True)
         ),
     )
     path = curve(seed + 3, (0, 0, 0), 0.15, 0.05, LEVEL) if camera_moves else still(rotation=LEVEL)

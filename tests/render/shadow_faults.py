@@ -52,7 +52,7 @@ def frame(rng: np.random.Generator, size: int) -> Scene:
         body(1, grid(width=20, depth=20, subdivisions=4), (0, 5, 0), False, "ground"),
         body(2, icosphere(), (-0.9, 4.5, rng.uniform(0.6, 1.2))),
         body(3, cuboid(), (0.9, 4.0, rng.uniform(0.9, 1.3))),
-        body(4, grid(width=1.0, depth=0.8, subdivisions=2), (0.1, 3.6, 1.4), double_sided=True),
+        body(4, grid(width=1.0, depth=0.8, subdivisions=2), (0.1, 3.6, 1.4), both_sides=True),
         body(5, cuboid(extents=(0.5, 0.4, 0.6)), (0.1, 5.5, 0.3), False),
     )
     light = Light(towards, 1.0, SKY, shadows="hard", shadow_size=size)

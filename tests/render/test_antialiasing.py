@@ -28,7 +28,7 @@ def half_plane(angle: float, offset: float, size: int = 48) -> tuple[Scene, np.n
     )
     depth = 10.0
     points = np.column_stack([corners * depth / size, np.full(4, depth)])  # camera axes; fx = size
-    plane = thing("edge", 1, mesh(points, [[0, 1, 2], [0, 2, 3]]), still(), Material(unlit=True, double_sided=True))
+    plane = thing("edge", 1, mesh(points, [[0, 1, 2], [0, 2, 3]]), still(), Material(unlit=True, both_sides=True))
     camera = Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still())
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return Scene((plane,), camera, 0, SECOND), half_plane_area(normal, offset - x * normal[0] - y * normal[1])
@@ -107,7 +107,7 @@ def stripes(period_texels: int, distance: float, size: int = 64) -> Scene:
         1,
         flat,
         still((0, distance, 0), type(LEVEL).from_matrix(FACING)),
-        Material(Texture(image), unlit=True, double_sided=True),
+        Material(Texture(image), unlit=True, both_sides=True),
     )
     return scene(
         [body], Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still((0, 0, 0), LEVEL))
@@ -146,7 +146,7 @@ def test_four_taps_of_a_linear_texture_are_one(gl):
         1,
         quad(1.0, 1.0),
         still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)),
-        Material(Texture(ramp), unlit=True, double_sided=True),
+        Material(Texture(ramp), unlit=True, both_sides=True),
     )
     world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
     with Renderer(gl, world, RenderConfig()) as one, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as four:

@@ -35,7 +35,7 @@ from render_scenes import (
 from test_antialiasing import half_plane
 
 EDGES = RenderConfig(antialiasing="edges", image_antialiasing="edges")
-WHITE = Material(unlit=True, double_sided=True)
+WHITE = Material(unlit=True, both_sides=True)
 GREY = replace(WHITE, base_color=(0.3,) * 3)
 
 
@@ -389,7 +389,7 @@ def chamfered():
             faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
             normals += 4 * [(np.sin(way), 0, -np.cos(way))]
         shape = mesh(np.array(points) / 16, faces, np.array(normals))
-        paint = Material(double_sided=True)
+        paint = Material(both_sides=True)
         things.append(thing(f"box{k}", 10 + k, shape, still(((k * 11 - 16.3) / 16, 0, 3.0)), paint))
     return scene(things, EYE, Light(sun=1.0, sky=0.2))
 
@@ -448,7 +448,7 @@ def rough_ball(subdivisions: int, dents: float):
     points, place = np.unique(np.round(ball.vertices, 6), axis=0, return_inverse=True)
     rough = 1 + dents * np.random.default_rng(3).uniform(-1, 1, len(points))
     shape = mesh(ball.vertices * rough[place.reshape(-1), None], ball.faces)
-    paint = replace(WHITE, double_sided=False)
+    paint = replace(WHITE, both_sides=False)
     return scene([thing("ball", 1, shape, drift((0, 3.4, 0), (0.4, 0, 0.1), LEVEL), paint)], rig(48, 48, 48.0))
 
 
@@ -469,7 +469,7 @@ def test_seams_of_textures(gl):
     card = mesh(np.column_stack([points * 3 / 48, np.full(4 * rows, 3.0)]), np.concatenate([strip(0), strip(2 * rows)]))
     image = np.zeros((64, 64, 3), np.float32)
     image[:32], image[32:] = 0.1, 0.9
-    paint = Material(Texture(image), unlit=True, double_sided=True)
+    paint = Material(Texture(image), unlit=True, both_sides=True)
     world = looked_at(thing("card", 1, replace(card, uvs=uvs), still(), paint))
     assert set(Contour([(world.objects[0].parts[0].mesh, False)]).sharp.tolist()) == {0, 2}
     true = finest(gl, world)

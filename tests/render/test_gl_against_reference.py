@@ -172,7 +172,7 @@ def test_back_faces_and_two_sided_light(gl):
     inside = scene(
         [
             thing(
-                "room", 1, cube(3.0), still(rotation=Rotation.from_rotvec([0.1, 0.2, 0.3])), Material(double_sided=True)
+                "room", 1, cube(3.0), still(rotation=Rotation.from_rotvec([0.1, 0.2, 0.3])), Material(both_sides=True)
             ),
             thing(
                 "sheet", 2, quad(0.5, 0.5), drift((0, 2, 0), (0.1, 2, 0), LEVEL * Rotation.from_rotvec([0.4, 0.2, 0]))

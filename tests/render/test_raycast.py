@@ -74,7 +74,7 @@ def forest_with_an_empty_part(parts, cull):
         root=np.insert(whole.root, at, 0).astype(np.int32),
         first=np.insert(whole.first, at, whole.first[at]).astype(np.int32),
         size=np.insert(whole.size, at, 0).astype(np.int32),
-        cull=np.array(cull),
+        side=np.array(cull),
         extent=np.insert(whole.extent, at, 1.0),
         mask=np.insert(whole.mask, at, -1).astype(np.int32),
     )

@@ -271,7 +271,7 @@ def test_in_front_of_the_near_plane_is_not_seen():
 def test_back_faces():
     inside = rig(path=still(rotation=LEVEL))
     assert not casting.cast(scene([thing("box", 1, cube(3.0), still())], inside), 0).hit.any()
-    lined = scene([thing("box", 1, cube(3.0), still(), Material(double_sided=True))], inside)
+    lined = scene([thing("box", 1, cube(3.0), still(), Material(both_sides=True))], inside)
     frame = reference.render(lined, 0)
     assert frame.hit.all()
     rays = rays_of(lined.camera) @ LEVEL.as_matrix().T

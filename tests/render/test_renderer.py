@@ -291,7 +291,7 @@ def test_exactly_the_largest_radius_is_drawn():
         True,
         "line",
     )
-    assert item_of(flat, Material(double_sided=True)).radius == MAX_RADIUS
+    assert item_of(flat, Material(both_sides=True)).radius == MAX_RADIUS
 
 
 def lit(*rows) -> np.ndarray:

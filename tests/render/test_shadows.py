@@ -86,7 +86,7 @@ def moving_world(seed, camera=True, shadows="hard", lamps=()):
     things = [
         thing("ball", 2, sphere(0.5, 4), curve(seed, (-0.9, 4.5, 0.0), 0.3, 0.4)),
         thing("box", 3, cube(0.4), curve(seed + 1, (0.8, 4.0, -0.1), 0.3, 0.5)),
-        thing("sheet", 4, quad(0.5, 0.4), curve(seed + 2, (0.1, 3.6, 0.6), 0.2, 0.6), Material(double_sided=True)),
+        thing("sheet", 4, quad(0.5, 0.4), curve(seed + 2, (0.1, 3.6, 0.6), 0.2, 0.6), Material(both_sides=True)),
         thing("standing", 5, cube(0.3), still((0.1, 5.5, -0.7))),
     ]
     eye = curve(seed + 3, (0, 0, 1.0), 0.2, 0.05, DOWN) if camera else still((0, 0, 1.0), DOWN)
@@ -190,7 +190,7 @@ def test_no_more_than_four_lamps_cast(gl):
 
 def test_the_rate_keeps_to_what_is_lit(gl):
     """dL/dt of a surface in the shadow is that of its other light; the shadow's own motion is not in it."""
-    roof = thing("roof", 2, quad(3, 3), still((0, 4, 2)), Material(double_sided=True))
+    roof = thing("roof", 2, quad(3, 3), still((0, 4, 2)), Material(both_sides=True))
     turn = Rotation.from_rotvec([0, 0.4, 0])
     world = sunlit(roof, thing("ball", 3, sphere(0.4), drift((0, 4, 0), (0, 4, 0.2), None, turn)), sky=0.3)
     dark = replace(world, light=replace(world.light, sun=0.0, shadows="off"))

@@ -236,11 +236,15 @@ PLY = (
     "name, text, problem",
     [
         ("a.ply", PLY.format("9" * 5000, 1), "too many vertex elements (got 'a number of 5000 digits')"),
-        ("a.ply", PLY.format(3, 1).replace("3 0 1 2", "3 0 1 99999999"), "a face refers to a vertex outside 0..2"),
+        (
+            "a.ply",
+            PLY.format(3, 1).replace("3 0 1 2", "3 0 1 99999999"),
+            "a face refers to a vertex that does not exist (got 99999999); expected 0 to 2",
+        ),
         (
             "a.obj",
             "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 4294967295/1\n",
-            "a face refers to a vertex that does not exist (got '4294967295'); expected at most 6",
+            "line 5: a face refers to a vertex that does not exist (got '4294967295'); expected 1 to 3, or -1 to -3",
         ),
         (
             "a.obj",
@@ -259,6 +263,7 @@ PLY = (
             '{"asset": {"version": "2.0"}, "buffers": [{"uri": "' + "x" * 5000 + '", "byteLength": 4}]}',
             "refers to a file that is missing",
         ),
+        ("a.gltf", '{"asset": {"version": "2.0", "minVersion": "2.1"}}', "no glTF 2.0 (got 'minVersion 2.1')"),
         ("a.gltf", '{"asset": []}', "asset: input should be a valid dictionary"),
         ("a.gltf", "[]", "its JSON: input should be a valid dictionary"),
     ],

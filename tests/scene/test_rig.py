@@ -49,7 +49,7 @@ def offset(x, turn=(0.0, 0.0, 0.0)):
 def stereo(T_right=None):
     """A wall at 4 m and a box before it, seen by two eyes on a rig that slides and turns; the left one sits in its
     origin."""
-    paint = Material(procedural_texture("fbm", 1, 128), double_sided=True, unlit=True)
+    paint = Material(procedural_texture("fbm", 1, 128), both_sides=True, unlit=True)
     wall = SceneObject(
         "wall",
         1,

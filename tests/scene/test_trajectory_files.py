@@ -1,5 +1,7 @@
 """Trajectories of other programs, in and out: a flight by formula comes back; what is wrong in a file is named."""
 
+import json
+
 import numpy as np
 import pytest
 import yaml
@@ -66,6 +68,108 @@ def test_both_forms_say_the_same_to_the_nanosecond(flight):
     assert np.array_equal(again, t_ns) and np.allclose(T_again, T, atol=1e-11)
     write_trajectory(flight / "early.txt", np.array([-1_500_000_000, -1]), T[:2])
     assert read_trajectory(flight / "early.txt")[0].tolist() == [-1_500_000_000, -1]
+
+
+T_S = np.arange(40) * 0.02
+
+
+def table(titles: str, rows, separator: str) -> str:
+    return titles + "\n" * bool(titles) + "\n".join(separator.join(f"{v:.9f}" for v in row) for row in rows) + "\n"
+
+
+def poses_of(T: np.ndarray, order: str) -> np.ndarray:
+    """(N, 7): the columns that ``order`` names."""
+    by = dict(zip(("x", "y", "z"), T[:, :3, 3].T))
+    by |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(T[:, :3, :3]).as_quat().T))
+    return np.stack([by[name] for name in order.split()], axis=1)
+
+
+@pytest.mark.parametrize("separator", [" ", ", ", ",", "\t", ";"])
+@pytest.mark.parametrize(("unit", "scale"), [("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize(
+    ("titles", "order"),
+    [
+        ("# timestamp{}, x, y, z, qx, qy, qz, qw", "x y z qx qy qz qw"),  # ESIM's
+        ("# timestamp{} tx ty tz qw qx qy qz", "x y z qw qx qy qz"),
+        ("time{} q_w q_x q_y q_z p_x p_y p_z", "qw qx qy qz x y z"),
+        ("#t{} pos_x pos_y pos_z x y z w", "x y z qx qy qz qw"),
+        ("#timestamp{}, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
+         "x y z qw qx qy qz"),
+        ("time{},position.x,position.y,position.z,orientation.x,orientation.y,orientation.z,orientation.w",
+         "x y z qx qy qz qw"),
+        ("#t{} x y z w x y z", "x y z qw qx qy qz"),
+    ],
+)  # fmt: skip
+def test_a_heading_says_order_and_unit_whatever_separates(tmp_path, titles, order, unit, scale, separator):
+    T, notes = circle(T_S), []
+    rows = np.column_stack([T_S * scale, poses_of(T, order)])
+    (tmp_path / "t.txt").write_text(table(titles.format(f" [{unit}]"), rows, separator))
+    t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
+    assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7) and notes == []
+    (tmp_path / "t.txt").write_text(table(titles.format(""), rows, separator))
+    t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
+    assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7)
+    assert len(notes) == 1 and f"times taken as {unit}" in notes[0] and "time_unit:" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("order", "said"), [("x y z qx qy qz qw", "qx qy qz qw"), ("x y z qw qx qy qz", "qw qx qy qz")]
+)
+def test_without_a_heading_order_and_unit_are_guessed_and_said(tmp_path, order, said):
+    T, notes = np.tile(np.eye(4), (40, 1, 1)), []
+    T[:, 0, 3], T[:, :3, :3] = T_S, Rotation.from_rotvec(np.outer(T_S, (0, 0, 1))).as_matrix()
+    (tmp_path / "t.txt").write_text(table("", np.column_stack([T_S, poses_of(T, order)]), " "))
+    assert np.allclose(read_trajectory(tmp_path / "t.txt", notes=notes)[1], T, atol=1e-7)
+    assert any(f"quaternions taken as {said}" in note and "columns:" in note for note in notes)
+    (other,) = [o for o in ("x y z qx qy qz qw", "x y z qw qx qy qz") if o != order]
+    (tmp_path / "t.txt").write_text(table("", np.column_stack([T_S, poses_of(T, other)]), " "))
+    declared = read_trajectory(tmp_path / "t.txt", columns=f"t {other}", time_unit="s")[1]
+    assert np.allclose(declared, T, atol=1e-7)
+
+
+def test_other_programs_files(tmp_path):
+    """KITTI, TartanAir, COLMAP and NeRF, written as their documentation says."""
+    T = circle(T_S)
+    (tmp_path / "poses.txt").write_text("\n".join(" ".join(f"{v:.9f}" for v in one[:3].ravel()) for one in T))
+    (tmp_path / "times.txt").write_text("\n".join(f"{t:.6e}" for t in T_S))
+    for given in ({}, {"rate": 50}):
+        t_ns, read = read_trajectory(tmp_path / "poses.txt", **given)
+        assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7)
+    inverse = np.linalg.inv(T)
+    lines = [
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+    ]
+    for k in reversed(range(len(T))):
+        numbers = " ".join(f"{v:.9f}" for v in poses_of(inverse[k : k + 1], "qw qx qy qz x y z")[0])
+        lines += [f"{k + 1} {numbers} 1 frame_{k}.png", "1.0 2.0 -1"]
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    assert np.allclose(read_trajectory(tmp_path / "images.txt", rate=50)[1], T, atol=1e-6)
+    opengl = T @ np.diag([1, -1, -1, 1.0])
+    frames = [{"file_path": f"./r_{k}", "time": t, "transform_matrix": one.tolist()} for k, (t, one) in
+              enumerate(zip(T_S.tolist(), opengl))]  # fmt: skip
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    notes = []
+    t_ns, read = read_trajectory(tmp_path / "transforms.json", notes=notes)
+    assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-9) and "opengl" in notes[0]
+    # x forwards, y right, z down: OpenCV's z, x, y.
+    ned = T.copy()
+    ned[:, :3, :3] = T[:, :3, :3] @ np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    rows = poses_of(ned, "x y z qx qy qz qw")
+    (tmp_path / "pose_left.txt").write_text(table("", rows, " "))
+    assert np.allclose(read_trajectory(tmp_path / "pose_left.txt", rate=50)[1], T, atol=1e-6)
+    (tmp_path / "w2c.txt").write_text(table("#t[s] x y z qx qy qz qw", np.column_stack(
+        [T_S, poses_of(inverse, "x y z qx qy qz qw")]), " "))  # fmt: skip
+    assert np.allclose(read_trajectory(tmp_path / "w2c.txt", maps_from="world")[1], T, atol=1e-6)
+
+
+def test_a_camera_at_three_hundred_metres_a_second_is_said(tmp_path):
+    T, notes = np.tile(np.eye(4), (40, 1, 1)), []
+    T[:, 0, 3] = T_S * 300
+    (tmp_path / "t.txt").write_text(table("#t[s] x y z qx qy qz qw", np.column_stack(
+        [T_S, poses_of(T, "x y z qx qy qz qw")]), " "))  # fmt: skip
+    read_trajectory(tmp_path / "t.txt", notes=notes)
+    assert notes == ["t.txt: the body moves at 300 units/s: another unit of time or length? (time_unit)"]
 
 
 def scene(pose) -> Scene:
@@ -136,10 +240,16 @@ GOOD = "0 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 0 1\n0.3 1 2 3 0 0 0 1
         (GOOD + "0.25 1 2 3 0 0 0 1\n", "line 5 is before the one before"),
         (GOOD + "9 1 2 3 0 0 0 1\n", "a gap before line 5"),
         (GOOD + "0.4 1 2 3 0 0 0 0.5\n", "line 5 has no rotation"),
-        ("# timestamp tx ty tz qw qx qy qz\n" + GOOD, "quaternions begin with w"),
-        ("0 1 2 3 0 0 0 1\n10000000 1 2 3 0 0 0 1\n", "another unit of time"),
-        ("1403636579763555584 1 2 3 0 0 0 1\n1403636579763655584 1 2 3 0 0 0 1\n", "too large: another unit"),
+        ("0 1 2 3 0 0 0 1\ninf 1 2 3 0 0 0 1\n", "line 2 is no pose"),
+        ("#t [s] x y z qx qy qz qw\n0 1 2 3 0 0 0 1\n10000000 1 2 3 0 0 0 1\n", "another unit of time"),
+        (
+            "#t_s x y z qx qy qz qw\n1403636579763555584 1 2 3 0 0 0 1\n1403636579763655584 1 2 3 0 0 0 1\n",
+            "too large: another unit",
+        ),
         ("1,2,3\n4,5,6\n", "line 1 is no pose"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n", "poses without times"),
+        ("1 0 0 0 0 2 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n", "line 1 is no pose"),
+        ('{"frames": [{"transform_matrix": 3}]}', "no transforms.json"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
@@ -155,9 +265,10 @@ def test_what_a_sequence_cannot_have(flight, tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         record(scene(Trajectory(flight / "missing.txt")))
     with pytest.raises(ConfigError, match=r"Trajectory\.form"):
-        Trajectory("x", form="kitti")
-    with pytest.raises(ConfigError, match="unknown form"):
-        read_trajectory(flight / "tum.txt", form="kitti")
+        Trajectory("x", form="vins")
+    for wrong in ({"form": "vins"}, {"axes": "enu"}, {"maps_from": "here"}, {"time_unit": "h"}, {"columns": "t x y z"}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            read_trajectory(flight / "tum.txt", **wrong)
     with pytest.raises(ConfigError, match="times do not increase"):
         write_trajectory(tmp_path / "x.txt", np.array([2, 1]), circle(np.zeros(2)))
     (flight / "c.yaml").write_text(
@@ -220,7 +331,7 @@ def test_a_camera_beside_the_body_that_the_file_is_of(flight):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("T_BS", "T_SB"), "T_BS: not a rigid transform"),
+        (("T_BS", "T_SB"), "no place on a body"),
         (("0.0148655429818", "1.0148655429818"), "T_BS: not a rigid transform"),
         (("0.0148655429818", ".nan"), "T_BS: not a rigid transform"),
         (("0.0, 0.0, 0.0, 1.0]", "0.0, 0.0]"), "T_BS: not a rigid transform"),

@@ -19,13 +19,13 @@ H, W, N, FPS = 6, 8, 5, 20
 
 @pytest.fixture
 def clip(tmp_path) -> Path:
-    """Five colour frames that get brighter, each with alpha; flow (k, -k) from frame k; the first k pixels masked."""
+    """Five colour frames that get brighter, each with an opaque alpha; flow (k, -k) from frame k; k pixels masked."""
     folder = tmp_path / "clip"
     for name in ("image_left", "flow"):
         (folder / name).mkdir(parents=True)
     for k in range(N):
         image = np.full((H, W, 4), 40 * (k + 1), np.uint8)
-        image[..., 0], image[..., 3] = 9, 100
+        image[..., 0], image[..., 3] = 9, 255
         cv2.imwrite(str(folder / f"image_left/{k}.png"), image)
         if k < N - 1:
             np.save(folder / f"flow/{k}_flow.npy", np.full((H, W, 2), (k, -k), np.float32))
@@ -83,8 +83,15 @@ def test_a_label_is_of_the_frame_after_its_interval(clip, first, count, used):
         assert truth.forward_ns == (k + 2) * 50_000_000 and truth.frame.forward.valid.all()
         assert (truth.frame.forward.flow == (number, -number)).all()
         assert np.flatnonzero(truth.frame.forward.occluded).tolist() == list(range(number))
-    assert sequence.facts() == {
-        "source": {"folder": "clip", "images": used, "first": f"{first}.png", "last": f"{first + used - 1}.png"}
+    facts = sequence.facts()
+    assert facts["source"].pop("notes")[0] == "integer codes taken as sRGB (--gamma linear for a camera's raw frames)"
+    assert facts == {
+        "source": {
+            "folder": "clip",
+            "images": used,
+            "first": f"{first}.png",
+            "last": f"{first + used - 1}.png",
+        }
     }
     assert sequence.poses() == {} and sequence.triangles == 0 and sequence.omissions == ()
 

@@ -26,7 +26,7 @@ scene:
     stone: {procedural: bricks, color: [0.8, 0.7, 0.6], uv_scale: [5, 5]}
     paint: {procedural: fbm, seed: 1}
     red: {color: [0.9, 0.3, 0.2]}
-    lamp: {color: [0.9, 0.9, 0.5], unlit: true, double_sided: true}
+    lamp: {color: [0.9, 0.9, 0.5], unlit: true, both_sides: true}
   objects:
     - {mesh: floor, material: stone, category: ground, name: floor, position: [0, 5, 0]}
     - mesh: ball

@@ -96,18 +96,18 @@ def test_errors_of_the_output_name_it_and_no_hidden_file(tmp_path, capsys):
 
 def test_compare_says_what_it_took(ns, tmp_path, capsys):
     assert run(["compare", ns, *OPTIONS, "--out", str(tmp_path / "c")]) == 0
-    assert "left out: events outside 80x60" in capsys.readouterr().err
+    assert "left out: events outside 80x60" in capsys.readouterr().out
     assert json.loads((tmp_path / "c/compare.json").read_text())["a"]["count"] == 3000
     np.savez(tmp_path / "g.npz", x=E.x, y=E.y, t=E.t, p=E.p)
     assert run(["compare", str(tmp_path / "g.npz")]) == 0
-    said = capsys.readouterr().err
+    said = capsys.readouterr().out
     assert "g.npz: times taken as us" in said and "size taken as 240x180" in said
 
 
 def test_calibrate_notes_what_it_took(ns, tmp_path, capsys):
     arguments = ["calibrate", ns, "--still", "--out", str(tmp_path / "s.yaml"), "--starts", "1", *OPTIONS]
     assert run(arguments) == 0
-    assert "note: left out: events outside 80x60: 1" in capsys.readouterr().err
+    assert "left out: events outside 80x60: 1" in capsys.readouterr().out
 
 
 def test_eflow_predict_reads_alike(ns, tmp_path, capsys):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from skimage import data
 
-from blinkgl.errors import EventDataError
 from blinkgl.timeline import interpolate
 
 
@@ -156,11 +155,11 @@ def test_as_many_steps_as_the_quickest_but_a_few_pixels_ask_for(monkeypatch):
     assert count(max_px=1.0) == 3
 
 
-def test_motion_of_frames_too_small_for_dense_flow():
-    for size in ((16, 16), (16, 300), (300, 16), (17, 130)):
-        assert len(list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))) == 2
-    for size in ((15, 300), (300, 15), (12, 64), (1, 1)):
-        with pytest.raises(
-            EventDataError, match=f"too small for dense flow .got '{size[1]}x{size[0]}'.; expected at least 16x16"
-        ):
-            list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))
+@pytest.mark.parametrize("preset", [cv2.DISOPTICAL_FLOW_PRESET_FAST, cv2.DISOPTICAL_FLOW_PRESET_MEDIUM])
+def test_motion_of_frames_of_any_size(preset):
+    """OpenCV itself raises, returns NaN or ends the process below 32 px a side."""
+    for size in ((1, 1), (1, 300), (7, 8), (12, 64), (15, 300), (16, 16), (17, 130), (31, 40), (300, 16)):
+        a, b = np.random.default_rng(0).integers(0, 256, (2, *size)).astype(np.uint8)
+        flow = interpolate.DenseFlow(preset).forward(a, b)
+        assert flow.shape == (*size, 2) and np.isfinite(flow).all()
+        assert len(list(interpolate.motion([(np.full(size, 0.5, np.float32), t) for t in (0, 10)]))) == 2

@@ -157,7 +157,7 @@ class ScenePass(Pass):
     def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
         """Draw one item with the program that ``uniforms`` belong to."""
         self.dress_item(painter, shot, item, uniforms)
-        painter.draw(uniforms, item)
+        painter.draw(uniforms, item, shot.moment.t_ns)
 
     def dress_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
         """Set all that a program needs of an item."""

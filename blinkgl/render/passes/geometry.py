@@ -80,7 +80,7 @@ class Geometry(ScenePass):
                 if item.deformer is None and name in of_shapes:
                     continue
                 uniforms[name].write(rows[item.object_index])
-            painter.draw(uniforms, item)
+            painter.draw(uniforms, item, shot.moment.t_ns)
 
     def _values(self, shot: Shot) -> dict[str, tuple[str, list[bytes]]]:
         """Return uniform -> the label that gives it, and its bytes for each object."""

@@ -1,5 +1,5 @@
 """Conversion of any triangles to a valid :class:`~blinkgl.scene.types.Mesh`: checked, cleaned, with normals and texture
-coordinates, and tested for closedness."""
+coordinates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.shapes.deformer import Deformer, filled
@@ -17,9 +16,6 @@ from blinkgl.scene.types import Mesh, Scene
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
-COARSE_WELD_RELATIVE = (
-    1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part separately
-)
 _MAX_REPEATS = 1e9  # of a texture: float32 has no fraction left, and overflows later
 _MAX_COORDINATE = 1e15  # squares of larger coordinates are inaccurate in float32 and overflow soon after
 
@@ -37,13 +33,15 @@ def make_mesh(
     project_degenerate: bool = False,
     log: list[str] | None = None,
     source: list[np.ndarray] | None = None,
+    crease_degrees: float = CREASE_DEGREES,
 ) -> Mesh:
     """Return a valid mesh from raw triangles.
 
     Parameters
     ----------
     vertices : (V, 3) any float, object-local.   faces : (F, 3) any int, counter-clockwise seen from outside.
-    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at ``CREASE_DEGREES`` or more.
+    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at ``crease_degrees`` or
+        more; 0: flat.
     uvs : (V, 2), v down, or None: box projection (:func:`box_project`).
     uv_size : edge of one repeat of projected texture coordinates, in the mesh's units; None: the largest side of the
         bounding box, so that the texture covers the mesh once.
@@ -53,8 +51,8 @@ def make_mesh(
     source : gets (W,) int64, the index of the given vertex of each of the mesh's; then no two of different origin are
     joined.
 
-    Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is reversed. Raises
-    :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
+    Faces without area are dropped and unused vertices removed; no face is turned round. Raises :class:`AssetError`
+    (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
@@ -64,10 +62,7 @@ def make_mesh(
     uvs_given = uvs is not None
     uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
 
-    points, welded = weld(vertices, faces)
-    closed, inside_out = closed_or_nearly(points, welded)  # before slivers are dropped: they close gaps of no width
-    kept = _worth_drawing(vertices, faces, where, label, log)
-    faces, welded = faces[kept], welded[kept]
+    faces = faces[_worth_drawing(vertices, faces, where, label, log)]
     if normals is not None and not _usable_normals(normals, vertices, faces):
         log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
@@ -76,16 +71,14 @@ def make_mesh(
         uvs = None
 
     # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    corner_normals = crease_normals(vertices, faces, welded) if normals is None else normals[faces]
+    if normals is None:
+        corner_normals = crease_normals(vertices, faces, weld(vertices, faces)[1], crease_degrees)
+    else:
+        corner_normals = normals[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
-    if inside_out:
-        log.append(f"{label}: the mesh was inside out, turned round")
-        faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
-        if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
-            corner_normals = -corner_normals
     corners = None if source is None else origin[faces]
     mesh, first = _from_corners(
-        vertices[faces], corner_normals, corner_uvs, corners, closed=closed, name=name, source_hash=source_hash
+        vertices[faces], corner_normals, corner_uvs, corners, name=name, source_hash=source_hash
     )
     if source is not None and corners is not None:
         source.append(corners.ravel()[first])
@@ -126,7 +119,7 @@ def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray 
 
 def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: str, log: list[str]) -> np.ndarray:
     """Return (F,) bool: faces with an area. Raises AssetError where there are none."""
-    kept = _faces_with_area(vertices, faces)
+    kept = faces_with_area(vertices, faces)
     if not kept.any():
         raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
     if (~kept).mean() > 0.1:  # a few slivers are in almost every file
@@ -134,7 +127,7 @@ def _worth_drawing(vertices: np.ndarray, faces: np.ndarray, where: str, label: s
     return kept
 
 
-def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return (F,) bool. A sliver is compared with its own longest edge, so that small meshes are not dropped."""
     corners = vertices[faces]
     height, longest = _height_and_edge(corners)
@@ -203,7 +196,8 @@ def _usable_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     if normals.shape != vertices.shape:
         return False
     length = np.linalg.norm(normals[faces], axis=2)
-    return bool(np.isfinite(length).all() and (length > 1e-6).all())
+    # Directions of any length: those of a file in mm have the square of its scale. Shorter ones are rounding.
+    return bool(np.isfinite(length).all() and (length > 1e-150).all())
 
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -225,65 +219,31 @@ def _components(left: np.ndarray, right: np.ndarray, count: int) -> tuple[int, n
     )
 
 
-def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """Return (closed, inside_out) of a welded mesh.
-
-    Closed: every directed edge occurs as often as its reverse (an oriented surface without a boundary, which also
-    allows solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of
-    one that has.
-    """
+def closedness(points: np.ndarray, welded: np.ndarray) -> bool:
+    """Return whether a welded mesh is closed and wound outwards: every directed edge occurs as often as its reverse (an
+    oriented surface without a boundary, which also allows solids that touch along an edge), around no negative
+    volume."""
     alive = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
-    welded = welded[alive]
-    if not len(welded):
-        return False, False
-    count = len(points)
+    welded, count = welded[alive], len(points)
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
-    if not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
-        return False, False
-    _, shell = _components(start, end, count)
+    if not len(welded) or not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
+        return False
     a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
-    volumes = np.bincount(shell[welded[:, 0]], weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
-    # A sheet made of two coincident layers has no volume and counts as closed.
+    # A sheet of two coincident layers has no volume and counts as closed.
     noise = 1e-9 * float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) ** 3
-    inside_out = bool(volumes.sum() < -noise)
-    volumes = -volumes if inside_out else volumes
-    shells = np.unique(shell[welded[:, 0]])
-    hollow = [s for s in shells if volumes[s] < -noise]
-    if len(hollow) > 64:
-        return False, False
-    boxes = {s: (points[shell == s].min(axis=0), points[shell == s].max(axis=0)) for s in shells} if hollow else {}
-    for s in hollow:
-        low, high = boxes[s]
-        if not any(volumes[o] > 0 and (boxes[o][0] <= low).all() and (boxes[o][1] >= high).all() for o in shells):
-            return False, False
-    return True, inside_out
-
-
-def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """Return :func:`closedness`; when that fails, also over points merged within ``COARSE_WELD_RELATIVE`` of the
-    extent, which closes gaps that no pixel can show."""
-    closed, inside_out = closedness(points, welded)
-    if closed:
-        return closed, inside_out
-    extent = float((points.max(axis=0) - points.min(axis=0)).max())
-    near = (
-        cKDTree(points).query_pairs(extent * COARSE_WELD_RELATIVE, output_type="ndarray")
-        if len(points) < 100_000
-        else []
-    )
-    if len(near) == 0 or len(near) > 4 * len(points):  # nothing to merge, or so fine a mesh that all of it would be
-        return False, False
-    count, label = _components(near[:, 0], near[:, 1], len(points))
-    merged = np.empty((count, 3))
-    merged[label] = points
-    return closedness(merged, label[welded].astype(np.int64))
+    return bool(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 >= -noise)
 
 
 def crease_normals(
-    vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    welded: np.ndarray,
+    crease_degrees: float = CREASE_DEGREES,
+    groups: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return (F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point
-    that are joined by edges bent less than ``crease_degrees``."""
+    that are joined by edges bent less than ``crease_degrees``; with (F,) ``groups`` instead by edges between two faces
+    of one smoothing group, 0: of none."""
     cross = _face_cross(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
     corners = vertices[faces]
@@ -298,7 +258,10 @@ def crease_normals(
     order = np.lexsort((high, low))
     same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
     first, second = order[:-1][same], order[1:][same]  # edge numbers 3*face + k
-    smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
+    if groups is None:
+        smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
+    else:
+        smooth = (groups[first // 3] == groups[second // 3]) & (groups[first // 3] > 0)
     first, second = first[smooth], second[smooth]
     f_next, s_next = first - first % 3 + (first % 3 + 1) % 3, second - second % 3 + (second % 3 + 1) % 3
     # The edge's two ends: joined corners are those at the same welded point (faces may be wound either way).
@@ -470,7 +433,7 @@ def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:
-    """Return one mesh of several; closed when they are closed together (see :func:`closed_together`)."""
+    """Return one mesh of several."""
     if len(meshes) == 1:
         return replace(meshes[0], name=name or meshes[0].name, source_hash=source_hash or meshes[0].source_hash)
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
@@ -479,18 +442,7 @@ def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = 
         faces=np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.int32),
         normals=np.concatenate([m.normals for m in meshes]),
         uvs=np.concatenate([m.uvs for m in meshes]),
-        closed=closed_together(meshes),
+        closed=all(m.closed for m in meshes),
         name=name,
         source_hash=source_hash,
     )
-
-
-def closed_together(meshes: tuple[Mesh, ...]) -> bool:
-    """Return whether the union of the meshes is closed: files often split one solid by material."""
-    if all(m.closed for m in meshes):
-        return True
-    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    vertices = np.concatenate([m.vertices for m in meshes])
-    faces = np.concatenate([m.faces.astype(np.int64) + o for m, o in zip(meshes, offsets)])
-    closed, inside_out = closed_or_nearly(*weld(vertices, faces))
-    return closed and not inside_out

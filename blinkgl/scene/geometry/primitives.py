@@ -138,7 +138,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
             faces=np.ascontiguousarray(faces, np.int32),
             normals=np.ascontiguousarray(normals, np.float32),
             uvs=np.ascontiguousarray(uvs, np.float32),
-            closed=closedness(*weld(positions, faces))[0],
+            closed=closedness(*weld(positions, faces)),
             name=where,
             source_hash=parameter_hash("primitive", 1, where, tuple(bound.arguments.items())),
             deformer=deformer,

@@ -3,7 +3,7 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import ConfigError
+from blinkgl.scene.geometry.meshes import faces_with_area
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.parts import RawMesh, transformed
 from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
@@ -19,6 +20,8 @@ from blinkgl.scene.shapes.skeleton import Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.types import Mesh
 
+Motion = Callable[[int], tuple[np.ndarray, np.ndarray]]
+
 
 class Animation:
     """A clip of a file with its timing. document : whose nodes move.   skeleton : all of its nodes, in the file's
@@ -26,8 +29,11 @@ class Animation:
 
     def __init__(self, document: gltf.Document, tracks: list[Track], playing: Playing):
         self.document, self.tracks, self._playing, self._places = document, tracks, playing, document.places
+        self._tries: dict[tuple[int, int], list[np.ndarray]] = {}
         self.skeleton: Skeleton = document.skeleton(Clip(document.rest(), tracks, playing))
-        self._moved = {track.joint for track in tracks if track.path in PATHS}
+        self._moved: dict[int, list[Track]] = {}
+        for track in (track for track in tracks if track.path in PATHS):
+            self._moved.setdefault(track.joint, []).append(track)
 
     def moves(self, node: int) -> bool:
         """Return whether a node or one of its ancestors is moved."""
@@ -43,24 +49,30 @@ class Animation:
 
     def tracks_of(self, node: int) -> list[Track]:
         """Return the tracks that move a node or one of its ancestors."""
-        chain = {self._places[step] for step in self._chain(node)}
-        return [track for track in self.tracks if track.joint in chain and track.path in PATHS]
+        return [track for step in self._chain(node) for track in self._moved.get(self._places[step], ())]
 
-    def sample_times(self, keys: list[np.ndarray], t0_ns: int, t1_ns: int, step: float, most: int) -> np.ndarray:
-        """Return (N,) int64 ns in [t0, t1] as the samples of a path: regular ones and, for a clip at the sequence's own
-        times, the key frames (keys : s), as far as it lasts."""
-        playing = self._playing
-        start, end = t0_ns * 1e-9, t1_ns * 1e-9
-        plain = not playing.loop and playing.speed == 1 and playing.phase == -playing.first
-        if plain:
-            first, last = min(k[0] for k in keys), max(k[-1] for k in keys)
-            start, end = max(first, min(start, last)), min(last, max(end, first))
-        regular = np.linspace(start, end, int(min(max((end - start) / step, 1), most)) + 1)
-        inside = np.concatenate(keys) if plain else np.zeros(0)
-        inside = inside[(inside >= start) & (inside <= end)]
-        times = np.unique(np.round(np.concatenate([inside, regular]) * 1e9).astype(np.int64))
-        # A key next to a sample would only cause ringing.
-        return times[np.concatenate([[True], np.diff(times) > 100_000])]
+    def motion(self, node: int, turn: np.ndarray, before: np.ndarray) -> Motion:
+        """Return the function that gives (turn @ T @ before, its rate), ((4, 4), (4, 4) 1/s), of a node's transform T
+        to the file's world at a time in ns."""
+        place = self._places[node]
+
+        def at(t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+            world, rate = self.skeleton.at(int(t_ns))
+            return turn @ world[place] @ before, turn @ rate[place] @ before
+
+        return at
+
+    def tries(self, node: int, t0_ns: int, t1_ns: int, count: int = 32) -> list[np.ndarray]:
+        """Return the node's transforms to the file's world at irregular times in [t0, t1], which no period meets."""
+        if (t0_ns, t1_ns) not in self._tries:
+            times = (t0_ns + round((0.618033988749895 * k % 1) * (t1_ns - t0_ns)) for k in range(count))
+            self._tries[t0_ns, t1_ns] = [self.skeleton.at(t)[0] for t in times]
+        return [world[self._places[node]] for world in self._tries[t0_ns, t1_ns]]
+
+    @property
+    def span_ns(self) -> int:
+        """Return the time after which the clip repeats itself, or does not change any more."""
+        return self._playing.span_ns
 
     def deformer(
         self,
@@ -147,10 +159,10 @@ def play(document: gltf.Document, config: AnimationConfig, base: Path, where: st
     if theirs is not document:
         tracks = _by_name(theirs, tracks, document, f"{where}.file", config.file or "")
     times = [track.times for track in tracks]
-    first, last = (min(t[0] for t in times), max(t[-1] for t in times)) if times else (0.0, 0.0)
-    # A clip that is held is at its own time 0 at the sequence's time 0, as in its file.
-    phase = config.phase if config.loop else config.phase - first
-    return Animation(document, tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop))
+    # A clip begins at its own time 0, as in its file: its first key, when it comes later, is held until then.
+    first = float(min(0.0, *(t[0] for t in times))) if times else 0.0
+    last = float(max(first, *(t[-1] for t in times))) if times else 0.0
+    return Animation(document, tracks, Playing(first, last, config.speed, config.phase - first, config.loop))
 
 
 def _source(document: gltf.Document, file: str | None, base: Path, where: str) -> gltf.Document:
@@ -189,9 +201,30 @@ def _at_rest(document: gltf.Document, node: int, raw: RawMesh, joints: Sequence[
         if raw.binding is None:  # follows the node, without joints
             return transformed(raw, document.world(node))
         skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *raw.binding, where=document.path.name)
-        turned = None if raw.normals is None else skin.normals(shape, 0)
-        raw = replace(raw, vertices=skin.positions(shape, 0), normals=turned, binding=None)
+        # Joints that mirror turn faces and normals round.
+        mirrored = skin.mirrored(0)
+        turned = None if raw.normals is None else skin.normals(shape, 0) * np.where(mirrored, -1.0, 1.0)[:, None]
+        faces = np.where(mirrored[raw.faces[:, :1]], raw.faces[:, ::-1], raw.faces)
+        raw = replace(raw, vertices=skin.positions(shape, 0), normals=turned, binding=None, faces=faces)
     return raw
+
+
+def shown(document: gltf.Document, node: int, animation: Animation | None) -> tuple[list[RawMesh], np.ndarray] | None:
+    """Return :func:`meshes_at_rest` of a node, of an animated one those that its deformer moves; None where nothing of
+    it is ever visible: it is hidden, has a scale of 0, or no surface."""
+    n = document.nodes[node]
+    if not n.shows:
+        return None
+    if animation is None:
+        raws, world = meshes_at_rest(document, node)
+    else:
+        assert n.mesh is not None
+        raws, world = document.raw_meshes(n.mesh), document.world(node)
+        grows = any(track.path == "scale" for track in animation.tracks_of(node))
+        if (grows or (n.skin is not None and raws)) and np.linalg.matrix_rank(world[:3, :3]) < 3:
+            world = np.eye(4)  # a rest pose without size, from which no motion can start
+    raws = [raw for raw in raws if len(raw.faces) and faces_with_area(raw.vertices @ world[:3, :3].T, raw.faces).any()]
+    return (raws, world) if raws else None
 
 
 def clip_names(document: gltf.Document) -> list[str]:

@@ -13,6 +13,7 @@ Features that are not drawn are collected in :attr:`Document.omissions`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.importing.gltf_file import MAX_NODES, Node, buffers_of, index_of, item, needs, nodes_of, parse
-from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE, INVISIBLE_EXTENSIONS, Materials
-from blinkgl.scene.importing.parts import RawMesh
+from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE_EXTENSIONS, Materials
+from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
 from blinkgl.scene.reading import Omissions, contents, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
@@ -77,7 +78,7 @@ class Document:
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
         gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights)
         table, found = gltf_schema.PunctualLights.model_validate(extension).lights, {}
-        for index in self.nodes:
+        for index in (index for index, node in self.nodes.items() if node.visible):
             if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
                 number = reference.get("light")
                 if type(number) is not int or not 0 <= number < len(table):
@@ -109,14 +110,7 @@ class Document:
     def _primitive(self, primitive: dict, mesh: int) -> RawMesh | None:
         """Return one primitive of a mesh; None: it has no visible surface."""
         mode, attributes = primitive.get("mode", 4), primitive["attributes"]
-        if mode in (5, 6):
-            raise AssetError(
-                "a mesh consists of triangle strips or fans",
-                where=self.where,
-                value=f"mode {mode}",
-                accepted="mode 4, separate triangles, as Blender's exporter writes them",
-            )
-        if mode != 4:
+        if mode not in (4, 5, 6):
             self.omissions.add("points and lines")
             return None
         if "POSITION" not in attributes:
@@ -139,10 +133,12 @@ class Document:
             material, colours = self._coloured(primitive, material, len(vertices))
             material = self._without_coordinates(material) if uvs is None else material
         binding, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
-        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours)
+        both = material is not None and bool(material.both_sides)
+        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours, both, flat=True)
 
     def _faces(self, primitive: dict, mesh: int, count: int) -> np.ndarray:
-        """Return the faces of a primitive of ``count`` vertices, (F, 3); without indices the vertices' order counts."""
+        """Return the faces of a primitive of ``count`` vertices, (F, 3): separate triangles, a strip or a fan; without
+        indices the vertices' order counts."""
         if "indices" not in primitive:
             order = np.arange(count)
         else:
@@ -150,7 +146,13 @@ class Document:
             if order.dtype.kind != "u" or order.shape[1] != 1:
                 raise AssetError(f"the indices of mesh {mesh} are no whole numbers", where=self.where)
             order = order.astype(np.int64).ravel()
-        return order[: len(order) // 3 * 3].reshape(-1, 3)
+        mode, n = primitive.get("mode", 4), max(len(order) - 2, 0)
+        if mode == 4:
+            return order[: len(order) // 3 * 3].reshape(-1, 3)
+        first, odd = np.arange(n), np.arange(n) % 2
+        if mode == 5:  # every other triangle of a strip has two corners exchanged
+            return np.stack([order[first], order[first + 1 + odd], order[first + 2 - odd]], axis=1)
+        return np.stack([order[first * 0], order[first + 1], order[first + 2]], axis=1)
 
     def _binding(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return ((V, 4 n) joints, (V, 4 n) weights) of all sets of a primitive."""
@@ -229,7 +231,7 @@ class Document:
             bind = bind.reshape(-1, 4, 4).swapaxes(1, 2)
         return [places[joint] for joint in joints], bind
 
-    @property
+    @cached_property
     def places(self) -> dict[int, int]:
         """Return node of the file -> its index in :attr:`nodes`, which is that of its joint in :meth:`skeleton`."""
         return {node: place for place, node in enumerate(self.nodes)}
@@ -292,11 +294,7 @@ class Document:
         colours = np.clip(np.nan_to_num(given[:, :3]), 0, 1)
         if width == 4 and material is not None and material.mask is not None and (given[:, 3] < 1).any():
             self.omissions.add("opacity of vertex colours (left out)")
-        material = material or Material()
-        if len(colours) and not (colours == colours[0]).all():
-            return material, colours
-        factor = colours[0] * material.base_color if len(colours) else material.base_color
-        return replace(material, base_color=tuple(float(c) for c in factor)), None
+        return tinted(material, colours)
 
     def _without_coordinates(self, material: Material | None) -> Material | None:
         """Return the material of a mesh without texture coordinates, without normal map, whose direction is then
@@ -432,6 +430,8 @@ def read(
             said_there = name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"))
             if name not in DRAWN | _LIGHT_ONLY | INVISIBLE_EXTENSIONS and not said_there:
                 document.omissions.add(name)
+        if "KHR_materials_variants" in tree.get("extensions", {}):
+            document.omissions.add("variants of materials (the default is drawn)")
         if not lights and any(_LIGHTS in tree["nodes"][i].get("extensions", {}) for i in document.nodes):
             document.omissions.add("lights (the configuration's sun and sky shine)")
     return document
@@ -442,7 +442,7 @@ def _check_faces(document: Document, max_faces: int) -> None:
     tree, where = document.tree, document.where
     per_mesh = {}
     for node in document.nodes.values():
-        if node.mesh is None:
+        if not node.shows:
             continue
         if node.mesh not in per_mesh:
             total = 0
@@ -452,8 +452,9 @@ def _check_faces(document: Document, max_faces: int) -> None:
                 corners = vertices
                 if "indices" in primitive:
                     corners = item(tree, "accessors", primitive["indices"], where)["count"]
-                total += max(corners, vertices) // 3
+                # A strip or a fan has a triangle for every corner after the second.
+                total += max(corners, vertices) // (3 if primitive.get("mode", 4) == 4 else 1)
             per_mesh[node.mesh] = total
-    total = sum(per_mesh[n.mesh] for n in document.nodes.values() if n.mesh is not None)
+    total = sum(per_mesh[n.mesh] for n in document.nodes.values() if n.shows)
     if total > max_faces:
         raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")

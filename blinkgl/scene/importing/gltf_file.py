@@ -51,8 +51,10 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
     except (ValueError, RecursionError):
         raise AssetError("the file is no valid glTF (its JSON cannot be read)", where=where) from None
     gltf_schema.check(tree, where)
-    if not tree["asset"]["version"].startswith("2"):
-        raise AssetError("the file is no glTF 2", where=where, value=tree["asset"]["version"])
+    version, least = tree["asset"]["version"], tree["asset"].get("minVersion", "2.0")
+    if not version.startswith("2") or least not in ("2", "2.0"):
+        value = version if not version.startswith("2") else f"minVersion {least}"
+        raise AssetError("the file is no glTF 2.0", where=where, value=value, accepted="version 2.0")
     return tree, binary
 
 
@@ -156,7 +158,8 @@ MAX_NODES, _MAX_DEPTH = 200_000, 256
 @dataclass(frozen=True, eq=False)
 class Node:
     """A node: name, parent (None at the root), mesh, camera and skin index (None without), rest translation, quaternion
-    x y z w, scale or matrix; weights of the mesh's morph targets where the node has its own."""
+    x y z w, scale or matrix; weights of the mesh's morph targets where the node has its own; whether it and what is
+    above it are visible (KHR_node_visibility)."""
 
     name: str
     parent: int | None
@@ -168,6 +171,12 @@ class Node:
     matrix: np.ndarray | None
     skin: int | None = None
     weights: tuple | None = None
+    visible: bool = True
+
+    @property
+    def shows(self) -> bool:
+        """Return whether it shows a mesh."""
+        return self.mesh is not None and self.visible
 
     def local(self) -> np.ndarray:
         """Return the rest transform to the parent, (4, 4)."""
@@ -207,6 +216,8 @@ def nodes_of(tree: dict, where: str) -> dict[int, Node]:
         ]
         own = tuple(n["weights"]) if "weights" in n else None
         name = str(n.get("name") or f"node-{i}")
-        nodes[i] = Node(name, parent, n.get("mesh"), n.get("camera"), *rest, matrix, n.get("skin"), own)
+        visible = n.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True) is not False
+        visible = visible and (parent is None or nodes[parent].visible)
+        nodes[i] = Node(name, parent, n.get("mesh"), n.get("camera"), *rest, matrix, n.get("skin"), own, visible)
         stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
     return nodes

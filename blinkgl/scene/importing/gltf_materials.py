@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blinkgl.scene.importing.gltf_file import fetch, index_of, item
+from blinkgl.scene.importing.parts import INVISIBLE
 from blinkgl.scene.reading import Omissions
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
 from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
@@ -22,13 +23,14 @@ DRAWN = {
     "KHR_materials_emissive_strength",
     "KHR_texture_transform",
     "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_materials_variants",
+    "EXT_texture_webp",
 }
 INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
 """Extensions without visible effect."""
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
-INVISIBLE = Material()
-"""A material that is cut off everywhere."""
 
 
 class _Place(NamedTuple):
@@ -68,7 +70,7 @@ class Materials:
                 texture=self._texture(info["index"]) if info and self.wanted else None,
                 base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
                 unlit="KHR_materials_unlit" in m.get("extensions", {}),
-                double_sided=m.get("doubleSided", False),
+                both_sides=m.get("doubleSided", False),
             )
             if self.wanted:
                 material, base = self._surface(material, m, pbr, base)
@@ -119,6 +121,9 @@ class Materials:
         least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
         # Half-transparent surfaces are not drawn: partly opaque ones are cut out, fully opaque ones are drawn.
         if mode == "BLEND":
+            if most == 0:
+                self.omissions.add("a material of opacity 0")
+                return INVISIBLE
             if most < cutoff:
                 self.omissions.add("alpha BLEND (drawn opaque)")
                 return material
@@ -161,9 +166,10 @@ class Materials:
     def _texture(self, index: int, kind: str = "colour") -> Texture | None:
         """Return a texture. kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is
         opaque."""
-        source = item(self.tree, "textures", index, self.where).get("source")
+        texture = item(self.tree, "textures", index, self.where)
+        source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         if source is None:
-            names = ", ".join(self.tree["textures"][index].get("extensions", {})) or "without an image"
+            names = ", ".join(texture.get("extensions", {})) or "without an image"
             self.omissions.add(f"textures of another kind ({names})")
             return None
         if (source, kind) not in self._textures:

@@ -32,6 +32,7 @@ class _Part(BaseModel):
 
 class Asset(_Part):
     version: str
+    minVersion: str = None
 
 
 class Buffer(_Part):

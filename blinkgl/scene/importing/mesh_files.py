@@ -1,5 +1,5 @@
-"""Mesh files (obj, ply, stl by :mod:`blinkgl.scene.importing.trimesh_files`; glb, gltf by
-:mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
+"""Mesh files (obj, ply, each by a reader of its own; stl, off, 3mf by :mod:`blinkgl.scene.importing.trimesh_files`;
+glb, gltf by :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
 Sizes that a file declares are checked against limits before memory is allocated, and only files in the file's own
 folder are read.
@@ -19,15 +19,17 @@ from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play as play_clip
+from blinkgl.scene.importing.animations import Animation, clip_names, play as play_clip, shown
 from blinkgl.scene.importing.gltf_file import buffer_contents
-from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
+from blinkgl.scene.importing.obj import read_obj
+from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
+from blinkgl.scene.importing.ply import read_ply
 from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".3mf", ".glb", ".gltf")
 ClipOf = Callable[[gltf.Document], Animation]
 
 
@@ -51,7 +53,9 @@ class Asset:
 
     def normalised(self) -> Asset:
         """Return it with the bounding box centred on the origin and bounding radius 1; a deforming one by its whole
-        region."""
+        region. Raises AssetError where nothing of it is visible."""
+        if not self.parts:
+            raise AssetError("nothing of the file is visible", where=self.name, accepted="a mesh with visible faces")
         meshes = normalise(tuple(p.mesh for p in self.parts), self.name)
         return replace(self, parts=tuple(Part(m, p.material) for m, p in zip(meshes, self.parts)))
 
@@ -95,8 +99,8 @@ def load_asset(
             if len(raw.faces) or len(found.raws) == 1
         )
     if not parts:
-        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    parts = closed_parts(parts) if has_materials else _one_part(parts, path.stem, digest)
+        found.omissions.add(WHOLE)
+    parts = parts if has_materials else _white(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
     asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
     given = {"max_faces": max_faces, "max_bytes": max_bytes, "keep_materials": keep_materials, "uv_size": uv_size}
@@ -134,13 +138,22 @@ def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, 
         return _of_document(document, play, turn), digest
     if play is not None:
         raise AssetError("only glTF files have animations", where=where, accepted="a gltf or glb file, or no animation")
+    omissions, log = Omissions(path.name), []
+    raws = _reader(suffix)(path, data, max_faces, max_texture if materials else None, omissions, log)
+    raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
+    return _Found(raws, [None] * len(raws), log, omissions, []), digest
+
+
+def _reader(suffix: str) -> Callable[..., list[RawMesh]]:
+    """Return the function that reads a kind of file other than glTF."""
+    if suffix == ".obj":
+        return read_obj
+    if suffix == ".ply":
+        return read_ply
     # Here: trimesh takes half as long to import as everything else that a worker needs, and most scenes do not use it.
     from blinkgl.scene.importing.trimesh_files import read_meshes
 
-    omissions = Omissions(path.name)
-    raws = read_meshes(path, data, suffix[1:], max_faces, max_texture if materials else None, omissions)
-    raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
-    return _Found(raws, [None] * len(raws), [], omissions, []), digest
+    return read_meshes
 
 
 def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:
@@ -150,11 +163,10 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
     if clips and played is None:
         document.omissions.add("animations (the rest pose is drawn)")
     found = _Found([], [], document.log, document.omissions, clips)
-    for node in (i for i, n in document.nodes.items() if n.mesh is not None):
-        if played is None:
-            raws, world = meshes_at_rest(document, node)
-        else:
-            raws, world = document.raw_meshes(document.nodes[node].mesh), document.world(node)
+    if not any(node.mesh is not None for node in document.nodes.values()):
+        raise AssetError("the file has no faces", where=document.where, accepted="a mesh with triangles")
+    for node in document.nodes:
+        raws, world = shown(document, node, played) or ([], np.eye(4))
         for raw in raws:
             placed = transformed(raw, world)
             found.raws.append(placed if turn is None else transformed(placed, turn))
@@ -164,11 +176,14 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
     return found
 
 
-def _one_part(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:
-    """Return white parts as one, unless their deformations cannot be joined."""
-    meshes = tuple(part.mesh for part in parts)
-    whole = joined_mesh(meshes, name, digest)
-    return tuple(Part(mesh, Material()) for mesh in ((whole,) if whole is not None else meshes))
+def _white(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:
+    """Return white parts: one for each kind of sides, unless their deformations cannot be joined."""
+    made: list[Part] = []
+    for both in dict.fromkeys(part.material.both_sides for part in parts):
+        meshes = tuple(part.mesh for part in parts if part.material.both_sides == both)
+        whole = joined_mesh(meshes, name, digest)
+        made += [Part(mesh, Material(both_sides=both)) for mesh in ((whole,) if whole is not None else meshes)]
+    return tuple(made)
 
 
 def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh | None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from blinkgl.scene.geometry.meshes import closed_together, make_mesh
+from blinkgl.scene.geometry.meshes import CREASE_DEGREES, make_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.types import Material, Part
@@ -15,6 +15,9 @@ from blinkgl.scene.types import Material, Part
 # ---------------------------------------------------------------------------------------------------------------------
 # Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
 
+INVISIBLE = Material()
+"""The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere."""
+WHOLE = "the whole file: all of it is hidden, transparent or without area"
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
@@ -25,7 +28,9 @@ class RawMesh:
 
     binding : (V, k) joints of the node's skin and (V, k) weights; None: no skin.
     targets : morph targets, (n, V, 3) positions, likewise normals or None; None: none.
-    colours : (V, 3) linear factors on the albedo; None: none."""
+    colours : (V, 3) linear factors on the albedo; None: none.
+    both_sides : whether its file draws its faces from both sides; a file that does not say so does.
+    flat : whether faces without normals are flat; otherwise they are smooth where they meet at a small angle."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -35,6 +40,18 @@ class RawMesh:
     binding: tuple[np.ndarray, np.ndarray] | None = None
     targets: tuple[np.ndarray, np.ndarray | None] | None = None
     colours: np.ndarray | None = None
+    both_sides: bool = True
+    flat: bool = False
+
+
+def tinted(material: Material | None, colours: np.ndarray) -> tuple[Material, np.ndarray | None]:
+    """Return (the material, (V, 3) linear factors on it); one colour on all vertices becomes part of the material, with
+    None for the factors."""
+    material = material or Material()
+    if len(colours) and not (colours == colours[0]).all():
+        return material, colours
+    r, g, b = (float(c) for c in (colours[0] * material.base_color if len(colours) else material.base_color))
+    return replace(material, base_color=(r, g, b)), None
 
 
 def transformed(raw: RawMesh, matrix: np.ndarray) -> RawMesh:
@@ -70,6 +87,7 @@ def part_of(
 
     materials : whether it has its own; False: a white one, for any texture. Raises AssetError."""
     material = raw.material if materials and raw.material is not None else Material()
+    material = replace(material, both_sides=raw.both_sides)
     colours = raw.colours if materials else None
     bumped = material.bumps is not None
     # Only per-vertex data of the file needs the indices of the mesh's vertices.
@@ -87,6 +105,7 @@ def part_of(
         project_degenerate=material.texture is None,
         log=log,
         source=source,
+        crease_degrees=0.0 if raw.flat else CREASE_DEGREES,
     )
     if source is None:
         return Part(mesh, material)
@@ -97,11 +116,3 @@ def part_of(
         mesh, kept = split_mirrored(mesh)
         index = index[kept]
     return Part(mesh if deformer is None else replace(mesh, deformer=deformer(raw, index)), material)
-
-
-def closed_parts(parts: Iterable[Part]) -> tuple[Part, ...]:
-    """Return the parts, each marked closed where they are closed together: one solid, split by material."""
-    parts = tuple(parts)
-    if not closed_together(tuple(part.mesh for part in parts)):
-        return parts
-    return tuple(Part(replace(part.mesh, closed=True), part.material) for part in parts)

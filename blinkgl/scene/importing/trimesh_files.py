@@ -1,185 +1,82 @@
-"""obj, ply and stl files as raw meshes."""
+"""stl, off and 3mf files as raw meshes, read by trimesh."""
 
 from __future__ import annotations
 
 import io
 import logging
 import re
-import warnings
-from dataclasses import replace
+import zipfile
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 import trimesh
-from PIL import Image
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.importing.gltf_file import inside
-from blinkgl.scene.importing.parts import RawMesh
-from blinkgl.scene.reading import Omissions, contents
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image
-from blinkgl.scene.types import Material, Texture
+from blinkgl.scene.importing.parts import RawMesh, tinted, transformed
+from blinkgl.scene.importing.polygons import Polygons, raw_meshes
+from blinkgl.scene.reading import MAX_BYTES, Omissions
 from blinkgl.srgb import linear_from_srgb
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings are of no use to a user
 
 
 def read_meshes(
-    path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions
+    path: Path, data: bytes, max_faces: int, max_texture: int | None, omissions: Omissions, log: list[str]
 ) -> list[RawMesh]:
-    """Return raw meshes of a file of this ``kind`` ("obj", "ply", "stl").
+    """Return raw meshes of an stl, off or 3mf file.
 
-    max_texture : None leaves materials out.   omissions : gets the undrawn features of the file. Raises AssetError:
-    truncated, corrupt, no faces, more than ``max_faces``, references outside its folder."""
-    where = str(path)
-    {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj}[kind](data, max_faces, where)
-    resolver = FolderResolver(path.parent, where, kind, omissions)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        loaded = trimesh.load_scene(
-            io.BytesIO(data),
-            file_type=kind,
-            resolver=resolver,
-            process=False,
-            maintain_order=True,
-            skip_materials=max_texture is None,
-        )
-    if max_texture is not None and resolver.refused is not None:
-        raise resolver.refused
-    raws = [
-        _raw_mesh(g, max_texture, omissions, resolver)
-        for g in loaded.geometry.values()
-        if isinstance(g, trimesh.Trimesh)
-    ]
+    max_texture : None leaves colours out.   omissions, log : get what is not drawn, and what was decided. Raises
+    AssetError: truncated, corrupt, no faces, more than ``max_faces``."""
+    where, kind = str(path), path.suffix.lower()[1:]
+    if kind == "off":
+        return _off(data, max_faces, max_texture is not None, where, log)
+    {"stl": _check_stl, "3mf": _check_3mf}[kind](data, max_faces, where)
+    loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
+    raws = []
+    for node in loaded.graph.nodes_geometry:
+        place, name = loaded.graph[node]
+        mesh = loaded.geometry[name]
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            raws.append(transformed(_raw_mesh(mesh, max_texture is not None), np.asarray(place, np.float64)))
     if not raws:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    if any(not isinstance(g, trimesh.Trimesh) for g in loaded.geometry.values()):
-        omissions.add("points and lines")
+    if kind == "3mf" and any(tag in _model_of(data) for tag in (b"basematerials", b"texture2d", b"colorgroup")):
+        omissions.add("colours and textures of 3MF (drawn white)")
     return raws
 
 
-def _raw_mesh(
-    mesh: trimesh.Trimesh, max_texture: int | None, omissions: Omissions, resolver: FolderResolver
-) -> RawMesh:
-    """Return raw triangles and material. max_texture : None leaves the material out."""
-    # mesh.vertex_normals would compute normals that the file does not have.
-    normals = mesh._cache.cache.get("vertex_normals")  # noqa: SLF001
-    uvs = getattr(mesh.visual, "uv", None)
-    if uvs is not None and len(uvs) == len(mesh.vertices):
-        uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]  # trimesh has v upwards
-    else:
-        uvs = None
-    material, colours = None, None
-    if max_texture is not None:
-        material = _material(mesh.visual, max_texture, omissions, resolver)
-        if getattr(mesh.visual, "kind", None) == "vertex":
-            colours = linear_from_srgb(np.asarray(mesh.visual.vertex_colors, float)[:, :3] / 255)
-            if (colours == colours[0]).all():
-                colours = None
-            elif material is not None:
-                material = replace(material, base_color=(1.0, 1.0, 1.0))
-    return RawMesh(
-        np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), normals, uvs, material, colours=colours
-    )
+def _raw_mesh(mesh: trimesh.Trimesh, wanted: bool) -> RawMesh:
+    """Return raw triangles, with the colours of faces where they are ``wanted``."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if not wanted or getattr(mesh.visual, "kind", None) != "face":
+        return RawMesh(vertices, faces)
+    codes = np.asarray(mesh.visual.face_colors)[:, :3] / 255
+    material, tint = tinted(None, linear_from_srgb(np.repeat(codes, 3, axis=0)))
+    apart = np.arange(faces.size).reshape(-1, 3)
+    return RawMesh(vertices[faces.ravel()], apart, None, None, material, colours=tint)
 
 
-def _to_linear(srgb: np.ndarray) -> tuple[float, float, float]:
-    """Return the linear light of an sRGB colour (3,), clipped to 0 to 1."""
-    r, g, b = (float(c) for c in linear_from_srgb(np.clip(srgb, 0, 1)))
-    return r, g, b
-
-
-def _material(visual, max_texture: int, omissions: Omissions, resolver: FolderResolver) -> Material | None:
-    material = getattr(visual, "material", None)
-    if material is None:
-        kind = getattr(visual, "kind", None)
-        if kind not in ("face", "vertex"):
-            return None
-        colours = visual.face_colors if kind == "face" else visual.vertex_colors
-        if kind == "face" and not (colours == colours[0]).all():
-            omissions.add(f"{kind} colours (drawn in the most frequent one)")
-        return Material(base_color=_to_linear(np.asarray(visual.main_color, float)[:3] / 255))
-    image, diffuse = material.image, material.diffuse
-    # An untouched default is not a material; the usual grey diffuse default does not darken a texture.
-    if image is None and material.name is None and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3]):
-        return None
-    if image is None:
-        return Material(base_color=_to_linear(np.asarray(diffuse, float)[:3] / 255))
-    return Material(texture=resolver.texture(image, max_texture))
-
-
-class FolderResolver(trimesh.resolvers.Resolver):
-    """Reads material and image files beside a mesh; refuses paths outside its folder.
-
-    trimesh opens images with Pillow itself and ignores those that it cannot open. So it gets a pixel instead of each,
-    whose colour is the image's number; :meth:`texture` decodes the file by the rules of all other textures.
-    """
-
-    def __init__(self, folder: Path, where: str, kind: str, omissions: Omissions):
-        self.folder, self.where, self.kind, self.omissions = Path(folder), where, kind, omissions
-        self.refused: AssetError | None = None
-        self._named: set[str] = set()  # images named by a material file
-        self._images: list[tuple[str, bytes]] = []
-        self._textures: dict[int, Texture] = {}
-
-    def get(self, name: str) -> bytes:
-        try:
-            file = inside(self.folder, str(name), self.where)
-            data = contents(file, "file")
-        except AssetError as error:  # trimesh hides it; read_meshes raises it
-            if "missing" in error.problem:
-                self.omissions.add(f"'{name}', which is missing")
-            else:
-                self.refused = self.refused or error
-            raise
-        if self.kind == "obj" and name not in self._named:
-            self._read_mtl(data)
-            return data
-        self._images.append((str(file), data))
-        number, stream = len(self._images) - 1, io.BytesIO()
-        Image.new("RGB", (1, 1), (number & 255, number >> 8 & 255, number >> 16 & 255)).save(stream, "PNG")
-        return stream.getvalue()
-
-    def texture(self, pixel: Image.Image, max_texture: int) -> Texture:
-        """Return the texture of a placeholder ``pixel``. Raises AssetError naming its file."""
-        red, green, blue = pixel.convert("RGB").getpixel((0, 0))
-        number = red + (green << 8) + (blue << 16)
-        if number not in self._textures:
-            name, data = self._images[number]
-            self._textures[number] = Texture(decode_image(data, max_texture, name), Path(name).name, content_hash(data))
-        return self._textures[number]
-
-    def _read_mtl(self, data: bytes) -> None:
-        """Record the images that a material file names, and undrawn features of its materials."""
-        for line in data.decode("utf-8", errors="replace").splitlines():
-            key, _, rest = line.strip().partition(" ")
-            key, rest = key.lower(), rest.strip()
-            if key == "map_kd":
-                self._named.add(rest)
-            elif key in _MTL_MAPS:
-                self.omissions.add(_MTL_MAPS[key])
-
-    def write(self, name: str, data: bytes) -> NoReturn:
-        raise AssetError("a mesh loader tried to write", where=self.where, value=name)
-
-    def namespaced(self, namespace: str) -> FolderResolver:
-        return FolderResolver(inside(self.folder, namespace, self.where), self.where, self.kind, self.omissions)
-
-    def keys(self) -> list[str]:
-        return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]
-
-
-_MTL_MAPS = {
-    "map_bump": "normal maps",
-    "bump": "normal maps",
-    "norm": "normal maps",
-    "map_d": "transparency (drawn opaque)",
-    "map_ke": "emissive light",
-    "map_ks": "shine (drawn matt)",
-    "map_pr": "shine (drawn matt)",
-    "map_pm": "shine (drawn matt)",
-}
+def _off(data: bytes, max_faces: int, wanted: bool, where: str, log: list[str]) -> list[RawMesh]:
+    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces."""
+    text = re.sub(r"#.*", "", data.decode("latin-1"))
+    head = re.match(r"\s*((?:ST)?C?N?OFF)(?!\s*BINARY)", text, re.IGNORECASE)
+    if head is None:
+        raise AssetError("the mesh is no OFF file of text", where=where, value=text[:20], accepted="OFF, COFF, NOFF")
+    kind, rows = head[1].upper(), [words for line in text[head.end() :].splitlines() if (words := line.split())]
+    number, count = (int(word) for word in rows[0][:2])
+    vertices, faces = rows[1 : 1 + max(number, 0)], rows[1 + number : 1 + number + count]
+    sizes = np.array([int(row[0]) for row in faces], np.int64)
+    if len(vertices) != number or len(faces) != count or any(len(r) <= n for r, n in zip(faces, sizes, strict=True)):
+        raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
+    places = np.array([int(place) for row in faces for place in row[1 : 1 + int(row[0])]], np.int64)
+    given, first = Polygons(np.array([row[:3] for row in vertices], np.float64), places, sizes), 6 if "N" in kind else 3
+    if wanted and "C" in kind:
+        given.colours = np.array([row[first : first + 3] for row in vertices], np.float64)[places.clip(0, number - 1)]
+    elif wanted and all(len(row) >= size + 4 for row, size in zip(faces, sizes, strict=True)):
+        given.colours = np.repeat(np.array([row[1 + int(row[0]) :][:3] for row in faces], np.float64), sizes, axis=0)
+    if given.colours is not None:  # whole numbers up to 255, or fractions
+        given.colours = linear_from_srgb((given.colours / (255 if given.colours.max() > 1 else 1)).clip(0, 1))
+    return raw_meshes(given, [None], max_faces, where, log)
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:
@@ -201,45 +98,21 @@ def _check_stl(data: bytes, max_faces: int, where: str) -> None:
     _limit(data.count(b"facet normal"), max_faces, where)
 
 
-def _check_ply(data: bytes, max_faces: int, where: str) -> None:
-    end = data[: 1 << 16].find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
-        raise AssetError("the mesh is corrupt (no PLY header)", where=where)
-    for name, digits in re.findall(rb"element\s+(\w+)\s+(\d+)", data[:end]):
-        what = "faces" if name == b"face" else f"{name.decode(errors='replace')} elements"
-        if len(digits) > 18:
-            raise AssetError(
-                f"the mesh has too many {what}",
-                where=where,
-                value=f"a number of {len(digits)} digits",
-                accepted=f"at most {max_faces} faces",
-            )
-        count = int(digits)
-        if count > (max_faces if name == b"face" else 3 * max_faces + 1_000_000):
-            raise AssetError(
-                f"the mesh has too many {what}", where=where, value=count, accepted=f"at most {max_faces} faces"
-            )
-        if count > len(data) - end:  # an element takes at least one byte
-            raise AssetError(f"the mesh is truncated: {count} {what} in {len(data)} bytes", where=where)
-
-
-def _check_obj(data: bytes, max_faces: int, where: str) -> None:
-    _limit(data.count(b"\nf ") + data.startswith(b"f "), max_faces, where)
-    # trimesh allocates as many vertices as the largest index of a face; a file has at most one per line.
-    lines = data.count(b"\n") + data.count(b"\r") + 1
-    found = re.search(
-        rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1),
-        data.replace(b"\\\n", b" ") if b"\\\n" in data else data,
-    )
-    if found:
-        raise AssetError(
-            "a face refers to a vertex that does not exist",
-            where=where,
-            value=found[1][:20].decode(),
-            accepted=f"at most {lines}",
-        )
-
-
 def _limit(faces: int, max_faces: int, where: str) -> None:
     if faces > max_faces:
         raise AssetError("the mesh has too many faces", where=where, value=faces, accepted=f"at most {max_faces}")
+
+
+def _check_3mf(data: bytes, max_faces: int, where: str) -> None:
+    """Check what the archive says about its sizes before anything is unpacked."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = sum(info.file_size for info in archive.infolist())
+    if size > MAX_BYTES or size > 100 * len(data):
+        raise AssetError("the mesh is too large when it is unpacked", where=where, value=f"{size / 1e6:.0f} MB")
+    _limit(_model_of(data).count(b"<triangle "), max_faces, where)
+
+
+def _model_of(data: bytes) -> bytes:
+    """Return the XML of a 3MF file's models."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return b"".join(archive.read(name) for name in archive.namelist() if name.lower().endswith(".model"))

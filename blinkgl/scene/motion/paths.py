@@ -18,6 +18,8 @@ at a time and scipy's call overhead is ten times the work.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -267,6 +269,68 @@ class PausedPath:
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
         """Return the bound of :meth:`KeyframePath.approach_bound`."""
         return self.path.approach_bound(normal, reach, self._clock(int(ta_ns))[0], self._clock(int(tb_ns))[0])
+
+
+class AffinePath:
+    """The rigid part of a motion that may also scale and shear, exact at every time: its position, and the rotation
+    nearest to its linear part.
+
+    motion : (M, dM/dt), ((4, 4), (4, 4) 1/s), at a time in ns.   local : (4, 4) rigid, from the body to M's axes.
+    span_ns : time in which the motion takes all its values; 0: unknown."""
+
+    is_static = False
+
+    def __init__(
+        self,
+        motion: Callable[[int], tuple[np.ndarray, np.ndarray]],
+        t0_ns: int,
+        t1_ns: int,
+        local: ArrayLike,
+        span_ns: int = 0,
+    ):
+        self.t0_ns, self.t1_ns = int(t0_ns), int(t1_ns)
+        self._motion, self._local, self._span_ns = motion, rigid(local), span_ns
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        matrix, _ = self._motion(min(max(int(t_ns), self.t0_ns), self.t1_ns))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = nearest_rotation(matrix[:3, :3]), matrix[:3, 3]
+        return T @ self._local
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        D = np.zeros((4, 4))
+        if not self.t0_ns <= t_ns <= self.t1_ns:
+            return D
+        matrix, rate = self._motion(int(t_ns))
+        R = nearest_rotation(matrix[:3, :3])
+        # M = R P with P symmetric, and R' = R W: W P + P W = R^T M' - M'^T R, diagonal in the axes of P.
+        sizes, axes = np.linalg.eigh(R.T @ matrix[:3, :3])
+        twist = R.T @ rate[:3, :3]
+        W = axes.T @ (twist - twist.T) @ axes
+        sums = sizes[:, None] + sizes
+        D[:3, :3] = R @ axes @ np.divide(W, sums, out=np.zeros((3, 3)), where=np.abs(sums) > 1e-300) @ axes.T
+        D[:3, 3] = rate[:3, 3]
+        return D @ self._local
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        return np.array([self.pose(int(t)) for t in t_ns]).reshape(-1, 4, 4)
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """Return bounds, see :class:`PosePath`, from samples; a quarter is added for what lies between them."""
+        if self._span_ns:
+            tb_ns = min(tb_ns, ta_ns + self._span_ns)
+        rates = [self.derivative(int(t)) for t in np.linspace(ta_ns, tb_ns, _SPEED_SAMPLES)]
+        speed = max(float(np.linalg.norm(D[:3, 3])) for D in rates)
+        return 1.25 * speed, 1.25 * max(float(np.linalg.norm(D[:3, :3])) for D in rates) / math.sqrt(2)
+
+
+_SPEED_SAMPLES = 256
+
+
+def nearest_rotation(linear: np.ndarray) -> np.ndarray:
+    """Return the rotation nearest to a (3, 3) matrix (polar decomposition)."""
+    u, _, vt = np.linalg.svd(linear)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
 class OffsetPath:

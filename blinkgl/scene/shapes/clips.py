@@ -106,6 +106,9 @@ class Clip:
         moving = [track for track in tracks if track.path in PATHS]
         self.is_static = playing.is_static or not moving
         self.period_ns, self.span_ns = playing.period_ns, playing.span_ns
+        scales = [track for track in moving if track.path == "scale"]
+        # A cubic may go below 0 between positive keys.
+        self.mirrors = any(track.interpolation == "CUBICSPLINE" or (track.values < 0).any() for track in scales)
         self._joint = np.array([track.joint for track in moving], np.int64)
         self._path = np.array([PATHS.index(track.path) for track in moving], np.int64)
         self._kind = np.array([KINDS.index(track.interpolation) for track in moving], np.int64)

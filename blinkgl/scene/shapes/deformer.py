@@ -51,6 +51,8 @@ class Deformer(ABC):
     goes : orientation of a moving body: "anyhow"; "upright" on the ground, "level" above it, both along its x axis.
     speed : units/s that fit the motion, such as steps; 0: it may stay in place.
 
+    mirrors : whether the shape is a mirror image at some time (:meth:`side`).
+
     Config : its model in ``deform:``; None: none.   period_ns : period of the shape; None: not periodic.   span_ns :
     time from 0 after which the shape no longer changes."""
 
@@ -65,6 +67,7 @@ class Deformer(ABC):
     span_ns: int = 0
     goes: str = "anyhow"
     speed: float = 0.0
+    mirrors: bool = False
     examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
 
     @classmethod
@@ -82,6 +85,10 @@ class Deformer(ABC):
     def is_static(self) -> bool:
         """Return whether the shape is the same at all times."""
         return False
+
+    def side(self, t_ns: int) -> int:
+        """Return 1; where faces are mirrored at a time, -1; 0 where some are and others are not."""
+        return 1
 
     # ---- the shape, on the CPU -----------------------------------------------------------------------------------
 

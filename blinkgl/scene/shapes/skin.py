@@ -115,6 +115,7 @@ class Skin(Deformer):
         self.span_ns = max((part.span_ns for part in moving), default=0)
         self.goes = getattr(skeleton.motion, "goes", "anyhow")
         self.speed = getattr(skeleton.motion, "speed", 0.0) * float(np.linalg.norm(self.after[:3, 0]))
+        self.mirrors = getattr(skeleton.motion, "mirrors", False) or self.side(0) != 1
         self.sizes = {"SKIN_WEIGHTS": self.weights.shape[1]}
         if targets:
             self.sizes |= {
@@ -170,9 +171,18 @@ class Skin(Deformer):
         world, rate = self.skeleton.at(t_ns)
         return self.after @ world[self.bones] @ self._bind, self.after @ rate[self.bones] @ self._bind
 
+    def side(self, t_ns: int) -> int:
+        signs = np.sign(np.linalg.det(self.matrices(t_ns)[0][:, :3, :3]))
+        # A joint of scale 0 hides its part and has no side.
+        return 1 if (signs >= 0).all() else -1 if (signs <= 0).all() else 0
+
     def _blend(self, matrices: np.ndarray) -> np.ndarray:
         """Return the vertices' blends, (V, 3, 4), of (m, 4, 4)."""
         return np.einsum("vk,vkij->vij", self.weights, matrices[:, :3][self.joints])
+
+    def mirrored(self, t_ns: int) -> np.ndarray:
+        """Return (V,) bool: whether a vertex' joints mirror it at a time."""
+        return np.linalg.det(self._blend(self.matrices(t_ns)[0])[:, :, :3]) < 0
 
     def _morphed(self, vectors: np.ndarray, deltas: np.ndarray | None, weights: np.ndarray) -> np.ndarray:
         vectors = np.asarray(vectors, np.float64)

@@ -66,7 +66,7 @@ def explicit_scene(
     log: list[str] = []
     omissions: dict[str, None] = {}
     objects = _objects(config, t0_ns, t1_ns, base, memory, log, omissions)
-    path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True)
+    path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True, log=log)
     bodies = {thing.name: item.physics for thing, item in zip(objects, config.objects) if item.physics is not None}
     if config.collisions:
         # Nothing stops falling objects: the engine knows the others' final paths.
@@ -115,25 +115,29 @@ def _objects(
             assets[key] = _asset(*given, animation, f"{where}.animation")
             log += [line for line in assets[key].log if line not in log]
             omissions.update(dict.fromkeys(assets[key].omissions))
-        parts = _parts(assets[key], item, None if own else materials[item.material], config.light.unlit)
+        parts = _parts(assets[key], item, None if own else materials[item.material], config)
         if item.deform is not None:
             if animation is not None:
                 raise ConfigError(
                     "deform and animation exclude each other", where=f"{where}.deform", accepted="deform or animation"
                 )
             parts = deforming(parts, item.deform)
-        path = _object_path(item, parts, t0_ns, t1_ns, where, base)
+        path = _object_path(item, parts, t0_ns, t1_ns, where, base, log)
         objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     return objects
 
 
-def _parts(asset: Asset, item: ObjectConfig, material: Material | None, unlit: bool) -> list[Part]:
+def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: ExplicitSceneConfig) -> list[Part]:
     """Return an asset's parts at an object's size. material : replaces its own."""
     matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
     parts = []
     for part in asset.parts:
         worn = part.material if material is None else material
-        worn = replace(worn, unlit=worn.unlit or unlit)
+        sides = part.material.both_sides  # of a file, or None
+        sides = sides if sides is None or config.both_sides is None else config.both_sides
+        if material is not None and material.both_sides is not None:
+            sides = material.both_sides
+        worn = replace(worn, unlit=worn.unlit or config.light.unlit, both_sides=sides)
         mesh = transform_mesh(part.mesh, matrix)
         if material is not None and worn.bumps is not None and mesh.deformer is None:
             mesh, _ = split_mirrored(mesh)  # a deforming mesh keeps its seams: its joints count its vertices
@@ -141,23 +145,31 @@ def _parts(asset: Asset, item: ObjectConfig, material: Material | None, unlit: b
     return parts
 
 
-def _object_path(item: ObjectConfig, parts: Sequence[Part], t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
+def _object_path(
+    item: ObjectConfig, parts: Sequence[Part], t0_ns: int, t1_ns: int, where: str, base: Path, log: list[str]
+) -> PosePath:
     """Return an object's path from its pose, key frames, trajectory, or way, at the speed that its steps need."""
     way = item.way
     if way is None:
-        return motion_path(item, t0_ns, t1_ns, where, base)
+        return motion_path(item, t0_ns, t1_ns, where, base, log=log)
     speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
     form = {"closed": way.closed, "level": way.level, "start": way.start}
     return path_along_curve(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
 
 
 def motion_path(
-    config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, base: Path, camera: bool = False
+    config: KeyedMotionConfig,
+    t0_ns: int,
+    t1_ns: int,
+    where: str,
+    base: Path,
+    camera: bool = False,
+    log: list[str] | None = None,
 ) -> PosePath:
     """Return the configured pose over [t0, t1], or the path through its key frames (whose times are seconds on the
     sequence's clock) or a file's poses. Raises ConfigError and AssetError."""
     if config.trajectory is not None:
-        return trajectory_path(config.trajectory, t0_ns, t1_ns, f"{where}.trajectory", base)
+        return trajectory_path(config.trajectory, t0_ns, t1_ns, f"{where}.trajectory", base, log)
     if not config.keyframes:
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
@@ -165,15 +177,20 @@ def motion_path(
     return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation)
 
 
-def trajectory_path(config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path) -> PosePath:
-    """Return a C2 spline through the poses of a file. Raises AssetError, as :func:`read_trajectory`, and ConfigError
-    where the file does not cover [t0, t1], or lacks the sensor's pose on its body."""
-    from blinkgl.io.trajectories import read_trajectory
+def trajectory_path(
+    config: TrajectoryConfig, t0_ns: int, t1_ns: int, where: str, base: Path, log: list[str] | None = None
+) -> PosePath:
+    """Return a C2 spline through the poses of a file. log : gets what was guessed. Raises AssetError, as
+    :func:`read_trajectory`, and ConfigError where the file does not cover [t0, t1], or lacks the sensor's pose on its
+    body."""
+    from blinkgl.io.trajectories import PoseFile, read_trajectory
 
     file = resolve(config.file, base)
     if not file.is_file():
         raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a trajectory")
-    t_ns, poses = read_trajectory(file, None if config.form == "auto" else config.form)
+    form = None if config.form == "auto" else config.form
+    declared = PoseFile(form, config.columns, config.time_unit, config.maps_from, config.axes, config.rate)
+    t_ns, poses = read_trajectory(file, declared, log)
     t_ns = t_ns - (t_ns[0] - t0_ns if config.start is None else round(config.start * 1e9))
     if t_ns[0] > t0_ns or t_ns[-1] < t1_ns:
         raise ConfigError(
@@ -335,7 +352,7 @@ def _material(
         texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
     rough = _map(config, "metallic_roughness_map", base, where, maps)
     shines = config.metallic > 0 or config.roughness < 1 or rough is not None
-    plain = texture, config.color, config.uv_scale, config.unlit, config.double_sided
+    plain = texture, config.color, config.uv_scale, config.unlit, config.both_sides
     return Material(
         *plain,
         gloss=Gloss(config.metallic, config.roughness, rough) if shines else None,

@@ -14,17 +14,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import Animation, clip_names, meshes_at_rest, play
-from blinkgl.scene.importing.parts import Z_UP, DeformerOf, RawMesh, closed_parts, part_of, transformed
+from blinkgl.scene.importing.animations import Animation, Motion, clip_names, play, shown
+from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
-from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.paths import AffinePath, StaticPath, nearest_rotation
 from blinkgl.scene.reading import reading
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import content_hash
@@ -34,8 +33,6 @@ from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
-_ANIMATION_STEP = 1 / 60  # s between the samples of a spline
-_MAX_SAMPLES = 20_000
 
 
 def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path) -> Scene:
@@ -65,8 +62,9 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
             lights_gain=config.lights_gain if own else None,
         )
     light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
-    scene = replace(scene, light=light, objects=objects, background=config.background)
-    return unlit(scene) if config.light.unlit else scene
+    changes: dict = {"unlit": True} if config.light.unlit else {}
+    changes |= {} if config.both_sides is None else {"both_sides": config.both_sides}
+    return dressed(replace(scene, light=light, objects=objects, background=config.background), **changes)
 
 
 def from_document(
@@ -88,8 +86,8 @@ def from_document(
     camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
     intrinsics : "config": those of ``camera``; "file": fx = fy = height / 2 / tan(yfov / 2), centred, near = znear.
     animation : name or index, or more (:class:`~blinkgl.config.deform.AnimationConfig`, whose files are below
-        ``base``). Translations and rotations of nodes are sampled at 60 Hz and joined by a C2 spline; what a path
-        cannot represent (changing scales, jumps, skins, morph targets) deforms the object's shape instead, exactly.
+        ``base``). Motion is exact between key frames. What a rigid path cannot represent (changing scales, jumps,
+        skins, morph targets) deforms the object's shape.
     lights_gain : None: only ``light``. A number: the factor on the file's lights, which replace its sun. Features of
     the file that are not drawn are in the scene's ``omissions``.
     Raises AssetError (file), ConfigError (missing camera, animation or lights).
@@ -115,35 +113,31 @@ def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t
     made: list[SceneObject] = []
     names: set[str] = set()
     for index, node in document.nodes.items():
-        if node.mesh is None:
-            continue
         found = _object(document, index, animation, t0_ns, t1_ns)
         if found is not None:
             name = node.name if node.name not in names else f"{node.name}#{len(made)}"
             names.add(name)
             made.append(SceneObject(name, len(made) + 1, *found))
-    if not made:
+    if not made and not any(node.mesh is not None for node in document.nodes.values()):
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
+    if not made:
+        document.omissions.add(WHOLE)
     return tuple(made)
 
 
 def _object(
     document: gltf.Document, index: int, animation: Animation | None, t0_ns: int, t1_ns: int
 ) -> tuple[tuple[Part, ...], PosePath] | None:
-    """Return (parts, path) of a node that shows a mesh; None: one without faces."""
-    node = document.nodes[index]
-    assert node.mesh is not None
-    if animation is None:
-        raws, world = meshes_at_rest(document, index)
-    else:
-        raws, world = document.raw_meshes(node.mesh), document.world(index)
-    if not any(len(raw.faces) for raw in raws):
+    """Return (parts, path) of a node that shows a mesh; None: one of which nothing is visible."""
+    node, found = document.nodes[index], shown(document, index, animation)
+    if found is None:
         return None
+    raws, world = found
     if animation is None:
         place, baked = split_rigid(Z_UP @ world)
         return _parts(raws, baked, node.name, document), StaticPath(place, t0_ns, t1_ns)
     skinned = node.skin is not None and any(raw.binding is not None for raw in raws)
-    if skinned or _beyond_a_path(animation, index):
+    if skinned or _beyond_a_path(animation, index, t0_ns, t1_ns):
         # The shape itself moves, in the scene's axes.
         baked = Z_UP @ world
         deformer = partial(animation.deformer, index, at_rest=baked, turn=Z_UP)
@@ -155,11 +149,11 @@ def _object(
     return _parts(raws, baked, node.name, document, deformer), path
 
 
-def unlit(scene: Scene) -> Scene:
-    """Return the scene with radiance = albedo everywhere."""
+def dressed(scene: Scene, **changes: bool) -> Scene:
+    """Return the scene with these ``changes`` to all materials."""
 
     def of(parts):
-        return tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in parts)
+        return tuple(Part(p.mesh, replace(p.material, **changes)) for p in parts)
 
     return replace(scene, objects=tuple(replace(o, parts=of(o.parts)) for o in scene.objects))
 
@@ -169,10 +163,9 @@ def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     decomposition), A the rest: scale, shear, reflection."""
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-300:
-        raise AssetError("a node's transform is singular or not finite", where="scene", value=matrix.tolist())
-    u, _, vt = np.linalg.svd(linear)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    if not np.isfinite(matrix).all():
+        raise AssetError("a node's transform is not finite", where="scene", value=matrix.tolist())
+    rotation = nearest_rotation(linear)
     T, A = np.eye(4), np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, matrix[:3, 3]
     A[:3, :3] = rotation.T @ linear
@@ -188,7 +181,7 @@ def _parts(
         digest = content_hash(raw.vertices.tobytes(), np.ascontiguousarray(raw.faces, np.int64).tobytes())
         given = {"name": name, "where": document.where, "source_hash": digest, "log": document.log}
         parts.append(part_of(raw, **given, deformer=deformer))
-    return closed_parts(parts)
+    return tuple(parts)
 
 
 # ---- glTF
@@ -201,12 +194,23 @@ def _animation(document: gltf.Document, given: str | int | AnimationConfig | Non
     return play(document, animation_of(given, loop=False), base, "scene.animation")
 
 
-def _beyond_a_path(animation: Animation, node: int) -> bool:
-    """Return whether a node's motion is not a rigid path: its scale changes, or it jumps."""
-    return any(
-        track.interpolation == "STEP" or (track.path == "scale" and np.ptp(track.values, axis=0).max() > 0)
-        for track in animation.tracks_of(node)
-    )
+def _beyond_a_path(animation: Animation, node: int, t0_ns: int, t1_ns: int) -> bool:
+    """Return whether a node's motion is not a rigid path: it jumps, or its scale changes, as it also does where it
+    turns below a node of unequal scales."""
+    tracks = animation.tracks_of(node)
+    if any(t.interpolation == "STEP" or (t.path == "scale" and np.ptp(t.values, axis=0).max() > 0) for t in tracks):
+        return True
+    shapes = animation.tries(node, t0_ns, t1_ns) if tracks else [np.eye(4)]
+    # A shape that only turns keeps the products of its columns.
+    products = np.array([shape[:3, :3].T @ shape[:3, :3] for shape in shapes])
+    return bool((np.ptp(products, axis=0) > 1e-6 * np.abs(products).max()).any())
+
+
+def _rigid(animation: Animation, node: int, t_ns: int) -> tuple[Motion, np.ndarray]:
+    """Return (a node's motion without the matrix that is baked into its vertices, that matrix, of a time)."""
+    baked = split_rigid(animation.motion(node, Z_UP, np.eye(4))(t_ns)[0])[1]
+    before = np.linalg.inv(baked) if np.linalg.matrix_rank(baked) == 4 else np.eye(4)
+    return animation.motion(node, Z_UP, before), baked
 
 
 _HERE = np.eye(4)
@@ -219,25 +223,13 @@ def _motion(
     t0_ns: int,
     t1_ns: int,
     local: np.ndarray = _HERE,
-):
+) -> tuple[PosePath, np.ndarray]:
     """Return (PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
-    mine = [] if animation is None else animation.tracks_of(node)
     rest, baked = split_rigid(Z_UP @ document.world(node))
-    if animation is None or not mine:
+    if animation is None or not animation.moves(node):
         return StaticPath(rest @ local, t0_ns, t1_ns), baked
-    times = animation.sample_times([track.times for track in mine], t0_ns, t1_ns, _ANIMATION_STEP, _MAX_SAMPLES)
-    place = document.places[node]
-    poses, first = [], None
-    for t in times:
-        T, A = split_rigid(Z_UP @ animation.skeleton.at(int(t))[0][place])
-        first = A if first is None else first
-        poses.append(T @ local)
-    if any(track.interpolation == "STEP" for track in mine):
-        document.log.append(
-            f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed"
-        )
-    poses = np.stack(poses)
-    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3])), first
+    motion, baked = _rigid(animation, node, t0_ns)
+    return AffinePath(motion, t0_ns, t1_ns, local, animation.span_ns), baked
 
 
 def _with_lights(

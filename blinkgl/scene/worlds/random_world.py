@@ -382,18 +382,15 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
     parts = []
     texture = None if asset.has_materials else textures.draw(rng, split, log)
     for part in asset.parts:
-        mesh = scale_mesh(part.mesh, radius)
-        if asset.has_materials:
+        material = part.material
+        if not asset.has_materials:
             material = replace(
-                part.material,
-                unlit=part.material.unlit or config.light.unlit,
-                double_sided=part.material.double_sided or not mesh.closed,
+                material, texture=texture, base_color=tuple(float(c) for c in tint), uv_scale=(repeats, repeats)
             )
-        else:
-            material = Material(
-                texture, tuple(float(c) for c in tint), (repeats, repeats), config.light.unlit, not mesh.closed
-            )
-        parts.append(Part(mesh, material))
+        sides = material.both_sides  # of a file, or None
+        sides = sides if sides is None or config.both_sides is None else config.both_sides
+        material = replace(material, unlit=material.unlit or config.light.unlit, both_sides=sides)
+        parts.append(Part(scale_mesh(part.mesh, radius), material))
     return tuple(parts)
 
 

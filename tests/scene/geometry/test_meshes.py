@@ -16,7 +16,7 @@ CUBE = trimesh.creation.box()
 
 def test_a_cuboid_without_normals_stays_flat():
     mesh = M.make_mesh(CUBE.vertices, CUBE.faces)
-    assert len(mesh.vertices) == 24 and mesh.closed
+    assert len(mesh.vertices) == 24
     v = mesh.vertices[mesh.faces]
     flat = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
     np.testing.assert_allclose(
@@ -77,43 +77,29 @@ def test_degenerate_coordinates_are_kept_for_palette_textures():
     assert (mesh.uvs == 0.25).all()
 
 
-def test_inside_out_is_turned_round():
-    log = []
-    mesh = M.make_mesh(CUBE.vertices, CUBE.faces[:, ::-1], name="box", log=log)
-    assert log == ["box: the mesh was inside out, turned round"] and mesh.closed
-    v = mesh.vertices[mesh.faces]
-    assert np.einsum("ij,ij->i", v[:, 0], np.cross(v[:, 1], v[:, 2])).sum() / 6 == pytest.approx(1)
-    assert ((mesh.normals * mesh.vertices).sum(axis=1) > 0).all()
+def test_no_face_is_turned_round():
+    """A room, a dome, an open box: what its file says is drawn, whatever it looks like."""
+    for faces in (CUBE.faces, CUBE.faces[:, ::-1], CUBE.faces[:-2], CUBE.faces[:-2, ::-1]):
+        log: list[str] = []
+        mesh = M.make_mesh(CUBE.vertices, faces, log=log)
+        np.testing.assert_array_equal(mesh.vertices[mesh.faces], CUBE.vertices[faces])
+        flat = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+        assert (np.einsum("fk,fck->fc", flat, mesh.normals[mesh.faces]) > 0.99).all() and not log and not mesh.closed
+
+
+def closed(vertices, faces):
+    return M.closedness(*M.weld(np.asarray(vertices), np.asarray(faces)))
 
 
 def test_closedness():
-    assert not M.make_mesh(CUBE.vertices, CUBE.faces[:-1]).closed
+    assert closed(CUBE.vertices, CUBE.faces) and not closed(CUBE.vertices, CUBE.faces[:-1])
     flipped = CUBE.faces.copy()
     flipped[0] = flipped[0, ::-1]
-    assert not M.make_mesh(CUBE.vertices, flipped).closed
+    assert not closed(CUBE.vertices, flipped) and not closed(CUBE.vertices, CUBE.faces[:, ::-1])
     soup = CUBE.vertices[CUBE.faces].reshape(-1, 3)  # every corner its own vertex, as in STL
-    assert M.make_mesh(soup, np.arange(36).reshape(-1, 3)).closed
+    assert closed(soup, np.arange(36).reshape(-1, 3))
     two = np.concatenate([CUBE.vertices, CUBE.vertices + [1, 1, 0]]), np.concatenate([CUBE.faces, CUBE.faces + 8])
-    assert M.make_mesh(*two).closed  # touching along an edge
-    hollow = np.concatenate([CUBE.vertices, CUBE.vertices / 2]), np.concatenate([CUBE.faces, CUBE.faces[:, ::-1] + 8])
-    assert M.make_mesh(*hollow).closed
-    apart = (
-        np.concatenate([CUBE.vertices, CUBE.vertices / 2 + 5]),
-        np.concatenate([CUBE.faces, CUBE.faces[:, ::-1] + 8]),
-    )
-    assert not M.make_mesh(*apart).closed  # a shell turned inside out
-    rng = np.random.default_rng(0)
-    quantised = soup + rng.uniform(-2e-4, 2e-4, soup.shape)
-    assert M.make_mesh(quantised, np.arange(36).reshape(-1, 3)).closed  # an exporter's gaps
-    assert not M.make_mesh(soup + rng.uniform(-0.02, 0.02, soup.shape), np.arange(36).reshape(-1, 3)).closed
-
-
-def test_parts_that_are_closed_together():
-    top = M.make_mesh(CUBE.vertices, CUBE.faces[:5])
-    rest = M.make_mesh(CUBE.vertices, CUBE.faces[5:])
-    assert not top.closed and not rest.closed and M.closed_together((top, rest))
-    joined = M.concatenate((top, rest))
-    assert joined.closed and len(joined.faces) == 12
+    assert closed(*two)  # touching along an edge
 
 
 def test_slivers_are_dropped_at_any_size():
@@ -207,22 +193,6 @@ def test_points_nearer_than_a_millionth_are_one(gap, points):
     assert len(welded) == points and (faces[0, 0] == faces[1, 0]) == (points == 3)
 
 
-@pytest.mark.parametrize("apart, closed", [(0.9e-3, True), (1.1e-3, False)])
-def test_gaps_up_to_a_thousandth_of_the_extent_are_none(apart, closed):
-    vertices = np.vstack([CUBE.vertices, CUBE.vertices[CUBE.faces[0]] + [apart, 0, 0]])
-    assert M.make_mesh(vertices, np.vstack([CUBE.faces[1:], [[8, 9, 10]]])).closed is closed
-
-
-@pytest.mark.parametrize("holes, closed", [(64, True), (65, False)])
-def test_so_many_hollows(holes, closed):
-    shift = np.stack(np.meshgrid(*[np.arange(5)] * 3), axis=-1).reshape(-1, 3)[:holes] * 0.15 - 0.3
-    vertices = np.concatenate([CUBE.vertices, (CUBE.vertices * 0.1 + shift[:, None]).reshape(-1, 3)])
-    faces = np.concatenate(
-        [CUBE.faces, (CUBE.faces[:, ::-1] + 8 * (np.arange(holes)[:, None, None] + 1)).reshape(-1, 3)]
-    )
-    assert M.make_mesh(vertices, faces).closed is closed
-
-
 @pytest.mark.parametrize("height, kept", [(2e-10, 2), (0.5e-10, 1)])
 def test_a_sliver_is_judged_by_its_own_longest_edge(height, kept):
     for size in (1e-5, 1.0, 1e5):
@@ -235,11 +205,9 @@ def test_normals_that_are_given_are_kept_unless_they_are_none():
     log: list[str] = []
     mesh = M.make_mesh(CUBE.vertices, CUBE.faces, normals=slanted, log=log)
     assert np.allclose(mesh.normals, [0.6, 0, 0.8]) and log == []
-    turned = M.make_mesh(CUBE.vertices, CUBE.faces[:, ::-1], normals=-CUBE.vertices)
-    assert ((turned.normals * turned.vertices).sum(axis=1) > 0).all(), "inside out, and so were they"
     kept = M.make_mesh(CUBE.vertices, CUBE.faces[:, ::-1], normals=CUBE.vertices)
     assert ((kept.normals * kept.vertices).sum(axis=1) > 0).all()
-    for row, bad in ((0, 0.0), (3, np.nan), (7, 0.9e-6)):
+    for row, bad in ((0, 0.0), (3, np.nan), (7, 0.9e-150)):
         broken = np.array(CUBE.vertices)
         broken[row] = [bad, 0, 0]
         log.clear()
@@ -249,7 +217,7 @@ def test_normals_that_are_given_are_kept_unless_they_are_none():
         )
     assert (np.abs(M.make_mesh(CUBE.vertices, CUBE.faces, normals=slanted[:5]).normals).max(axis=1) > 0.99).all()
     tiny = np.array(CUBE.vertices)
-    tiny[0] = [1.1e-6, 0, 0]
+    tiny[0] = [1.1e-150, 0, 0]
     assert M.make_mesh(CUBE.vertices, CUBE.faces, normals=tiny).normals.max() == 1
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import subprocess
 
 import cv2
-import imageio_ffmpeg
 import lobes
 import numpy as np
 import pytest
@@ -17,6 +15,7 @@ from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.surfaces.environment import FINER, environment, pixel_directions, quartic, turned
 from blinkgl.scene.surfaces.images import MAX_HDR_PIXELS, cube_faces, load_image, load_panorama
 from tests.shared_data import shared
+from tests.videos import put_exr
 
 
 def normals(count=200, seed=0):
@@ -150,20 +149,12 @@ def written(path, image):
     return path
 
 
-def exr(path, image):
-    height, width = image.shape[:2]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "gbrpf32le"]
-    command += ["-s", f"{width}x{height}", "-i", "-", "-y", str(path)]
-    subprocess.run(command, input=np.ascontiguousarray(np.moveaxis(image[..., [1, 2, 0]], -1, 0)).tobytes(), check=True)
-    return path
-
-
 def test_hdr_exr_and_eight_bits_are_read(tmp_path):
     image = sky(16, np.array([0, 0, 1.0]), 0.3, 50.0)
     read, factor = load_panorama(written(tmp_path / "a.hdr", image))
     np.testing.assert_allclose(read, image, rtol=0.02, atol=0.01)
     assert np.percentile((read * factor).max(axis=2), 90) == pytest.approx(0.8, rel=1e-4)
-    read, _ = load_panorama(exr(tmp_path / "a.exr", image))
+    read, _ = load_panorama(put_exr(tmp_path / "a.exr", image))
     np.testing.assert_array_equal(read, image)
     np.testing.assert_allclose(load_image(tmp_path / "a.exr"), np.clip(read * factor, 0, 1.5), rtol=0.02, atol=0.01)
     read, factor = load_panorama(written(tmp_path / "a.png", np.full((4, 8, 3), 188, np.uint8)))
@@ -181,9 +172,9 @@ def test_what_is_no_panorama(tmp_path):
     huge = written(tmp_path / "huge.hdr", image).read_bytes().replace(b"-Y 16 +X 32", b"-Y 15000 +X 30000")
     (tmp_path / "huge.hdr").write_bytes(huge)
     for path, expected in (
-        (exr(tmp_path / "nan.exr", bad), "x=5, y=3: a pixel is not a radiance .got .nan"),
-        (exr(tmp_path / "inf.exr", endless), "x=1, y=7: a pixel is not a radiance .got .*inf"),
-        (exr(tmp_path / "minus.exr", negative), "a pixel is not a radiance .got -1"),
+        (put_exr(tmp_path / "nan.exr", bad), "x=5, y=3: a pixel is not a radiance .got .nan"),
+        (put_exr(tmp_path / "inf.exr", endless), "x=1, y=7: a pixel is not a radiance .got .*inf"),
+        (put_exr(tmp_path / "minus.exr", negative), "a pixel is not a radiance .got -1"),
         (written(tmp_path / "square.hdr", image[:, :16]), "not a panorama .got '16x16'.; expected twice as wide"),
         (written(tmp_path / "black.hdr", 0 * image), "the panorama is black"),
         (

@@ -125,7 +125,7 @@ def test_materials_meshes_and_scale(tmp_path):
         materials={
             "red": {"texture": "red.png", "max_size": 10, "uv_scale": [2, 3], "color": [0.5, 1, 1]},
             "noise": {"procedural": "perlin", "seed": 4, "max_size": 16},
-            "screen": {"unlit": True, "double_sided": True},
+            "screen": {"unlit": True, "both_sides": True},
         },
         objects=[
             {"mesh": "box", "material": "red", "scale": 2},
@@ -140,14 +140,14 @@ def test_materials_meshes_and_scale(tmp_path):
         o.instance_id for o in scene.objects
     ] == [1, 2, 3, 4]
     np.testing.assert_allclose(np.ptp(box.parts[0].mesh.vertices, axis=0), [2, 4, 6])
-    assert np.ptp(egg.parts[0].mesh.vertices[:, 2]) > 5.5 and egg.parts[0].mesh.closed
+    assert np.ptp(egg.parts[0].mesh.vertices[:, 2]) > 5.5 and not egg.parts[0].culled
     assert (
         box.parts[0].material.texture.image.shape == (5, 10, 3)
         and box.parts[0].material.uv_scale == (2, 3)
         and box.parts[0].material.base_color == (0.5, 1, 1)
     )
     assert egg.parts[0].material.texture.image.shape == (16, 16, 3)
-    assert floor.category == "ground" and floor.parts[0].material.unlit and floor.parts[0].material.double_sided
+    assert floor.category == "ground" and floor.parts[0].material.unlit and floor.parts[0].material.both_sides
     assert second.parts[0].material.texture is None
     assert scene.light.sun == 2 and scene.light.sun_direction == pytest.approx((0, 0, 1), abs=1e-12)
 
@@ -209,7 +209,7 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
         objects=[{"mesh": "a"}, {"mesh": "a", "material": "checks"}],
     )
     own, other = (o.parts[0] for o in scene.objects)
-    assert own.material.base_color == (1, 0.5, 0.25) and own.material.double_sided
+    assert own.material.base_color == (1, 0.5, 0.25) and own.material.both_sides
     assert other.material.texture is not None and np.ptp(other.mesh.uvs) > 0.5  # degenerate ones were projected
     assert scene.log == ("a: the texture coordinates are degenerate, projected new ones",)
 

@@ -123,7 +123,8 @@ def test_missing_folders_and_empty_pools(tmp_path):
     assert folders("file") == "scene.pool.folders.0: is not a folder (got 'file'); expected a folder of meshes"
     assert (
         folders("empty")
-        == "scene.pool.folders.0: the folder holds no meshes (got 'empty'); expected files of .obj .ply .stl .glb .gltf"
+        == "scene.pool.folders.0: the folder holds no meshes (got 'empty'); expected files of .obj .ply .stl .off .3mf "
+        ".glb .gltf"
     )
     box(tmp_path / "empty" / "a.ply")
     assert folders("empty", "nowhere").startswith("scene.pool.folders.1: no such folder")
@@ -214,7 +215,7 @@ def write_bad_index(path):
 @pytest.mark.parametrize(
     "suffix, write, problem",
     [
-        ("obj", write_nan, "vertices are NaN, infinite"),
+        ("obj", write_nan, "line 4: a face has a vertex that is NaN or infinite"),
         ("obj", write_no_faces, "no faces"),
         ("obj", write_many_faces, "too many faces (got 2001); expected at most 1000"),
         ("obj", write_bad_index, ""),

@@ -1,0 +1,161 @@
+"""Lists of frame times: one a line, with or without the names of the frames (the Event Camera Dataset's images.txt,
+TUM's rgb.txt, EuRoC's data.csv, DSEC's timestamps, mkvextract's timestamps_v2)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?")
+_COLUMN = re.compile(r"[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """times_ns : int ns, in the file's order.   names : of the frames, None where the list has none.   note : the line
+    that says a guessed unit, or None."""
+
+    times_ns: list[int]
+    names: list[str] | None = None
+    note: str | None = None
+
+
+def read_timestamps(path: Path, unit: str | None = None, fps: float | None = None) -> Stamps:
+    """Return the times of a list.
+
+    Columns are separated by blanks, tabs, commas or semicolons; ``#`` begins a comment, and the first line may be a
+    heading. The time is the column that a heading calls so, else the first of numbers that is no plain count beside
+    another; a start and an end of an exposure give their middle. The unit is ``unit`` ("s", "ms", "us", "ns"; "frames"
+    of ``fps`` Hz), else what the heading or the file's name states, else guessed from all values together.
+
+    Raises AssetError: unreadable. EventDataError: not a time, with its line; two units in one list; no times.
+    ConfigError: "frames" without fps."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    except OSError as error:
+        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    heading, rows, numbers = _rows(lines, path)
+    if not rows:
+        raise EventDataError("no time stamps", where=str(path))
+    titles = _COLUMN.findall(heading)
+    columns = _time_columns(rows, titles)
+    texts: list[str] = []
+    for row, number in zip(rows, numbers):
+        chosen = [row[k] for k in columns if k < len(row)]
+        if len(chosen) < len(columns) or not all(map(_is_number, chosen)):
+            raise EventDataError(
+                f"line {number} is not a time stamp",
+                where=str(path),
+                value=" ".join(row),
+                accepted="'time' or 'time name', a finite number",
+            )
+        texts.append(chosen[0] if len(columns) == 1 else str(sum(map(Fraction, chosen)) / len(chosen)))
+    names = _names(rows, columns, path)
+    if unit == "frames":
+        if fps is None:
+            raise ConfigError(
+                "times in frames need a frame rate", where="--time-unit", value=unit, accepted="--fps, too"
+            )
+        return Stamps([round(Fraction(text) * 10**9 / Fraction(fps)) for text in texts], names)
+    found = _unit(unit, titles, columns, heading, path, texts)
+    return Stamps(nanoseconds(texts, found), names, None if found.line is None else f"{path.name}: {found.line}")
+
+
+def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str) -> Stamps:
+    """Return the times of an array (N,) named ``name``; the unit as of :func:`read_timestamps`. Raises EventDataError:
+    not numbers, not finite."""
+    values = np.asarray(values).reshape(-1)
+    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        bad = int(np.argmax(~np.isfinite(values))) if values.dtype.kind == "f" else 0
+        raise EventDataError(
+            "not a time",
+            where=f"{where}: '{name}'[{bad}]",
+            value=values[bad : bad + 1].tolist(),
+            accepted="a finite number",
+        )
+    stated = unit or named_unit(name)
+    how = "declared" if unit else "read"
+    found = TimeUnit(stated, how) if stated else guessed_frame_unit(values.astype(np.float64), f"{where}: '{name}'")
+    return Stamps(nanoseconds(values, found), None, found.line)
+
+
+def _rows(lines: Sequence[str], path: Path) -> tuple[str, list[list[str]], list[int]]:
+    """Return the heading, the fields of each line, and the lines' numbers."""
+    heading, rows, numbers = "", [], []
+    for number, line in enumerate(lines, 1):
+        text, _, comment = line.partition("#")
+        if not text.strip():
+            # The last comment before the first line of data is the heading, if any is.
+            heading = comment.strip() if comment.strip() and not rows else heading
+            continue
+        fields = text.replace(",", " ").replace(";", " ").split()
+        if not rows and not heading and not any(_is_number(part) for part in fields):
+            heading = text.strip()
+            continue
+        if not rows and len(fields) > 1 and not any(_is_number(part) for part in fields):
+            heading = text.strip()
+            continue
+        rows.append(fields)
+        numbers.append(number)
+    return heading, rows, numbers
+
+
+def _is_number(text: str) -> bool:
+    return _NUMBER.fullmatch(text) is not None
+
+
+def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[int]:
+    """Return the column of the times, or the two whose middle is the time."""
+    width = min(len(row) for row in rows)
+    if width == len(titles):
+        between = [k for k, title in enumerate(titles) if re.search(r"start|begin|end|stop", title, re.I)]
+        if len(between) == 2:
+            return between
+        called = [k for k, title in enumerate(titles) if re.match(r"(#|.*[_ ])?(time|t|ts|stamp)", title, re.I)]
+        if called:
+            return called[:1]
+    numeric = [k for k in range(width) if all(_is_number(row[k]) for row in rows)]
+    if len(numeric) < 2:
+        # One odd line among numbers is named by its line, so the first column stays the time.
+        return numeric[:1] if numeric and not _is_number(rows[0][0]) else [0]
+    first = [Fraction(row[numeric[0]]) for row in rows]
+    counts = len(first) > 2 and first[0] in (0, 1) and all(b - a == 1 for a, b in pairwise(first))
+    return [numeric[1] if counts else numeric[0]]
+
+
+def _names(rows: Sequence[Sequence[str]], columns: Sequence[int], path: Path) -> list[str] | None:
+    others = [[" ".join(part for k, part in enumerate(row) if k not in columns)] for row in rows]
+    names = [other[0] or None for other in others]
+    if all(name is None or _is_number(name) for name in names):
+        return None
+    if None in names:
+        raise EventDataError(
+            "times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line"
+        )
+    # A row of other columns and one name: the name has a letter.
+    return [next((part for part in reversed(str(name).split(" ")) if not _is_number(part)), str(name))
+            if len(rows[k]) > 2 and any(_is_number(part) for part in str(name).split(" ")) else str(name)
+            for k, name in enumerate(names)]  # fmt: skip
+
+
+def _unit(
+    unit: str | None, titles: Sequence[str], columns: Sequence[int], heading: str, path: Path, texts: Sequence[str]
+) -> TimeUnit:
+    if unit is not None:
+        return TimeUnit(unit, "declared")
+    stated = named_unit(titles[columns[0]]) if columns[0] < len(titles) else None
+    if stated is None and re.search(r"time(code|stamp)s? format v2", heading, re.I):
+        stated = "ms"  # mkvextract
+    stated = stated or (named_unit(heading) if not titles[1:] else None) or unit_of_file(path)
+    if stated is not None:
+        return TimeUnit(stated, "read")
+    return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))

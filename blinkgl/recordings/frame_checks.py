@@ -1,0 +1,66 @@
+"""Weaknesses of given frames that affect their events, found as the frames go by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+_FEW_CODES, _CLIPPED, _FLICKER, _REPEATED = 32, 0.1, 0.02, (0.1, 0.9)
+"""From which on frames are warned of: different codes, part of the pixels at an end, how much the whole picture's
+brightness jumps to and fro from one frame to the next (median), and which part of the frames equals the one before."""
+_SPARSE_PX = 128
+"""Side of the grid of pixels that is looked at."""
+
+
+class FrameChecks:
+    """Looks at every frame of a clip, of which nothing but copies is kept; ``lines`` yields the warnings."""
+
+    def __init__(self) -> None:
+        self._brightness: list[float] = []
+        self._codes: np.ndarray | None = None
+        self._clipped = self._repeated = 0.0
+        self._top = 0.0
+        self._last: np.ndarray | None = None
+
+    def see(self, frame: np.ndarray) -> None:
+        """Look at a frame as stored."""
+        step = tuple(slice(None, None, max(1, side // _SPARSE_PX)) for side in frame.shape[:2])
+        sparse = frame[step].copy()
+        self._brightness.append(float(sparse.mean()))
+        self._top = max(self._top, float(sparse.max()))
+        if sparse.dtype.kind == "u":
+            most = np.iinfo(sparse.dtype).max
+            self._codes = np.zeros(most + 1, bool) if self._codes is None or len(self._codes) <= most else self._codes
+            self._codes[sparse] = True
+            self._clipped += float(np.mean((sparse == 0) | (sparse == most)))
+        self._repeated += self._last is not None and np.array_equal(sparse, self._last)
+        self._last = sparse
+
+    def lines(self, white: float | None) -> Iterator[str]:
+        """Yield the warnings about the frames seen.   white : the level that was declared, read or guessed; None: the
+        type's largest."""
+        count = len(self._brightness)
+        if self._codes is None and self._top > (white or 1.0):
+            yield (f"floats up to {self._top:.4g}, where {white or 1:g} is white: --white-level 255, if they are codes")
+        if self._codes is not None:
+            if len(self._codes) > 256 and white is None and 0 < self._top < 2**14:
+                bits = int(self._top).bit_length()
+                where = f"16-bit codes up to {self._top:,.0f}, where 65,535 is white"
+                yield f"{where}: --white-level {2**bits - 1} for {bits} bits"
+            if self._clipped > _CLIPPED * count:
+                share = 100 * self._clipped / count
+                yield f"{share:.0f} % of the codes are at an end: what moves there makes no events"
+            if (different := int(np.count_nonzero(self._codes))) <= _FEW_CODES:
+                yield f"frames of {different} different codes: each step from one to the next makes events at once"
+        if count > 4 and _REPEATED[0] < self._repeated / (count - 1) < _REPEATED[1]:
+            yield (
+                f"{self._repeated:.0f} of {count} frames repeat the one before, as in a film at a higher rate: their "
+                "changes make events at once"
+            )
+        jumps = np.diff(np.log(np.maximum(self._brightness, 1e-6)), 2)
+        if len(jumps) >= 3 and np.median(np.abs(jumps)) > _FLICKER:
+            yield (
+                f"the whole picture flickers, by {100 * np.median(np.abs(jumps)) / 2:.0f} % from frame to frame, and "
+                "that makes events as motion does"
+            )

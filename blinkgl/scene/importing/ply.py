@@ -1,0 +1,189 @@
+"""Reader of PLY files, ASCII and binary: polygons, texture coordinates and colours of vertices, corners and faces.
+
+Reference: Greg Turk's "The PLY polygon file format"; names of properties as Blender, MeshLab, CloudCompare and VTK
+write them. Texture coordinates have v upwards.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.importing.parts import RawMesh
+from blinkgl.scene.importing.polygons import Polygons, beside, raw_meshes, texture_of
+from blinkgl.scene.reading import Omissions
+from blinkgl.scene.types import Material
+from blinkgl.srgb import linear_from_srgb
+
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
+_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"}
+_TYPES |= {"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"}
+_COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+Column = np.ndarray | tuple[np.ndarray, np.ndarray]
+"""Values of a property, (n,); of a list (n,) lengths and all values, one list after the other."""
+
+
+def read_ply(
+    path: Path, data: bytes, max_faces: int, max_texture: int | None, omissions: Omissions, log: list[str]
+) -> list[RawMesh]:
+    """Return raw meshes, one for each texture.
+
+    max_texture : None leaves materials and colours out.   omissions, log : get what is not drawn, and what was decided.
+    Raises AssetError: truncated, corrupt, no faces, too many faces, a texture outside the file's folder."""
+    where = str(path)
+    elements, textures = _elements(data, max_faces, where)
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
+    indices = face.get("vertex_indices", face.get("vertex_index"))
+    if not isinstance(indices, tuple) or not {"x", "y", "z"} <= set(vertex) or not len(indices[0]):
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+    if elements.get("edge") or elements.get("tristrips"):
+        omissions.add("edges and triangle strips")
+    sizes, places = (values.astype(np.int64) for values in indices)
+    inside = np.clip(places, 0, max(len(vertex["x"]) - 1, 0))  # raw_meshes refuses the others
+    given = Polygons(_columns_of(vertex, "xyz"), places, sizes)
+    if {"nx", "ny", "nz"} <= set(vertex):
+        given.normals = _columns_of(vertex, ("nx", "ny", "nz"))[inside]
+    if isinstance(own := face.get("texcoord"), tuple) and np.array_equal(own[0], 2 * sizes):
+        given.uvs = own[1].reshape(-1, 2).astype(np.float64)
+    elif names := next((names for names in _COORDINATES if set(names) <= set(vertex)), None):
+        given.uvs = _columns_of(vertex, names)[inside]
+    materials: list[Material | None] = [None]
+    if max_texture is not None:
+        of_faces, of_vertices = _colours(face), _colours(vertex)
+        given.colours = np.repeat(of_faces, sizes, axis=0) if of_faces is not None else None
+        given.colours = of_vertices[inside] if of_vertices is not None else given.colours
+        for name in textures if given.uvs is not None else ():
+            file = beside(path.parent, "", name, where, omissions)
+            materials.append(None if file is None else Material(texture=texture_of(file, max_texture)))
+        number = face.get("texnumber", np.zeros(len(sizes)))
+        if len(materials) > 1 and isinstance(number, np.ndarray):
+            given.surfaces = np.clip(np.nan_to_num(number), -1, len(materials) - 2).astype(np.int64) + 1
+    return raw_meshes(given, materials, max_faces, where, log)
+
+
+def _columns_of(element: dict, names) -> np.ndarray:
+    return np.column_stack([element[name] for name in names]).astype(np.float64)
+
+
+def _colours(element: dict) -> np.ndarray | None:
+    """Return (n, 3) linear colours of an element's items; None: it has none. Whole numbers are fractions of the largest
+    of their type."""
+    for names in _COLOURS:
+        if set(names) <= set(element):
+            kind = element[names[0]].dtype
+            code = _columns_of(element, names) / (np.iinfo(kind).max if kind.kind in "iu" else 1)
+            return linear_from_srgb(np.clip(np.nan_to_num(code), 0, 1))
+    return None
+
+
+def _elements(data: bytes, max_faces: int, where: str) -> tuple[dict[str, dict[str, Column]], list[str]]:
+    """Return (the columns of each element, the names of textures). Counts are checked before anything is allocated."""
+    # Lines may also end as on old Macs.
+    head = re.match(rb"ply\s*[\r\n](.{0,65536}?)end_header(?:\r\n|[^\n\r]*\n|\r)", data, re.DOTALL)
+    if head is None:
+        raise AssetError("the mesh is corrupt (no PLY header)", where=where)
+    form, textures = "", []
+    declared: list[tuple[str, int, list[tuple[str, str | None, str]]]] = []
+    for line in re.split(r"[\r\n]+", head[1].decode("utf-8", "replace")):
+        words = line.split()
+        if words[:1] == ["format"]:
+            form = words[1]
+        elif words[:2] == ["comment", "TextureFile"] and len(words) > 2:
+            textures.append(line.split("TextureFile", 1)[1].strip())
+        elif words[:1] == ["element"]:
+            declared.append((words[1], _count(words[1], words[2], max_faces, len(data) - head.end(), where), []))
+        elif words[:2] == ["property", "list"]:
+            declared[-1][2].append((words[4], _TYPES[words[2]], _TYPES[words[3]]))
+        elif words[:1] == ["property"]:
+            declared[-1][2].append((words[2], None, _TYPES[words[1]]))
+    orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+    if form not in orders:
+        raise AssetError("the mesh is of an unknown PLY format", where=where, value=form, accepted=", ".join(orders))
+    body = _Body(data[head.end() :], orders[form], sum(count for _, count, _ in declared))
+    return {name: body.columns(count, properties, name, where) for name, count, properties in declared}, textures
+
+
+def _count(name: str, digits: str, max_faces: int, available: int, where: str) -> int:
+    what, accepted = "faces" if name == "face" else f"{name} elements", f"at most {max_faces} faces"
+    count = int(digits) if digits.isdecimal() and len(digits) <= 18 else f"a number of {len(digits)} digits"
+    if isinstance(count, str) or count > (max_faces if name == "face" else 3 * max_faces + 1_000_000):
+        raise AssetError(f"the mesh has too many {what}", where=where, value=count, accepted=accepted)
+    if count > available:  # an element takes at least one byte
+        raise AssetError(f"the mesh is truncated: {count} {what} in {available} bytes", where=where)
+    return count
+
+
+class _Body:
+    """What follows the header as ``items``: bytes, or for ASCII the numbers. at : the first that is not read yet.
+    lines : where each line of an ASCII file with a line for each of its ``rows`` begins, and the end; None: of others.
+    Such a line may have more numbers than its header says, as MeshLab writes them."""
+
+    def __init__(self, data: bytes, order: str, rows: int):
+        self.order, self.at, self.lines = order, 0, None
+        if order:
+            self.items = np.frombuffer(data, np.uint8)
+            return
+        lines = [words for line in data.splitlines() if (words := line.split())]
+        self.items = np.array([float(word) for words in lines for word in words])
+        if len(lines) == rows:
+            self.lines = np.cumsum([0, *map(len, lines)])
+
+    def width(self, kind: str) -> int:
+        """Return the number of items of one value."""
+        return int(kind[1]) if self.order else 1
+
+    def values(self, at: np.ndarray, kind: str) -> np.ndarray:
+        """Return the values at (n,) places; numbers of a text that a type does not hold become its largest."""
+        if self.order:
+            return self.items[at[:, None] + np.arange(self.width(kind))].view(self.order + kind).ravel().astype(kind)
+        limits = np.iinfo(kind if kind[0] != "f" else "i4")
+        least, most = max(limits.min, -(2**53)), min(limits.max, 2**53)
+        found = self.items[at]
+        return found if kind[0] == "f" else np.clip(np.nan_to_num(found, nan=most), least, most).astype(kind)
+
+    def columns(self, count: int, properties: list[tuple[str, str | None, str]], name: str, where: str) -> dict:
+        """Return the columns of the next element: (name, type of a list's length or None, type) of each property."""
+        truncated = AssetError(f"the mesh is truncated: not all of {count} {name} elements are there", where=where)
+        widths = [self.width(length or kind) for _, length, kind in properties]
+        inner = [self.width(kind) if length else 0 for _, length, kind in properties]
+        at, end, begins = self.at, len(self.items), None
+        if self.lines is not None:
+            begins, self.lines = self.lines[: count + 1], self.lines[count:]
+        short = at + count * sum(widths) > end if begins is None else bool((np.diff(begins) < sum(widths)).any())
+        if short:
+            raise truncated
+        first = at + np.arange(count) * sum(widths) if begins is None else begins[:-1]
+        starts = first + np.cumsum([0, *widths[:-1]])[:, None]
+        lengths = np.zeros_like(starts)
+        # Rows with lists are found only by walking from one to the next.
+        for row in range(count if any(inner) else 0):
+            if begins is not None:
+                at, end = begins[row : row + 2].tolist()
+            for k, width in enumerate(widths):
+                starts[k, row] = at
+                at += width
+                if at > end:
+                    raise truncated
+                if inner[k]:
+                    given = self.items[at - 1]
+                    if self.order and width > 1:  # one byte, the usual length of a length, is read without an array
+                        given = self.values(starts[k, row : row + 1], properties[k][1] or "")[0]
+                    lengths[k, row] = max(int(given), 0)
+                    at += int(lengths[k, row]) * inner[k]
+            if at > end:
+                raise truncated
+        self.at, found = at if any(inner) else at + count * sum(widths), {}
+        if starts.max(initial=0) >= max(len(self.items), 1):
+            raise truncated
+        for k, (key, length, kind) in enumerate(properties):
+            if length is None:
+                found[key] = self.values(starts[k], kind)
+                continue
+            within = np.arange(lengths[k].sum()) - np.repeat(np.cumsum(lengths[k]) - lengths[k], lengths[k])
+            places = np.repeat(starts[k] + widths[k], lengths[k]) + within * inner[k]
+            found[key] = lengths[k], self.values(places, kind)
+        return found

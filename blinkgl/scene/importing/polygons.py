@@ -1,0 +1,129 @@
+"""Polygons of a file, whose corners have texture coordinates, normals and colours of their own, as raw meshes; and the
+images beside such a file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.meshes import crease_normals, weld
+from blinkgl.scene.geometry.polygons import triangulate
+from blinkgl.scene.importing.gltf_file import inside
+from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
+from blinkgl.scene.reading import Omissions, contents
+from blinkgl.scene.surfaces.images import content_hash, decode_image
+from blinkgl.scene.types import Material, Texture
+
+MAX_CORNERS = 50_000
+"""Most corners of a polygon: ear clipping may take a time that grows with their square."""
+
+
+@dataclass(eq=False)
+class Polygons:
+    """P polygons with C corners in all, one polygon after the other.
+
+    points : (V, 3).   places : (C,) index in ``points``.   sizes : (P,) corners of each.
+    uvs : (C, 2), v upwards, normals : (C, 3), NaN where a corner has none, or None; colours : (C, 3) linear, or None.
+    surfaces : (P,) number of the material.   smoothing : (P,) groups for corners without a normal, 0: flat; None: by
+    the angle between faces.   lines : (P,) of the file, for messages, or None."""
+
+    points: np.ndarray
+    places: np.ndarray
+    sizes: np.ndarray
+    uvs: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    colours: np.ndarray | None = None
+    surfaces: np.ndarray | None = None
+    smoothing: np.ndarray | None = None
+    lines: np.ndarray | None = None
+
+
+def raw_meshes(
+    given: Polygons, materials: Sequence[Material | None], max_faces: int, where: str, log: list[str]
+) -> list[RawMesh]:
+    """Return a raw mesh for each material, and one for those of its triangles that have no texture coordinates.
+
+    log : gets a line where polygons have no triangle. Raises AssetError: indices that do not exist, too many corners or
+    triangles."""
+    _check(given, max_faces, where)
+    triangles, owner, repeated = triangulate(given.points, given.places, given.sizes)
+    if not len(triangles):
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+    lost = len(given.sizes) - len(np.unique(owner))
+    if repeated or lost:
+        log.append(f"{Path(where).stem}: {repeated} repeated corners and {lost} faces of fewer than three left out")
+    at = given.places[triangles]
+    normals = np.full((len(triangles), 3, 3), np.nan) if given.normals is None else given.normals[triangles]
+    missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false
+    if missing.any():
+        groups = None if given.smoothing is None else given.smoothing[owner]
+        used, inner = np.unique(at, return_inverse=True)  # a point that no face has may lie anywhere
+        points, inner = given.points[used], inner.reshape(at.shape)
+        welded = weld(points, inner)[1] if groups is None else inner
+        made = crease_normals(points, inner, welded, groups=groups)
+        normals[missing] = made[missing]
+    # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
+    a, b, c = (given.points[at[:, k]] for k in range(3))
+    behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0
+    for array in (triangles, at, normals):
+        array[behind] = array[behind, ::-1]
+    uvs = np.full((len(given.places), 2), np.nan) if given.uvs is None else given.uvs * [1, -1] + [0, 1]
+    surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
+    kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
+    order, raws = np.argsort(kind, kind="stable"), []
+    for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():
+        (number, bare), corners, tint = divmod(int(kind[chosen[0]]), 2), triangles[chosen].ravel(), None
+        drawn = materials[number]
+        if drawn is INVISIBLE:
+            continue
+        if given.colours is not None:
+            drawn, tint = tinted(drawn, given.colours[corners])
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        shape = given.points[at[chosen]].reshape(-1, 3), faces, normals[chosen].reshape(-1, 3)
+        raws.append(RawMesh(*shape, None if bare else uvs[corners], drawn, colours=tint))
+    return raws
+
+
+def _check(given: Polygons, max_faces: int, where: str) -> None:
+    total = int(np.maximum(given.sizes - 2, 0).sum())
+    if total > max_faces:
+        raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+    if (most := int(given.sizes.max(initial=0))) > MAX_CORNERS:
+        accepted = f"at most {MAX_CORNERS}, or triangles"
+        raise AssetError("a polygon has too many corners", where=where, value=most, accepted=accepted)
+    last = len(given.points) - 1
+    beyond = (given.places < 0) | (given.places > last)
+    wrong = np.flatnonzero(beyond | ~np.isfinite(given.points[given.places.clip(0, max(last, 0))]).all(axis=1))
+    if len(wrong):
+        corner, face = wrong[0], int(np.searchsorted(np.cumsum(given.sizes), wrong[0], "right"))
+        place = f"{where}, face {face}" if given.lines is None else f"{where}, line {given.lines[face]}"
+        if not beyond[corner]:
+            value, accepted = given.points[given.places[corner]].tolist(), "finite numbers"
+            raise AssetError("a face has a vertex that is NaN or infinite", where=place, value=value, accepted=accepted)
+        problem, value = "a face refers to a vertex that does not exist", int(given.places[corner])
+        raise AssetError(problem, where=place, value=value, accepted=f"0 to {last}")
+
+
+def beside(folder: Path, inner: str, name: str, where: str, omissions: Omissions) -> Path | None:
+    """Return a file that is named relative to the folder ``inner`` below ``folder``, or to that; None where it is
+    missing, which is added to ``omissions``. Raises AssetError for one outside ``folder``."""
+    name = name.strip('"').replace("\\", "/")
+    for base in dict.fromkeys((inner, "")):
+        try:
+            return inside(folder, os.path.normpath(os.path.join(base, name)), where)
+        except AssetError as error:
+            if "missing" not in error.problem:
+                raise
+    omissions.add(f"'{name}', which is missing")
+    return None
+
+
+def texture_of(image: Path, max_texture: int) -> Texture:
+    """Return the texture of an image file. Raises AssetError naming it."""
+    data = contents(image, "image")
+    return Texture(decode_image(data, max_texture, str(image)), image.name, content_hash(data))

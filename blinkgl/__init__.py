@@ -30,17 +30,14 @@ _HOMES = {
     "blinkgl.front.drawing": ("Renderer", "render_frame"),
     "blinkgl.front.online": ("OnlineSequences",),
     "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
+    "blinkgl.front.event_files": ("convert", "open_events", "read_events", "write_events"),
     "blinkgl.front.files": (
         "calibrate",
         "compare",
-        "convert",
-        "open_events",
-        "read_events",
         "read_flow",
         "read_trajectory",
         "simulate",
         "simulate_file",
-        "write_events",
         "write_flow",
         "write_trajectory",
     ),
@@ -57,17 +54,14 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 if TYPE_CHECKING:  # for type checkers and editors; a test compares it with the table
     from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError
     from blinkgl.front.drawing import Renderer, render_frame
+    from blinkgl.front.event_files import convert, open_events, read_events, write_events
     from blinkgl.front.files import (
         calibrate,
         compare,
-        convert,
-        open_events,
-        read_events,
         read_flow,
         read_trajectory,
         simulate,
         simulate_file,
-        write_events,
         write_flow,
         write_trajectory,
     )

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from blinkgl.machine import event_options as of_events
+
 # What may be declared of frames, in every command that reads them.
 Fps = Annotated[float | None, typer.Option(help="Frames per second (default: the file's own times).")]
 Timestamps = Annotated[str | None, typer.Option(help="File of frame times, a line each: 'time' or 'time name'.")]
@@ -146,6 +148,14 @@ def compare(
     zero_time: Annotated[
         bool, typer.Option("--zero-time", help="Start both at their first event, and frames at the first.")
     ] = False,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of both, if the files do not give it.")] = None,
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
     judge: Annotated[
         bool,
         typer.Option(
@@ -156,6 +166,7 @@ def compare(
     """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against
     brightness."""
     from blinkgl.io.frames import Declared
+    from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
 
     return command.run(
@@ -176,6 +187,7 @@ def compare(
         interval_ms=interval_ms,
         zero_time=zero_time,
         judge=judge,
+        reading=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
     )
 
 
@@ -220,12 +232,21 @@ def calibrate(
     zero_time: Annotated[
         bool, typer.Option("--zero-time", help="Count events from the first, and frames from the first.")
     ] = False,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, if the recording does not give it.")] = None,
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
     starts: Annotated[int, typer.Option(min=1, max=20, help="Starting points of the search.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulations and the search.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
     """Fit an emulator to a camera's recording; writes a sensor file, and a page that shows how close the fit is."""
+    from blinkgl.io.reading import EventReading
     from blinkgl.show import calibrate as command
 
     return command.run(
@@ -253,35 +274,47 @@ def calibrate(
         seed=seed,
         overwrite=overwrite,
         quiet=quiet,
+        events=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
     )
 
 
 def convert(
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="IN",
-            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT2.1/EVT3 .raw, .aedat4, .aedat, .es, "
-            ".mat, .txt, .csv, .npz, .npy.",
-        ),
+        typer.Argument(metavar="IN", help="Event file, of any format of docs/formats.md."),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending selects the format.")],
-    size: Annotated[
-        str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not give it (default: guessed).")
-    ] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not give it.")] = None,
     zero_time: Annotated[
         bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")
     ] = False,
-    time_unit: Annotated[
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
+    write_unit: Annotated[
         str,
-        typer.Option("--time-unit", help="For .txt and .csv: s (six decimals), or us (integers; .csv as faery's)."),
+        typer.Option(
+            "--write-unit", help="Times of a .txt or .csv OUT: s (six decimals), or us (integers; .csv as faery's)."
+        ),
     ] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
     """Convert an event file from one format to another."""
+    from blinkgl.io.reading import EventReading
     from blinkgl.show import convert as command
 
-    return command.run(source, target, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
+    return command.run(
+        source,
+        target,
+        reading=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
+        zero_time=zero_time,
+        write_unit=write_unit,
+        overwrite=overwrite,
+    )
 
 
 def import_(

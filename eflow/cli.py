@@ -11,6 +11,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import ConfigError
+from blinkgl.machine import event_options as of_events
 from blinkgl.machine.command_line import run_app
 from blinkgl.machine.interrupts import interruptible
 from eflow.cli_arguments import (
@@ -39,7 +40,6 @@ from eflow.cli_arguments import (
     one_of,
     precision_for,
     rendered,
-    size_of,
     windows_of,
 )
 from eflow.methods.table import METHODS
@@ -228,6 +228,13 @@ def predict(
     whole: Whole = False,
     truth: Truth = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None,
+    time_unit: of_events.TimeUnit = None,
+    origin: of_events.Origin = None,
+    columns: of_events.Columns = None,
+    polarity: of_events.Polarity = None,
+    stream: of_events.Stream = None,
+    damaged: of_events.Damaged = "refuse",
+    sort: of_events.Sort = False,
     npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False,
     video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None,
     warm_start: WarmStart = False,
@@ -243,6 +250,7 @@ def predict(
 
     FWL (flow warp loss) says how much sharper the events of the new window become when the flow moves them back to its
     start; above 1 the flow helps."""
+    from blinkgl.io.reading import EventReading
     from blinkgl.types.events import Events
     from eflow import infer
     from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
@@ -252,7 +260,8 @@ def predict(
     asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
     method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     model = None if method is not None else network_of(checkpoint, device, raw, precision, iterations)
-    file = infer.open_sized(events, size_of(size))
+    reading = EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort)
+    file = infer.open_sized(events, reading)
     for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)
     outputs = Outputs(out, video, npy, infer.read_truth(truth, file.height, file.width) if truth else None)
@@ -265,6 +274,8 @@ def predict(
         predictor = infer.Predictor(model, *shape, **options)
     reads = ("old", "new") if model is None else model.reads
     show_flows(file, predictor, reads, asked, outputs, typer.echo)
+    for line in file.notes:
+        typer.echo(f"{events}: {line}", err=True)
 
 
 @app.command()

@@ -159,13 +159,3 @@ def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
                 accepted="LOW-HIGH in ms, such as 5-100",
             ) from None
     return validate(SourceConfig, tree)
-
-
-def size_of(text: str | None) -> tuple[int, int] | None:
-    """Return (480, 640) for "640x480". Raises ConfigError."""
-    if text is None:
-        return None
-    width, x, height = text.lower().partition("x")
-    if not (x and width.isdigit() and height.isdigit() and 0 < int(width) < 65536 and 0 < int(height) < 65536):
-        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
-    return int(height), int(width)

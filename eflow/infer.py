@@ -17,6 +17,7 @@ from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
 from blinkgl.io.flow import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.sequence_files.sequence_dir import refuse_existing
 from blinkgl.types.events import Events
 from eflow.data.representation import VoxelGrid
@@ -291,12 +292,10 @@ class Predictor:
         return flow, new
 
 
-def open_sized(path: str | os.PathLike, size: tuple[int, int] | None = None) -> EventFile:
-    """Open an event file with its sensor size: given, stored, or the smallest known sensor that contains its events."""
-    from dataclasses import replace
-
-    file = open_events(path)
-    return replace(file, height=size[0], width=size[1]) if size else file.sized()
+def open_sized(path: str | os.PathLike, reading: EventReading = AS_FILE) -> EventFile:
+    """Open an event file with its sensor size: declared, stored, or the smallest known sensor that contains its
+    events."""
+    return open_events(path, reading).sized()
 
 
 def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:

@@ -50,7 +50,7 @@ def test_a_file_format(code, tmp_path):
             writer.append(Events(*(getattr(recording, k)[i : i + 1000] for k in "xytp")))
         writer.close()
         reader = made.NineReader(path)
-        file = EventFile(path, "nine", reader.height, reader.width, 0, reader)
+        file = EventFile(path, "nine", reader.height, reader.width, _reader=reader)
         assert (file.height, file.width) == (48, 64)
         assert all(np.array_equal(getattr(file.read(), k), getattr(recording, k)) for k in "xytp")
     path.write_bytes(path.read_bytes() + b"x")

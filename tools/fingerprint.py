@@ -127,7 +127,7 @@ def exported(scratch: Path) -> Path:
         inner.mkdir()
         assets(inner)
         data = generated(case, inner)
-        for layout in LAYOUTS:
+        for layout in (name for name in LAYOUTS if name != "rosbag"):  # needs an extra
             try:
                 export_layout(data, scratch / "out" / case / layout, layout)
             except Exception as error:  # noqa: BLE001 - what a layout refuses is part of the fingerprint

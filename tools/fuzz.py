@@ -11,7 +11,9 @@ are defects.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import faulthandler
+import gzip
 import os
 import re
 import resource
@@ -27,11 +29,14 @@ from collections import Counter
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
+import h5py
+import hdf5plugin
 import numpy as np
 import trimesh
+from scipy.io import savemat
 
 from blinkgl.config.run import load_run
 from blinkgl.errors import BlinkGLError
@@ -39,6 +44,7 @@ from blinkgl.io.flow import read_flo, read_flow_png, write_flo, write_flow_png
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import Declared, open_frames
 from blinkgl.io.images import write_pfm
+from blinkgl.io.reading import EventReading
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.types.events import Events
 
@@ -62,17 +68,91 @@ def _events() -> Events:
     return Events(x, y, np.sort(t), p)
 
 
-def _events_as() -> Format:
-    def make(path: Path) -> None:
+def _events_as(make: Callable[[Path], object] | None = None) -> Format:
+    """Events, written by ``make`` (None: as the ending says), are read; the whole parts of a damaged file, too."""
+
+    def write(path: Path) -> None:
         write_events(path, _events(), HEIGHT, WIDTH)
 
     def read(path: Path) -> None:
+        with contextlib.suppress(BlinkGLError), open_events(path, EventReading(damaged="keep", sort=True)) as file:
+            list(file.chunks())
         with open_events(path) as file:
             sized = file.sized()
             for events in sized.chunks():
                 assert not len(events) or (events.x.max() < sized.width and events.y.max() < sized.height)
 
-    return Format(make, read)
+    return Format(make or write, read)
+
+
+def _es(path: Path) -> None:
+    """Event Stream, version 2."""
+    data, e, last = bytearray(b"Event Stream" + bytes([2, 0, 0, 1, WIDTH, 0, HEIGHT, 0])), _events(), 0
+    for x, y, t, p in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist()):
+        data += b"\xff" * ((t - last) // 127) + bytes([(t - last) % 127 << 1 | p, x, 0, y, 0])
+        last = t
+    path.write_bytes(data)
+
+
+def _dat(path: Path) -> None:
+    e = _events()
+    rows = np.stack([e.t, e.x | e.y.astype(np.int64) << 14 | e.p.astype(np.int64) << 28], axis=1).astype("<u4")
+    path.write_bytes(f"% Version 2\n% Height {HEIGHT}\n% Width {WIDTH}\n".encode() + bytes([12, 8]) + rows.tobytes())
+
+
+def _bin(path: Path) -> None:
+    e = _events()
+    rows = zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist())
+    path.write_bytes(b"".join(bytes([x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255]) for x, y, t, p in rows))
+
+
+def _mat(path: Path) -> None:
+    e = _events()
+    savemat(path, {"events": {"x": e.x * 1.0, "y": e.y, "ts": e.t * 1.0, "p": e.p}}, do_compression=True)
+
+
+def _h5(*packed: Any) -> Callable[[Path], object]:
+    """Columns of a stranger's HDF5, packed by filters."""
+
+    def make(path: Path) -> None:
+        e = _events()
+        with h5py.File(path, "w") as file:
+            file["t_offset"] = np.array([7])
+            for k, name in enumerate(("x", "y", "t", "p")):
+                file.create_dataset(f"events/{name}s", data=getattr(e, name), chunks=(128,), **packed[k % len(packed)])
+
+    return make
+
+
+def _rows(path: Path) -> None:
+    e = _events()
+    with h5py.File(path, "w") as file:
+        file["davis/left/events"] = np.stack([e.x, e.y, e.t * 1e-6, e.p * 2.0 - 1], axis=1)
+
+
+def _mat73(path: Path) -> None:
+    e = _events()
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name in "xytp":
+            file[name] = getattr(e, name)[None]
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
+
+
+def _gz(path: Path) -> None:
+    e = _events()
+    with gzip.open(path, "wt") as file:
+        file.writelines(f"{t} {x} {y} {p}\n" for x, y, t, p in zip(e.x, e.y, e.t, e.p))
+
+
+def _bag(path: Path) -> None:
+    from rosbags.rosbag1 import Writer
+
+    from blinkgl.io.ros import event_array, typestore
+
+    with Writer(path) as bag:
+        kind, data = event_array(_events(), HEIGHT, WIDTH)
+        bag.write(bag.add_connection("/events", kind, typestore=typestore(False)), 1, data)
 
 
 def _flow() -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +184,17 @@ def _read_frames(path: Path) -> None:
 FRAMES = Format(_write_picture, _read_frames)
 MESH = Format(lambda path: trimesh.creation.box().export(path), load_asset)
 FORMATS = {
-    **{name: _events_as() for name in ("e.txt", "e.csv", "e.h5", "e.npz", "e.npy", "e.raw")},
+    **{name: _events_as() for name in ("e.txt", "e.csv", "e.h5", "e.npz", "e.npy", "e.raw", "e.aedat4")},
+    "e.es": _events_as(_es),
+    "e.dat": _events_as(_dat),
+    "e.bin": _events_as(_bin),
+    "e.mat": _events_as(_mat),
+    "e73.mat": _events_as(_mat73),
+    "e.txt.gz": _events_as(_gz),
+    "e.bag": _events_as(_bag),
+    "rows.hdf5": _events_as(_rows),
+    "gzip.h5": _events_as(_h5({"compression": "gzip", "shuffle": True}, {"compression": "lzf"})),
+    "zstd.h5": _events_as(_h5(dict(hdf5plugin.Zstd()), dict(hdf5plugin.LZ4()), dict(hdf5plugin.Blosc()))),
     "flow.png": Format(lambda path: write_flow_png(path, *_flow()), lambda path: _sound(*read_flow_png(path))),
     "flow.flo": Format(lambda path: write_flo(path, *_flow()), lambda path: _sound(*read_flo(path))),
     **{f"0.{ending}": FRAMES for ending in ("png", "jpg", "tiff", "pfm", "hdr")},

@@ -64,7 +64,7 @@ def slider(root: Path) -> MakeClip:
 
 
 def _clip(events: Path, frames: Path, declared: Declared = NOTHING) -> MakeClip:
-    stream, size = read_recording(events)
+    stream, size, _ = read_recording(events)
     timed, exposures = timed_frames(frames, declared)
     given, reading = list(timed), FrameReading(exposures=exposures, name=frames.name)
     return lambda most: clip_of_frames(stream, given, size, reading, most=most)

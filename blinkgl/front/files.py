@@ -12,8 +12,7 @@ import numpy as np
 
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.front import arguments as check
-from blinkgl.io import formats
-from blinkgl.io.formats import EventFile
+from blinkgl.front.event_files import EventOptions, checked_size, event_reading
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
@@ -26,110 +25,6 @@ if TYPE_CHECKING:
     from blinkgl.recordings.simulation import FrameUse, SimulationReport
 
 _SIDE = 65535
-
-
-@check.public
-def open_events(path: str | os.PathLike) -> EventFile:
-    """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
-    ``height``, ``width`` in px, None if the file does not contain them (``file.sized()`` computes them), times in µs.
-    Formats and endings: docs/formats.md. For .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
-    ``file.imu()``, its inertial unit.
-
-    Raises AssetError: missing file, unknown ending, or content of another format."""
-    return formats.open_events(check.path(path, "path"))
-
-
-@check.public
-def read_events(path: str | os.PathLike, *, truth: bool = False) -> Events:
-    """Return all :class:`Events` of a file, t in µs, in memory.
-
-    truth : also read their causes (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
-    Raises AssetError and EventDataError (decreasing times …)."""
-    with open_events(path) as file:
-        events = file.read()
-    if not check.one_of(truth, "truth", bool, "True or False"):
-        return events
-    from blinkgl.io.event_labels import with_truth
-
-    return with_truth(events, 0, check.path(path, "path").parent)
-
-
-@check.public
-def write_events(
-    path: str | os.PathLike,
-    events: Events | Iterable[Events],
-    height: int,
-    width: int,
-    *,
-    t_offset_us: int = 0,
-    time_unit: str = "s",
-    overwrite: bool = True,
-) -> int:
-    """Write events, or chunks in order, of a sensor of height x width px, and return their number. The file appears
-    complete or not at all.
-
-    path : its ending names the format (docs/formats.md).   t_offset_us : DSEC's, µs.
-    time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
-    path, height, width = (
-        check.path(path, "path"),
-        check.whole(height, "height", 1, _SIDE),
-        check.whole(width, "width", 1, _SIDE),
-    )
-    offset = check.whole(t_offset_us, "t_offset_us", 0, 2**62)
-    return formats.write_events(
-        path,
-        _chunks(events),
-        height,
-        width,
-        t_offset_us=offset,
-        time_unit=time_unit,
-        overwrite=overwrite,
-    )
-
-
-def _chunks(events: Any) -> Iterator[Events]:
-    if isinstance(events, Events):
-        events = (events,)
-    if not isinstance(events, Iterable):
-        raise ConfigError("not events", where="events", value=events, accepted="Events, or chunks of them")
-
-    def checked() -> Iterator[Events]:
-        for chunk in events:
-            yield check.one_of(chunk, "events", Events, "Events, or chunks of them")
-
-    return checked()
-
-
-@check.public
-def convert(
-    source: str | os.PathLike,
-    target: str | os.PathLike,
-    *,
-    size: tuple[int, int] | None = None,
-    zero_time: bool = False,
-    time_unit: str = "s",
-    overwrite: bool = True,
-) -> int:
-    """Copy events from one file format to another, in pieces. Returns the number of events.
-
-    size : (height, width), px, if ``source`` does not contain it.   time_unit : as of :func:`write_events`.
-    zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
-    return formats.convert(
-        check.path(source, "source"),
-        check.path(target, "target"),
-        size=None if size is None else _size(size),
-        zero_time=bool(zero_time),
-        time_unit=time_unit,
-        overwrite=overwrite,
-    )[1]
-
-
-def _size(size: Any) -> tuple[int, int]:
-    """Return (height, width), px. Raises ConfigError."""
-    pair = check.one_of(size, "size", (list, tuple), "(height, width)")
-    if len(pair) != 2:
-        raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
-    return check.whole(pair[0], "size", 1, _SIDE), check.whole(pair[1], "size", 1, _SIDE)
 
 
 def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
@@ -227,6 +122,17 @@ class DeclaredFrames(TypedDict, total=False):
     background: str | None
 
 
+class DeclaredBoth(EventOptions, total=False):
+    """What event files do not say (:func:`blinkgl.open_events`), nor frames beside them."""
+
+    fps: float | None
+    timestamps: str | os.PathLike | None
+    frames_time_unit: str | None
+    white_level: float | None
+    range: str | None
+    background: str | None
+
+
 @check.public
 def compare(
     a: str | os.PathLike,
@@ -238,17 +144,18 @@ def compare(
     judge: bool = False,
     gamma: str | float | None = None,
     frame_delay_ms: float = 0.0,
-    **declared: Unpack[DeclaredFrames],
+    **declared: Unpack[DeclaredBoth],
 ) -> Comparison:
     """Compare two event files over their common time: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: only ``a`` is described.
     frames : video or folder of images that both are compared with.   gamma : of their codes; None: what the file
     states, linear for grey images, srgb for video and colour.   frame_delay_ms : added to their times, ms.   declared :
-    what the file does not say of them, as of :func:`simulate_file`.
+    what the file does not say of them, as of :func:`simulate_file` (``frames_time_unit`` is its ``time_unit``).
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event, and frames from the
     first.
     judge : also compute how well a classifier separates b from a, and the halves of each: ``told_apart``, ``halves``.
+    time_unit, size … : of both event files, as of :func:`open_events`.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
 
@@ -256,16 +163,17 @@ def compare(
         check.path(a, "a"),
         None if b is None else check.path(b, "b"),
         frames=None if frames is None else check.path(frames, "frames"),
-        declared=_declared(declared),
+        declared=_declared(declared, "frames_time_unit"),
         gamma=gamma,
         frame_delay_ms=check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6),
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
         judge=bool(judge),
+        reading=event_reading(declared),
     )
 
 
-class ReadingOptions(DeclaredFrames, total=False):
+class ReadingOptions(DeclaredBoth, total=False):
     """Options of frames beside a recording; :func:`blinkgl.calibrate` describes them."""
 
     zero_time: bool
@@ -293,11 +201,12 @@ def calibrate(
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping of initial values.   fixed : keys that keep their initial values.   still : a static scene in
-    constant light, without frames: only noise is fitted.   fps, timestamps, time_unit, white_level, range, background :
-    of the frames, as of :func:`simulate_file`.   zero_time : count events from the first, and frames from the first.
-    gamma : of their codes; None: what the file states, linear for grey images, srgb for video and colour.   interpolate
-    : between them, "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their times, ms; None:
-    estimated. starts : of the search.   Raises AssetError, EventDataError, ConfigError."""
+    constant light, without frames: only noise is fitted.   fps, timestamps, frames_time_unit, white_level, range,
+    background : of the frames, as of :func:`simulate_file`.   zero_time : count events from the first, and frames from
+    the first.   gamma : of their codes; None: what the file states, linear for grey images, srgb for video and colour.
+    interpolate : between them, "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their
+    times, ms; None: estimated.   starts : of the search.   time_unit, size … : of the recording, as of
+    :func:`open_events`.   Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.front.sections import events_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
@@ -322,9 +231,10 @@ def calibrate(
         emulator=events_tree(emulator),
         fixed=keys,
         still=bool(still),
-        declared=_declared(reading),
+        declared=_declared(reading, "frames_time_unit"),
         starts=check.whole(starts, "starts", 1, 20),
         seed=check.seed(seed),
+        events=event_reading(reading),
     )
 
 
@@ -407,7 +317,7 @@ def simulate_file(
         check.path(source, "source"),
         check.path(target, "target"),
         declared=_declared(given),
-        size=_sensor_size(frames.get("sensor")) if size is None else _size(size),
+        size=_sensor_size(frames.get("sensor")) if size is None else checked_size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
         use=use,
@@ -455,15 +365,15 @@ def _options(
     )
 
 
-def _declared(given: Mapping[str, Any]) -> Declared:
-    """Return what is declared of frames. Raises ConfigError."""
+def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:
+    """Return what is declared of frames; ``unit`` is the key of the unit of their times. Raises ConfigError."""
     from blinkgl.io.frames import Declared
 
     fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
     return Declared(
         None if fps is None else check.number(fps, "fps", above=0, most=1e9),
         None if stamps is None else check.path(stamps, "timestamps"),
-        given.get("time_unit"),
+        given.get(unit),
         bool(given.get("zero_time", False)),
         None if white is None else check.number(white, "white_level", above=0, most=1e9),
         given.get("range"),

@@ -21,6 +21,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import CameraFrame, G, ImuSamples
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -47,24 +48,26 @@ _DVS, _PIN, _APS, _IMU = range(4)
 
 
 class Aedat2Reader:
-    """A recording of a DAVIS camera; times are the file's own µs, unwrapped. height, width : px, by the chip's name.
+    """A recording of a DAVIS camera; times are the file's own µs, unwrapped. height, width : px, by the chip's name, or
+    as declared where the header names none (v2e's files).
     frames_cut : frames without all of their samples (at the file's ends), known after :meth:`frames`.
 
     Raises AssetError: another magic or version, an unknown chip, a header without an end; while reading, naming the
     byte: stray bytes at the end (truncated), an address outside the sensor, decreasing times."""
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path, self._keep = Path(path), reading.keep
         self._header, self._start = _read_header(self.path)
         chip = re.search(r"^#\s*AEChip:\s*(\S+)", self._header, re.M)
         name = chip.group(1).rpartition(".")[2] if chip else None
         size = next((size for known, size in SIZES.items() if name and name.upper().startswith(known)), None)
+        size = size or (reading.size if chip is None else None)
         if size is None:
             raise AssetError(
                 "a camera with unknown addresses" if chip else "no camera named in the header ('# AEChip: …')",
                 where=str(path),
                 value=name,
-                accepted=", ".join(SIZES),
+                accepted=", ".join(SIZES) + ("" if chip else "; or --size WIDTHxHEIGHT"),
             )
         self.height, self.width = size
         self.frames_cut = 0
@@ -75,6 +78,7 @@ class Aedat2Reader:
             # The file counts x of events from the right and y from the bottom.
             x = self.width - 1 - (address >> 12 & 0x3FF)
             y = self.height - 1 - (address >> 22 & 0x1FF)
+            # An address outside is negative here, and beyond every sensor as uint16.
             yield Events(x.astype(np.uint16), y.astype(np.uint16), t, (address >> 11 & 1).astype(np.uint8))
 
     def frames(self, records: int = 1 << 17) -> Iterator[CameraFrame]:
@@ -123,7 +127,7 @@ class Aedat2Reader:
             address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
             kinds = _kinds(address)
             t = np.empty(len(raw), np.int64)
-            bad, why = _unwrap(address, kinds, stamp, state, self.height, self.width, t)
+            bad, why = _unwrap(address, kinds, stamp, state, self.height, self.width, self._keep and kind == _DVS, t)
             if bad >= 0:
                 self._refuse(first + bad, int(address[bad]), int(stamp[bad]), why, state)
             chosen = kinds == kind
@@ -221,8 +225,9 @@ def _kinds(address: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _unwrap(address, kinds, stamp, state, height, width, t):
+def _unwrap(address, kinds, stamp, state, height, width, keep, t):
     """Fill times, int64 µs, and return (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
+    keep : neither is bad.
 
     Records of one kind are in order of time; of different kinds they may be out of order by less than half of the range
     of 32 bits."""
@@ -230,7 +235,7 @@ def _unwrap(address, kinds, stamp, state, height, width, t):
         kind = kinds[i]
         # Only events and frame samples have coordinates.
         if kind == 0 or kind == 2:
-            if (address[i] >> 12 & 0x3FF) >= width or (address[i] >> 22 & 0x1FF) >= height:
+            if not keep and ((address[i] >> 12 & 0x3FF) >= width or (address[i] >> 22 & 0x1FF) >= height):
                 return i, 1
         # Unwrapping: the difference to the last time modulo 2^32, taken as a signed number.
         if state[0] < 0:
@@ -239,7 +244,7 @@ def _unwrap(address, kinds, stamp, state, height, width, t):
             step = (stamp[i] - state[0]) & 0xFFFFFFFF
             now = state[0] + (step if step < 0x80000000 else step - 0x100000000)
         # Within its own kind a record must not be earlier than the one before.
-        if now < state[1 + kind] or now < 0:
+        if (now < state[1 + kind] and not keep) or now < 0:
             state[0] = state[1 + kind]
             return i, 2
         t[i] = now

@@ -1,17 +1,24 @@
-"""AEDAT4 recordings of iniVation's cameras, read by the package aedat."""
+"""AEDAT4 recordings of iniVation's cameras, read by the package aedat and written by dv-processing.
+
+dv-processing 2.0 reads the same events but refuses a file that was cut, and one without a table of its packets; aedat
+reads what is there."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.columns import CameraFrame, G, ImuSamples, check_size, events_of
+from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import CameraFrame, CheckedWriter, G, ImuSamples, events_of, joined
+from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
 
 _ABSENT = {"events": "no events", "frame": "no frames", "imus": "no samples of an inertial unit"}
@@ -20,28 +27,35 @@ _ABSENT = {"events": "no events", "frame": "no frames", "imus": "no samples of a
 class Aedat4Reader:
     """The streams of a recording; times are the file's own int64 µs (usually since 1970).
 
-    height, width : px of the events' sensor. Raises AssetError: not AEDAT4, damaged, the requested stream is
-    missing."""
+    height, width : px of the events' sensor.   notes : a line where there are several streams of events. Raises
+    AssetError: not AEDAT4, damaged, the requested stream is missing."""
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path = Path(path)
         with _damage(self.path):
             self._streams: dict[int, dict[str, Any]] = _decoder(self.path).id_to_stream()
-        events = self._streams[self._first("events")]
+        found = sorted(number for number, stream in self._streams.items() if stream["type"] == "events")
+        self._number = self._first("events") if reading.stream is None else reading.stream
+        shown = ", ".join(f"{n} ({self._streams[n]['width']}x{self._streams[n]['height']})" for n in found)
+        if self._number not in found:
+            raise AssetError(
+                "no such stream of events", where=str(path), value=self._number, accepted=f"--stream {shown}"
+            )
+        self.notes = []
+        if len(found) > 1:
+            self.notes.append(f"{len(found)} streams of events: {shown}; {self._number} is read (--stream for another)")
+        events = self._streams[self._number]
         self.height, self.width = events["height"], events["width"]
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events, packet by packet, joined to about ``size``."""
-        first, pending, count = 0, [], 0
+        yield from joined(self._events(), size)
+
+    def _events(self) -> Iterator[Events]:
+        first = 0
         for a in self._packets("events"):
-            pending.append(events_of(a["x"], a["y"], a["t"], a["on"], str(self.path), first + count))
-            count += len(a)
-            if count >= size:
-                yield Events.concatenate(pending)
-                first, pending, count = first + count, [], 0
-        if pending:
-            yield Events.concatenate(pending)
+            yield events_of(a["x"], a["y"], a["t"], a["on"], str(self.path), first)
+            first += len(a)
 
     def frames(self) -> Iterator[CameraFrame]:
         """Yield frames in their order, uint8, RGB where they have colours; one in memory at a time."""
@@ -58,7 +72,10 @@ class Aedat4Reader:
 
     def imu(self) -> ImuSamples:
         """Return all samples of the inertial unit."""
-        rows = np.concatenate(list(self._packets("imus")))
+        packets = list(self._packets("imus"))
+        if not packets:
+            raise AssetError(f"{_ABSENT['imus']} in the recording", where=str(self.path))
+        rows = np.concatenate(packets)
         t = rows["t"].astype(np.int64)
         if (back := np.diff(t) < 0).any():
             i = int(np.argmax(back))
@@ -82,14 +99,52 @@ class Aedat4Reader:
         return min(found)
 
     def _packets(self, kind: str) -> Iterator[Any]:
-        number = self._first(kind)
+        number = self._number if kind == "events" else self._first(kind)
         with _damage(self.path):
-            for packet in _decoder(self.path):
+            packets, sound = iter(_decoder(self.path)), _check_claims(self.path)
+            while True:
+                next(sound, None)
+                packet = next(packets, None)
+                if packet is None:
+                    return
                 if packet["stream_id"] == number:
                     yield packet[kind]
 
 
+_HEADER = 18
+"""Bytes of the magic and of the header's length, which follows it."""
+
+
+def _check_claims(path: Path) -> Iterator[None]:
+    """Yield before each packet of a file, once it is known to lie in the file. The decoder sets aside as much memory as
+    a packet claims. (iniVation, "AEDAT 4.0": packets of a stream's number, a length and so many bytes; the header is a
+    FlatBuffer, whose second field says where the table behind the packets lies.)
+
+    Raises AssetError: the header or a packet is longer than the rest of the file."""
+    total = path.stat().st_size
+    with open(path, "rb") as file:
+        begin = file.read(_HEADER)
+        length = int.from_bytes(begin[-4:], "little") if len(begin) == _HEADER else 0
+        if length > total - _HEADER:
+            raise AssetError(f"a header of {length} bytes", where=str(path), accepted=f"at most {total - _HEADER}")
+        header, end = file.read(length), total
+        with contextlib.suppress(struct.error):
+            table = struct.unpack_from("<I", header)[0]
+            place = struct.unpack_from("<H", header, table - struct.unpack_from("<i", header, table)[0] + 6)[0]
+            end = struct.unpack_from("<q", header, table + place)[0] if place else end
+        while len(packet := file.read(8)) == 8 and file.tell() - 8 != end:
+            size = int.from_bytes(packet[4:], "little")
+            if size > total - file.tell():
+                at = file.tell() - 8
+                raise AssetError(
+                    f"a packet at byte {at} of {size} bytes", where=str(path), accepted=f"at most {total - at}"
+                )
+            yield
+            file.seek(size, os.SEEK_CUR)
+
+
 def _decoder(path: Path) -> Any:
+    next(_check_claims(path), None)
     # Imported here: few programs read such files.
     import aedat
 
@@ -110,3 +165,32 @@ def _damage(path: Path) -> Iterator[None]:
             raise
         text = " ".join(str(error).split())[:160]
         raise AssetError(f"damaged AEDAT4 file: {text}", where=str(path)) from error
+
+
+class Aedat4Writer(CheckedWriter):
+    """Writes one stream of events by dv-processing. Raises OutputError: it is not installed."""
+
+    kind = "AEDAT4"
+
+    def __init__(self, path: str | os.PathLike, height: int, width: int):
+        super().__init__(path, height, width)
+        try:
+            import dv_processing as dv
+        except ImportError:
+            accepted = f"run {install('dv-processing')}"
+            raise OutputError("AEDAT4 is written by the package dv-processing", accepted=accepted) from None
+        settings = dv.io.MonoCameraWriter.EventOnlyConfig("BlinkGL", (width, height))
+        self._store = dv.EventStore
+        with output_errors(path):
+            self._file = dv.io.MonoCameraWriter(os.fspath(path), settings)
+
+    def _write(self, events: Events) -> None:
+        store = self._store()
+        for x, y, t, p in zip(*(getattr(events, k).tolist() for k in "xytp"), strict=True):
+            store.push_back(t, x, y, bool(p))
+        self._file.writeEvents(store)
+
+    def close(self, t_end_us: int | None = None) -> None:
+        """Finish the file, which the library does when its writer goes."""
+        with output_errors(self.path):
+            self._file = None

@@ -1,12 +1,12 @@
-"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured array; also reads
-MATLAB's .mat with such variables. Unlike the other formats, whole recordings are in memory."""
+"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured or (N, 4) array; also
+reads MATLAB's .mat with such variables. Unlike the other formats, whole recordings are in memory."""
 
 from __future__ import annotations
 
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,11 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size, events_of, microseconds
+from blinkgl.io.clock import named_unit
+from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
+from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.tables import Table, TableReader, named_columns, slot_of, table_of_columns, table_of_rows
 from blinkgl.types.events import Events
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -25,20 +28,19 @@ from blinkgl.types.events import Events
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 _MATRIX, _COMPRESSED, _STRUCT, _ARRAYS = 14, 15, 2, range(6, 16)
-_MOST_BYTES = 1 << 32
+_MOST_BYTES, _MOST_RATIO = 1 << 26, 100
+"""A file may unpack to so many bytes, or to so many times its own: columns of events pack a tenth of that."""
 _DAMAGE = (ValueError, LookupError, RuntimeError, StopIteration, struct.error, zlib.error)
 
 
 def read_mat(path: str | os.PathLike) -> dict[str, Any]:
-    """Return arrays (N,) by the names of their variables, a struct as a table of arrays; None for anything else. Raises
-    AssetError: version 7.3, which is HDF5; damaged."""
+    """Return arrays, (N,) or (N, K), by the names of their variables, a struct (or an array of structs, joined) as a
+    table of arrays; None for anything else. Raises AssetError: damaged, or it unpacks to far more than it holds."""
     data = memoryview(Path(path).read_bytes())
-    if data[124:128] in (b"\0\2IM", b"\2\0MI") or data[:8] == b"\x89HDF\r\n\x1a\n":
-        raise AssetError("a .mat of version 7.3", where=os.fspath(path), accepted="save(…, '-v7') in MATLAB")
     if data[124:128] != b"\0\1IM":
         raise AssetError("not a little-endian .mat of version 5 to 7", where=os.fspath(path))
     try:
-        return dict(_matrix(body) for kind, body in _unpacked(data[128:]) if kind == _MATRIX)
+        return dict(_matrix(body) for kind, body in _unpacked(data[128:], path) if kind == _MATRIX)
     except _DAMAGE as error:
         raise AssetError("damaged .mat", where=os.fspath(path), value=str(error)) from None
 
@@ -58,102 +60,120 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         at = following
 
 
-def _unpacked(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+def _unpacked(data: memoryview, path: str | os.PathLike) -> Iterator[tuple[int, memoryview]]:
+    left = max(_MOST_BYTES, _MOST_RATIO * len(data))
     for kind, body in _elements(data):
         if kind == _COMPRESSED:
-            yield from _elements(memoryview(zlib.decompressobj().decompress(body, _MOST_BYTES)))
+            unpacked = zlib.decompressobj().decompress(body, left)
+            left -= len(unpacked)
+            if left <= 0:
+                raise AssetError(
+                    f"unpacks to more than {_MOST_RATIO} times its size",
+                    where=os.fspath(path),
+                    accepted="save(…, '-v6')",
+                )
+            yield from _elements(memoryview(unpacked))
         else:
             yield kind, body
 
 
 def _matrix(body: memoryview) -> tuple[str, Any]:
-    """Return name and value. A struct's fields follow each other as matrices without names."""
+    """Return name and value. The fields of each element of a struct array follow each other as matrices without names;
+    the elements' columns are joined."""
     parts = _elements(body)
-    flags, _, called = next(parts)[1], next(parts), next(parts)[1]
+    flags, shape, called = next(parts)[1], np.frombuffer(next(parts)[1], "<i4"), next(parts)[1]
     name = bytes(called).decode("latin-1")
     if flags[0] == _STRUCT:
         width, names = int.from_bytes(next(parts)[1], "little"), bytes(next(parts)[1])
         fields = [names[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(names), width)]
-        return name, {field: _matrix(one)[1] for field, (_, one) in zip(fields, parts, strict=False)}
+        values = [_matrix(one)[1] for _, one in parts]
+        if not fields or len(values) % len(fields):
+            raise ValueError(f"a struct of {len(fields)} fields with {len(values)} values")
+        return name, {field: _joined(values[k :: len(fields)]) for k, field in enumerate(fields)}
     if flags[0] in _ARRAYS:
         kind, numbers = next(parts)
-        return name, np.frombuffer(numbers, _NUMBERS[kind])
+        values = np.frombuffer(numbers, _NUMBERS[kind])
+        return name, values.reshape(shape, order="F") if len(shape) == 2 and shape.min() > 1 else values
     return name, None
 
 
-DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
-_NAMES = {
-    "t": ("t", "ts", "timestamp", "timestamps", "t_us", "ts_us", "timestamps_us"),
-    "x": ("x",),
-    "y": ("y",),
-    "p": ("p", "polarity", "polarities", "pol", "on"),
-}
+def _joined(values: list[Any]) -> Any:
+    arrays = [value for value in values if isinstance(value, np.ndarray)]
+    return np.concatenate(arrays) if len(arrays) == len(values) > 1 else values[0] if values else None
 
 
-class ArrayReader:
-    """Reads ``.npz`` with four columns or structured ``.npy``. Integer times are µs, float times seconds; p is 0/1,
-    -1/1 or bool.
+DTYPE = np.dtype([(("us", "t"), "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
+"""Of the .npy files that are written; the title of t says its unit."""
 
-    A plain (N, 4) array is refused: existing files disagree about the order of its columns."""
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
-        self.height = self.width = None
-        columns, in_seconds = self._columns(path)
-        check_size(self.height, self.width, str(path))
-        t = columns["t"]
-        if in_seconds and t.dtype.kind == "f" and t.ndim == 1:
-            columns["t"] = microseconds(t, str(path))
-        self._events = events_of(*(columns[k] for k in "xytp"), str(path), cause=columns.get("cause"), signed=True)
-        self.causes = self._events.cause is not None
+class ArrayReader(TableReader):
+    """Reads ``.npz`` with four columns or one (N, 4) array, and ``.npy``, structured or (N, 4)."""
 
-    def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
-        """Return the columns of the file, and whether float times are seconds."""
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        path = Path(path)
         with numpy_errors(path):
-            if self.path.suffix.lower() == ".npy":
-                table = read_npy(path)
-                named = _named(table.dtype.names or (), path)
-                columns = {k: table[name] for k, name in named.items()}
+            if path.suffix.lower() == ".npy":
+                arrays: dict[str, Any] = {"": read_npy(path)}
             else:
-                with NpzReader(path) as arrays:
-                    named = _named(arrays.names, path)
-                    columns = {k: arrays[name] for k, name in named.items()}
-                    if "height" in arrays and "width" in arrays:
-                        self.height, self.width = (_declared(arrays[k], k, path) for k in ("height", "width"))
-        return columns, not named["t"].endswith("_us")
-
-    def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        for i in range(0, len(self._events), size):
-            yield self._events.part(slice(i, i + size))
+                with NpzReader(path) as archive:
+                    wanted = [
+                        n for n in archive.names if slot_of(n) != "_" or n in _KNOWN or n in reading.named.values()
+                    ]
+                    whole = set("txyp") <= set(named_columns(wanted, reading))
+                    arrays = {name: archive[name] for name in (wanted if whole else archive.names)}
+            super().__init__(path, reading, [_table(arrays, str(path), reading)])
 
 
-class MatReader(ArrayReader):
-    """Reads ``.mat`` of version 7 or older with variables, or one struct, of such names. MATLAB's numbers are floats by
-    default: times are seconds where one of them has a fraction, else µs. y is as in the file."""
+_KNOWN = ("height", "width", "time_unit", "cause")
 
-    def _columns(self, path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bool]:
+
+def _table(arrays: Mapping[str, Any], where: str, reading: EventReading) -> Table:
+    """Return the table of arrays by their names. Raises AssetError: a column is missing, and no array has four."""
+    if "" in arrays and arrays[""].dtype.names:  # a structured .npy
+        table = arrays[""]
+        arrays = {name: table[name] for name in table.dtype.names}
+        if titles := [field[2] for field in table.dtype.fields.values() if len(field) > 2]:
+            arrays["time_unit"] = np.array(titles[0])
+    named = named_columns(arrays, reading)
+    sides = [_declared(arrays[side], side, where) for side in ("height", "width") if side in arrays]
+    unit = named_unit(f"[{arrays['time_unit']}]") if "time_unit" in arrays else None
+    known: dict[str, Any] = {"unit": unit, "size": (sides[0], sides[1]) if len(sides) == 2 else None}
+    rows = next((a for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 2 and a.shape[1] >= 4), None)
+    if missing := [slot for slot in "txyp" if slot not in named]:
+        if rows is not None and rows.dtype.kind in "iuf":
+            return table_of_rows(rows, where, reading, **known)
+        raise AssetError(
+            f"no column '{missing[0]}'",
+            where=where,
+            value=list(arrays) if any(arrays) else "a plain array",
+            accepted="x, y, t, p in the file, or --columns x=NAME,y=NAME,t=NAME,p=NAME",
+        )
+    columns = {slot: np.asarray(arrays[name]) for slot, name in named.items()}
+    if isinstance(arrays.get("cause"), np.ndarray):
+        columns["cause"] = arrays["cause"]
+    return table_of_columns(columns, where, heading=named["t"], **known)
+
+
+class MatReader(TableReader):
+    """Reads ``.mat`` of version 7 or older with variables, or one struct or array of structs, of such names. y is as in
+    the file."""
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         found = read_mat(path)
-        structs = [one for one in found.values() if isinstance(one, dict)]
-        arrays = structs[0] if len(structs) == 1 else found
-        named = _named(arrays, path)
-        columns = {k: np.asarray(arrays[name]) for k, name in named.items()}
-        t = columns["t"]
-        whole = t.dtype.kind != "f" or bool((np.floor(t) == t).all())
-        return columns, not whole and not named["t"].endswith("_us")
+        tables = [found, *(one for one in found.values() if isinstance(one, dict))]
+        whole = [table for table in tables if set("txyp") <= set(named_columns(table, reading))]
+        arrays = {name: one for name, one in (whole or tables[-1:])[0].items() if isinstance(one, np.ndarray)}
+        super().__init__(Path(path), reading, [_table(arrays, os.fspath(path), reading)])
 
 
-class ArrayWriter:
+class ArrayWriter(CheckedWriter):
     """Collects events and writes on close."""
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int):
-        self.path, self._size, self._chunks = Path(path), (height, width), []
-        self._count, self._last = 0, None
+    def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
+        super().__init__(path, height, width)
+        self._chunks: list[Events] = []
 
-    def append(self, events: Events) -> None:
-        self._last = check_events(
-            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
-        )
-        self._count += len(events)
+    def _write(self, events: Events) -> None:
         self._chunks.append(events.copy())
 
     def close(self, t_end_us: int | None = None) -> None:
@@ -161,30 +181,14 @@ class ArrayWriter:
         with output_errors(self.path), open(self.path, "wb") as file:
             if self.path.suffix == ".npz":
                 columns = {k: getattr(e, k) for k in e.columns}
-                np.savez_compressed(file, **columns, height=self._size[0], width=self._size[1])
+                if None not in self._size:
+                    columns |= {"height": self._size[0], "width": self._size[1]}
+                np.savez_compressed(file, **columns, time_unit="us")
             else:
                 table = np.empty(len(e), DTYPE if e.cause is None else [*DTYPE.descr, ("cause", "u1")])
                 for k in table.dtype.names:
                     table[k] = getattr(e, k)
                 np.save(file, table, allow_pickle=False)
-
-    def abort(self) -> None:
-        self._chunks = []
-
-
-def _named(names: Iterable[str], path) -> dict[str, str]:
-    """Return column -> its name in the file. Raises AssetError when one is missing."""
-    found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
-    if "cause" in names:
-        found["cause"] = "cause"
-    if missing := [k for k, name in found.items() if name is None]:
-        raise AssetError(
-            f"no column '{missing[0]}'",
-            where=str(path),
-            value=list(names) or "a plain array",
-            accepted="x, y, t, p in an .npz, a .mat or a structured .npy",
-        )
-    return found
 
 
 def _declared(value: np.ndarray, name: str, path) -> int:

@@ -18,7 +18,7 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-from blinkgl.errors import OutputError
+from blinkgl.errors import BlinkGLError, OutputError
 
 _serial = itertools.count()
 _PATTERN = re.compile(r"^\..+\.blinkgl-tmp-([0-9a-f]{12})-(\d+)-\d+(\..*)?$")
@@ -124,9 +124,17 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
             fsync(final.parent)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OutputError) and error.where == str(temporary):
-            raise OutputError(error.problem, where=str(final), accepted=error.accepted) from error
+        if (named := _named(error, temporary, final)) is not None:
+            raise named from error
         raise
+
+
+def _named(error: BaseException, temporary: Path, final: Path) -> BlinkGLError | None:
+    """Return an error that names the output, where it names the hidden one; None: it does not."""
+    if not isinstance(error, BlinkGLError) or str(temporary) not in (error.where or ""):
+        return None
+    where = (error.where or "").replace(str(temporary), str(final))
+    return type(error)(error.problem, where=where, value=error.value, accepted=error.accepted)
 
 
 @contextlib.contextmanager
@@ -156,9 +164,8 @@ def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
             fsync(final.parent)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        if isinstance(error, OutputError) and error.where and str(temporary) in error.where:
-            where = error.where.replace(str(temporary), str(final))
-            raise OutputError(error.problem, where=where, accepted=error.accepted) from error
+        if (named := _named(error, temporary, final)) is not None:
+            raise named from error
         raise
 
 

@@ -128,3 +128,40 @@ def nanoseconds(values: Sequence[str] | np.ndarray, unit: TimeUnit) -> list[int]
 def unit_of_file(path: Path) -> str | None:
     """Return the unit that a file's name states: ``times_us.txt``."""
     return named_unit(path.stem)
+
+
+_TYPICAL_DURATION_S, _TYPICAL_RATE_HZ = 3.0, 1e5
+"""Of recordings: the middle, as ratios, of what people have."""
+
+
+def guessed_event_unit(values: np.ndarray, count: int, span: tuple[float, float] | None = None) -> TimeUnit:
+    """Return the unit in which the times of a whole file of events make sense together.
+
+    values : (N,) times, or a sample of them.   count : events of the file.   span : its first and last time (None:
+    those of ``values``).
+
+    A unit is likely where it makes the recording some seconds long and its rate some 100,000 events/s. Whole numbers
+    are µs, or ns where all are whole µs; fractions are of seconds, or of ms where three places are used: cameras count
+    µs. Times of this century's clock betray their unit.
+    """
+    values = np.asarray(values, np.float64)
+    first, last = (float(v) for v in span or ((values.min(), values.max()) if len(values) else (0.0, 0.0)))
+    whole, thousands = not (values % 1).any(), not (values % 1000).any()
+    if whole:
+        likely = {"us": -3.0, "ns": -4.0 if thousands and values.any() else 0.0}
+    else:
+        likely = {"s": -9.0 if _places(values) == 6 else -6.0, "ms": -3.0 if _places(values) == 3 else 0.0, "us": 0.0}
+    for unit in likely if last > first and count > 1 else ():
+        seconds = (last - first) * NANOSECONDS[unit] / 1e9
+        # Squared distances from the typical values, in spreads of 1.2 and 1.5 decades.
+        likely[unit] += (np.log10(seconds / _TYPICAL_DURATION_S) / 1.2) ** 2
+        likely[unit] += (np.log10(count / seconds / _TYPICAL_RATE_HZ) / 1.5) ** 2
+        if _EPOCH_S[0] <= first * NANOSECONDS[unit] / 1e9 <= _EPOCH_S[1]:
+            likely[unit] -= 40.0
+    return TimeUnit(min(likely, key=likely.__getitem__), "guessed", (first, last))
+
+
+def _places(values: np.ndarray) -> int | None:
+    """Return the decimal places that the values use, up to six; None: more."""
+    scaled = (values * 10.0**k for k in range(7))
+    return next((k for k, v in enumerate(scaled) if (np.abs(v - np.rint(v)) < 1e-4).all()), None)

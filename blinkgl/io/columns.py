@@ -7,14 +7,21 @@ file's first.
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.io.atomic import output_errors
 from blinkgl.types.events import Cause, Events
 
-MAX_SIDE = 65536
+MAX_SIDE, MAX_PIXELS = 65536, 1 << 25
 _MAX_TIME = 1 << 62
 """µs; sums and differences of two such times still fit int64."""
 
@@ -30,39 +37,59 @@ def events_of(
     cause: np.ndarray | None = None,
     offset: int = 0,
     signed: bool = False,
+    polarity: tuple[float, float] | None = None,
 ) -> Events:
     """Return columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
 
-    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. cause : 0 to 3, see
-    :class:`~blinkgl.types.events.Cause`, where the file has them. first : index of the first of these events in the
-    file.
+    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0; or the two numbers of ``polarity``, OFF and ON.
+    cause : 0 to 3, see :class:`~blinkgl.types.events.Cause`, where the file has them. first : index of the first of
+    these events in the file.
     Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between
     pixels, NaN, times beyond int64, another polarity. AssetError: a column that is not a 1-D array of numbers, or
     columns of different lengths."""
     columns = {"x": np.asarray(x), "y": np.asarray(y), "t": np.asarray(t), "p": np.asarray(p)}
+    if polarity is not None:
+        columns["p"], signed = on_or_off(columns["p"], polarity, where, first), False
     if cause is not None:
         columns["cause"] = np.asarray(cause)
     if any(c.ndim != 1 for c in columns.values()) or len({len(c) for c in columns.values()}) != 1:
         raise AssetError("event columns differ in length", where=where, value={k: c.shape for k, c in columns.items()})
-    x = _whole(columns["x"], "x", np.uint16, 0, MAX_SIDE - 1, where, first)
-    y = _whole(columns["y"], "y", np.uint16, 0, MAX_SIDE - 1, where, first)
-    t = _whole(columns["t"], "t", np.int64, -_MAX_TIME - min(offset, 0), _MAX_TIME - max(offset, 0), where, first)
-    p = _whole(columns["p"], "p", np.int8, -1 if signed else 0, 1, where, first)
+    x = whole(columns["x"], "x", np.uint16, 0, MAX_SIDE - 1, where, first)
+    y = whole(columns["y"], "y", np.uint16, 0, MAX_SIDE - 1, where, first)
+    t = whole(columns["t"], "t", np.int64, -_MAX_TIME - min(offset, 0), _MAX_TIME - max(offset, 0), where, first)
+    accepted = "0 or 1, -1 or 1; or --polarity OFF/ON" if signed else None
+    p = whole(columns["p"], "p", np.int8, -1 if signed else 0, 1, where, first, accepted)
     if cause is not None:
-        cause = _whole(columns["cause"], "cause", np.uint8, 0, max(Cause), where, first)
+        cause = whole(columns["cause"], "cause", np.uint8, 0, max(Cause), where, first)
     return Events(x, y, t + offset if offset else t, (p > 0).view(np.uint8) if signed else p.view(np.uint8), cause)
 
 
-def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
-    """Return int64 µs, rounded, of float seconds. Raises EventDataError, naming the event, for NaN, infinity and what
-    int64 cannot hold."""
-    t = np.rint(np.asarray(seconds, np.float64) * 1e6)
-    if len(t) and not (np.abs(t) < _MAX_TIME).all():  # NaN compares False
-        i = int(np.argmin(np.abs(t) < _MAX_TIME))
+def microseconds(times: np.ndarray, where: str, first: int = 0, unit_ns: int = 10**9) -> np.ndarray:
+    """Return int64 µs, rounded, of times in units of ``unit_ns`` (1e9: s, 1000: µs). Raises EventDataError, naming the
+    event, for NaN, infinity and what int64 cannot hold; AssetError: no numbers."""
+    times = np.asarray(times)
+    if times.dtype.kind not in "iufb":
+        raise AssetError("event column 't' holds no numbers", where=where, value=str(times.dtype))
+    scale = unit_ns / 1000
+    rounded = np.rint(times.astype(np.float64, copy=False) * scale)
+    if len(times) and not (good := np.abs(rounded) < _MAX_TIME).all():  # NaN compares False
+        i = int(np.argmin(good))
         raise EventDataError(
-            f"time of event {first + i}", where=where, value=float(seconds[i]), accepted="seconds that fit int64 µs"
+            f"time of event {first + i}", where=where, value=times[i].item(), accepted="times that fit int64 µs"
         )
-    return t.astype(np.int64)
+    if times.dtype.kind == "f":
+        return rounded.astype(np.int64)
+    whole = times.astype(np.int64)  # exact: a float64 holds 53 bits only
+    return whole * int(scale) if scale >= 1 else (whole + 500) // 1000
+
+
+def on_or_off(p: np.ndarray, pair: tuple[float, float], where: str, first: int = 0) -> np.ndarray:
+    """Return uint8 1 where ``p`` is the second of the pair (ON), 0 where it is the first. Raises EventDataError, naming
+    event and value."""
+    on = p == pair[1]
+    if not (good := on | (p == pair[0])).all():
+        _refuse(p, good, "polarity", f"{pair[0]:g} or {pair[1]:g} (--polarity)", where, first)
+    return on.view(np.uint8)
 
 
 def check_events(
@@ -108,26 +135,99 @@ def check_events(
     return int(t[-1])
 
 
-def refuse_causes(events: Events, kind: str, where: str) -> None:
-    """Raise OutputError for events with causes, for a format that cannot store them."""
-    if events.cause is not None:
-        raise OutputError(
-            f"{kind} cannot hold the causes of events",
-            where=where,
-            accepted=".h5, .npz or .npy, or events without causes",
-        )
+def joined(pieces: Iterable[Events], least: int) -> Iterator[Events]:
+    """Yield events in pieces of ``least`` or more. What precedes an error is yielded before it is raised."""
+    pending, count = [], 0
+    try:
+        for events in pieces:
+            pending.append(events)
+            count += len(events)
+            if count >= least:
+                yield Events.concatenate(pending)
+                pending, count = [], 0
+    except AssetError:
+        yield Events.concatenate(pending)
+        raise
+    if pending:
+        yield Events.concatenate(pending)
+
+
+class CheckedWriter:
+    """Base of writers of event files: checks what it is given, counts, and closes ``_file``. A subclass has
+    :meth:`_write`.
+
+    height, width : px, None: not known.   limits : times that the format holds, [least, most) µs, and what they are.
+    kind : name of a format that cannot store the causes of events; "": it can."""
+
+    kind = ""
+    limits: tuple[int, int, str] | None = None
+
+    def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
+        self.path, self._size, self._count, self._last = Path(path), (height, width), 0, None
+        self._file: Any = None
+        self.t_end_us: int | None = None
+
+    def append(self, events: Events) -> None:
+        """Add events. Raises OutputError: causes, which the format cannot store, or the disk refuses; EventDataError as
+        :func:`check_events`, and times that the format cannot hold."""
+        where, (height, width) = str(self.path), self._size
+        if self.kind and events.cause is not None:
+            raise OutputError(
+                f"{self.kind} cannot hold the causes of events",
+                where=where,
+                accepted=".h5, .npz or .npy, or events without causes",
+            )
+        if not len(events):
+            return
+        if self.limits is not None:
+            least, most, problem = self.limits
+            if events.t[0] < least or events.t[-1] >= most:
+                value = int(events.t[0] if events.t[0] < least else events.t[-1])
+                raise EventDataError(problem, where=where, value=value, accepted=f"{least} to less than {most} µs")
+        self._last = check_events(events, where, self._count, height=height, width=width, after=self._last)
+        with output_errors(self.path):
+            self._write(events)
+        self._count += len(events)
+
+    def _write(self, events: Events) -> None:
+        raise NotImplementedError
+
+    def close(self, t_end_us: int | None = None) -> None:
+        """Finish the file."""
+        with output_errors(self.path):
+            self._file.close()
+
+    def abort(self) -> None:
+        """Stop without finishing; never raises."""
+        with contextlib.suppress(Exception):
+            self._file.close()
 
 
 def check_size(height: int | None, width: int | None, where: str) -> None:
-    """Raise AssetError when a sensor's declared size (None: not declared) is impossible."""
-    if not all(n is None or 0 < n <= MAX_SIDE for n in (height, width)):
+    """Raise AssetError when a sensor's declared size (None: not declared) is impossible, before anything of that size
+    is made."""
+    sides = [side for side in (height, width) if side is not None]
+    if not all(0 < side <= MAX_SIDE for side in sides) or (len(sides) == 2 and sides[0] * sides[1] > MAX_PIXELS):
         raise AssetError(
-            "impossible sensor size", where=where, value=f"{width}x{height}", accepted=f"1 to {MAX_SIDE} px a side"
+            "impossible sensor size",
+            where=where,
+            value=f"{width}x{height}",
+            accepted=f"1 to {MAX_SIDE} px a side and at most {MAX_PIXELS} px: --size WIDTHxHEIGHT",
         )
 
 
-def _whole(column: np.ndarray, name: str, dtype, low: int, high: int, where: str, first: int) -> np.ndarray:
-    """Return ``column`` as ``dtype``, every value unchanged."""
+def whole(
+    column: np.ndarray,
+    name: str,
+    dtype: DTypeLike,
+    low: int,
+    high: int,
+    where: str,
+    first: int,
+    accepted: str | None = None,
+) -> np.ndarray:
+    """Return numbers of events as ``dtype``, every value unchanged. Raises EventDataError, naming event and value:
+    outside ``low`` … ``high``, NaN, or between two integers; AssetError: no numbers."""
     if column.dtype.kind not in "iufb":
         raise AssetError(
             f"event column '{name}' holds no numbers",
@@ -139,7 +239,7 @@ def _whole(column: np.ndarray, name: str, dtype, low: int, high: int, where: str
     fits = column.dtype.kind == "b" or (limits is not None and limits.min >= low and limits.max <= high)
     if not fits and len(column) and not (column.min() >= low and column.max() <= high):  # NaN compares False
         good = (column >= low) & (column <= high)
-        _refuse(column, good, name, f"{low} to {high}", where, first)
+        _refuse(column, good, name, accepted or f"{low} to {high}", where, first)
     out = column.astype(dtype, copy=False)
     if column.dtype.kind == "f" and not (good := out == column).all():
         _refuse(column, good, name, "whole numbers", where, first)

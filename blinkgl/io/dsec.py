@@ -24,6 +24,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import MAX_SIDE, check_events, check_size, events_of
 from blinkgl.io.hdf5 import attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
 
 BLOCK = 1 << 17
@@ -46,8 +47,8 @@ class DsecEventWriter:
     Parameters
     ----------
     path : file to create (overwritten).
-    height, width : sensor size in px; events outside are refused. Also stored as root attributes, which DSEC's
-        own readers ignore.
+    height, width : sensor size in px, None: not known; events outside are refused. Also stored as root attributes,
+        which DSEC's own readers ignore.
     t_offset_us : image-clock time of relative time 0. Events before it, or 2^32 µs (71.6 minutes) or more after it, are
         refused: the format's u4 cannot hold them.
     codec : "zstd", as the published files, "lz4" or "gzip".
@@ -56,20 +57,20 @@ class DsecEventWriter:
     def __init__(
         self,
         path: str | os.PathLike,
-        height: int,
-        width: int,
+        height: int | None,
+        width: int | None,
         t_offset_us: int = 0,
         *,
         codec: str = "zstd",
     ):
-        if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
+        if not all(side is None or 0 < side <= MAX_SIDE for side in (height, width)):
             raise EventDataError(
                 "sensor size does not fit uint16 coordinates",
                 where=str(path),
                 value=(height, width),
                 accepted=f"1 to {MAX_SIDE} px a side",
             )
-        self.path, self.height, self.width, self.t_offset_us = Path(path), int(height), int(width), int(t_offset_us)
+        self.path, self.height, self.width, self.t_offset_us = Path(path), height, width, int(t_offset_us)
         self.count = 0
         self.t_end_us: int | None = None  # may be set any time before close
         self._last_t = self.t_offset_us
@@ -91,7 +92,8 @@ class DsecEventWriter:
             self._ms_to_idx = growing_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
             # Compression runs beside the simulation; a full queue makes append wait.
-            self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
+            if height is not None and width is not None:
+                self._file.attrs["height"], self._file.attrs["width"] = int(height), int(width)
         self._queue: queue.Queue = queue.Queue(maxsize=4)
         self._thread = threading.Thread(target=self._run, name="dsec-writer", daemon=True)
         self._thread.start()
@@ -252,7 +254,7 @@ class DsecEventReader:
     AssetError : not a readable HDF5 file (truncated, wrong type) or without the DSEC datasets.
     """
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
@@ -262,10 +264,6 @@ class DsecEventReader:
                 if not isinstance(self._file.get(k), h5py.Dataset)
             ]
             if missing:
-                if "CD/events" in self._file:
-                    raise AssetError(
-                        "Prophesee's HDF5 files are not read", where=str(path), accepted="the camera's .raw"
-                    )
                 raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
             self._columns = {
                 k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"

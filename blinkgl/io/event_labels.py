@@ -15,10 +15,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import whole
 from blinkgl.io.hdf5 import dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
-from blinkgl.types.events import TOLD, TRUTH, Events
+from blinkgl.types.events import TOLD, TRUTH, Cause, Events
 
 EVENT_LABELS = "event_labels.h5"
 BLOCK = 1 << 17
@@ -120,13 +121,26 @@ class EventLabelsReader:
 
     def read(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
         """Return, for events ``start`` to ``stop`` (None: the last), (N,) of :data:`~blinkgl.types.events.TRUTH`, and
-        their causes (N,) uint8, None where the file has none. Raises AssetError: damaged."""
+        their causes (N,) uint8, None where the file has none. Raises AssetError: damaged; EventDataError, naming the
+        event: a value that these types cannot hold."""
         rows = slice(*slice(start, stop).indices(self.count)[:2])
         with hdf5_errors(self.path):
-            truth = np.empty(max(rows.stop - rows.start, 0), TRUTH)
-            for name in TOLD:
-                truth[name] = self._columns[name][rows]
-            return truth, self._columns["cause"][rows].astype(np.uint8) if self.causes else None
+            read = {name: column[rows] for name, column in self._columns.items()}
+        truth = np.empty(max(rows.stop - rows.start, 0), TRUTH)
+        where = str(self.path)
+        truth["instance"] = whole(read["instance"], "instance", np.uint16, 0, 65535, where, rows.start)
+        for name in ("depth", "velocity"):
+            with np.errstate(over="ignore"):
+                truth[name] = read[name]
+            # A depth may be infinite (nothing); what only float32 makes infinite may not.
+            lost = np.isnan(truth[name]) | (np.isinf(truth[name]) & (np.isfinite(read[name]) | (name == "velocity")))
+            if lost.any():
+                i = int(np.argwhere(lost)[0][0])
+                raise EventDataError(
+                    f"{name} of event {rows.start + i}", where=where, value=read[name][i].tolist(), accepted="float32"
+                )
+        cause = whole(read["cause"], "cause", np.uint8, 0, max(Cause), where, rows.start) if self.causes else None
+        return truth, cause
 
 
 def with_truth(events: Events, first: int, path: str | os.PathLike) -> Events:

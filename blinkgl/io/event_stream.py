@@ -1,7 +1,7 @@
 """Event Stream (.es) by Marcireau, version 2, of a DVS: one byte of time and polarity, then x and y, 16 bits each.
 
 The byte is (time since the event before, µs) << 1 | polarity; 0xff: 127 µs pass without an event, 0xfe: padding.
-(neuromorphic-paris/event_stream, the format's page.) y is as the file has it."""
+(neuromorphic-paris/event_stream, the format's page.) y counts from the bottom."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.columns import check_size
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -23,7 +23,9 @@ _DVS = 1
 class EventStreamReader:
     """Size and events of an .es file. Raises AssetError: not version 2, not of a DVS, truncated."""
 
-    def __init__(self, path: str | os.PathLike):
+    origin = "bottom"
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path = Path(path)
         with open(path, "rb") as file:
             header = file.read(_HEADER)
@@ -37,7 +39,6 @@ class EventStreamReader:
                 accepted="version 2, type 1 (DVS)",
             )
         self.width, self.height = (int.from_bytes(header[i : i + 2], "little") for i in (16, 18))
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events, decoded from ``size`` bytes at a time."""

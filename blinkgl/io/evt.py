@@ -3,8 +3,9 @@
 EVT2: type in bits 31..28 (0 OFF, 1 ON, 8 TIME_HIGH = t >> 6); t low 27..22, x 21..11, y 10..0.
 EVT2.1: upper half as a word of EVT2, lower half a mask: bit k is an event at x + k. Sensors whose header says
 "endianness=legacy" (IMX636) send the upper half first, each half little-endian.
-EVT3: type in bits 15..12: 0 ADDR_Y, 2 ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t &
-0xfff), 8 TIME_HIGH (t >> 12 & 0xfff): 24 bits of µs, wrapping every 16.8 s.
+EVT3: type in bits 15..12: 0 ADDR_Y, 1 ADDR_Y of events that are no contrast changes (left out until the next ADDR_Y), 2
+ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t & 0xfff), 8 TIME_HIGH (t >> 12 & 0xfff): 24
+bits of µs, wrapping every 16.8 s.
 (Prophesee, "EVT 2.0 / 2.1 / 3.0 format" pages.)
 
 Like other encoders of a ready event list we write EVT3's single events only, no vectors; the reader knows both.
@@ -12,6 +13,7 @@ Like other encoders of a ready event list we write EVT3's single events only, no
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 from collections.abc import Iterator
@@ -21,7 +23,8 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.io.columns import CheckedWriter
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -32,77 +35,53 @@ _MAX_TIME = 1 << 34
 """µs, 4.8 hours: the longest time that is filled with TIME_HIGH words."""
 
 
-class EvtWriter:
+class EvtWriter(CheckedWriter):
     """Streams events into an EVT3 file with a header that names format and geometry.
 
     Raises EventDataError for times outside [0, 2^34) µs or out of order, and coordinates
     outside the sensor or the format's 11 bits.
     """
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int):
-        if height > _MAX_SIDE or width > _MAX_SIDE:
+    kind, limits = "EVT3", (0, _MAX_TIME, "EVT3 times count from the recording's start; --zero-time shifts them")
+
+    def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
+        if max(height or 0, width or 0) > _MAX_SIDE:
             raise EventDataError(
                 "EVT3 has 11-bit coordinates",
                 where=str(path),
                 value=(height, width),
                 accepted="at most 2048 px a side",
             )
-        self.path, self.height, self.width = Path(path), height, width
+        super().__init__(path, height, width)
         # time written so far, and the row; -1: none yet
         self._state = np.array([0, -1], np.int64)
-        self._count = 0
-        header = (
-            f"% evt 3.0\n% format EVT3;height={height};width={width}\n"
-            f"% geometry {width}x{height}\n% integrator_name BlinkGL\n% end\n"
-        )
+        known = height is not None and width is not None
+        size, geometry = (f";height={height};width={width}", f"% geometry {width}x{height}\n") if known else ("", "")
+        header = f"% evt 3.0\n% format EVT3{size}\n{geometry}% integrator_name BlinkGL\n% end\n"
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
             self._file.write(header.encode())
 
-    def append(self, events: Events) -> None:
-        refuse_causes(events, "EVT3", str(self.path))
-        if not len(events):
-            return
-        t = events.t
-        if t[0] < 0 or t[-1] >= _MAX_TIME:
-            raise EventDataError(
-                "EVT3 times count from the recording's start",
-                where=str(self.path),
-                value=int(t[0] if t[0] < 0 else t[-1]),
-                accepted="0 to less than 2^34 µs; use --zero-time to shift",
-            )
-        check_events(
-            events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0])
-        )
+    def _write(self, events: Events) -> None:
         # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us passed.
+        t = events.t
         words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
         n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
-        self._count += len(t)
-        with output_errors(self.path):
-            self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
-
-    def close(self, t_end_us: int | None = None) -> None:
-        with output_errors(self.path):
-            self._file.close()
-
-    def abort(self) -> None:
-        try:
-            self._file.close()
-        except OSError:
-            pass
+        self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
 
 
 class EvtReader:
     """Header and events of an EVT2/EVT2.1/EVT3 file. ``height`` and ``width`` are None when the header does not give
     them.
 
-    As the format requires, events before the first TIME_HIGH have no time and are left out, and triggers and vendors'
-    words are skipped.
+    Events before the first TIME_HIGH have no time: they are left out, and ``notes`` counts them. Triggers and vendors'
+    words are skipped. With ``damaged="keep"`` words that the format does not have are skipped, too, and counted.
     Raises AssetError: no ``% evt`` header, another version, an impossible size, stray bytes at the end (truncated), a
     word that the format does not have (with its byte), events but no TIME_HIGH."""
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path, self._keep, self.notes = Path(path), reading.keep, []
+        self._mend = reading.keep or reading.sort
         header, self._start = _read_header(self.path)
         # Either line of the header names the version.
         version = re.search(r"^% evt (\d+\.?\d*)", header, re.M) or re.search(r"^% format EVT(\d+)", header, re.M)
@@ -116,54 +95,93 @@ class EvtReader:
         sizes = {k: re.search(rf"{k}=(\d{{1,9}})\b", header) for k in ("height", "width")}
         self.height = int(geometry.group(2)) if geometry else int(sizes["height"].group(1)) if sizes["height"] else None
         self.width = int(geometry.group(1)) if geometry else int(sizes["width"].group(1)) if sizes["width"] else None
-        check_size(self.height, self.width, str(path))
 
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``words`` words at a time."""
-        dtype = _WORD[self.version]
-        # EVT2: time high, wraps.  EVT3: time high, y, low, vector base x, polarity, wraps.  -1: no time yet.  Last:
-        # events without a time.
-        state = np.array([-1, 0, 0, 0, 0, 0, 0] if self.version == "evt3" else [-1, 0, 0], np.int64)
-        position = self._start
-        # Words decode to at most so many events: a vector of EVT3 holds twelve.
-        most = {"evt2": 1, "evt21": 32, "evt3": 12}[self.version]
+        dtype, state = _WORD[self.version], START[self.version].copy()
+        position, lost, stray = self._start, 0, 0
+        buffers = room(self.version, words)  # one for all pieces: fresh memory costs as much as decoding
         with open(self.path, "rb") as file:
             file.seek(self._start)
-            # A file that ends within a word is truncated, which is said after its whole words.
-            while data := file.read(words * dtype.itemsize):
-                whole = len(data) // dtype.itemsize * dtype.itemsize
-                raw = np.frombuffer(data[:whole], dtype)
-                x, y, p = (
-                    np.empty(most * len(raw), np.uint16),
-                    np.empty(most * len(raw), np.uint16),
-                    np.empty(most * len(raw), np.uint8),
-                )
-                t = np.empty(most * len(raw), np.int64)
-                n, bad = self._decode(raw, state, x, y, t, p)
+            while not stray and (data := file.read(words * dtype.itemsize)):
+                # A file that ends within a word is truncated, which is said after its whole words.
+                stray = len(data) % dtype.itemsize
+                raw = np.frombuffer(data[: len(data) - stray], dtype)
+                events, bad = self._decode(raw, state, buffers)
+                while bad >= 0 and self._keep:
+                    raw, lost, position = raw[bad + 1 :], lost + 1, position + (bad + 1) * dtype.itemsize
+                    more, bad = self._decode(raw, state, buffers)
+                    events = Events.concatenate([events, more])
                 if bad >= 0:
                     raise AssetError(
                         f"damaged at byte {position + bad * dtype.itemsize}: no valid {self.version.upper()} word",
                         where=str(self.path),
                         value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}",
                     )
-                position += whole
-                if n:
-                    yield Events(x[:n].copy(), y[:n].copy(), t[:n].copy(), p[:n].copy())
-                if whole < len(data):
-                    raise AssetError(
-                        f"truncated: {len(data) - whole} stray bytes after the last {self.version.upper()} word",
-                        where=str(self.path),
-                    )
+                position += len(raw) * dtype.itemsize
+                if len(events):
+                    yield events
+        said = [f"left out: words that {self.version.upper()} does not have: {lost:,}" if lost else ""]
+        if self.version == "evt3" and state[-2]:
+            said.append(f"4096 µs counted for each of {state[-2]:,} TIME_HIGH words that are missing")
+        if state[-1]:
+            said.append(f"left out: events before the first TIME_HIGH, which have no time: {state[-1]:,}")
+        self.notes = [line for line in said if line]
+        if stray:
+            raise AssetError(
+                f"truncated: {stray} stray bytes after the last {self.version.upper()} word", where=str(self.path)
+            )
         if state[0] < 0 and state[-1]:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
-    def _decode(self, raw, state, x, y, t, p) -> tuple[int, int]:
-        if self.version == "evt3":
-            return _decode_evt3(raw, state, x, y, t, p)
-        if self.version == "evt2":
-            return _decode_evt2(raw, np.ones(len(raw), np.uint32), state, x, y, t, p)
-        upper, lower = (raw.view("<u4")[half::2].copy() for half in ((0, 1) if self._upper_first else (1, 0)))
-        return _decode_evt2(upper, lower, state, x, y, t, p)
+    def _decode(self, words: np.ndarray, state: np.ndarray, buffers: list[np.ndarray]) -> tuple[Events, int]:
+        upper_first, mend = self._upper_first, self._mend
+        return decode(self.version, words, state, upper_first=upper_first, mend=mend, buffers=buffers)
+
+
+START = {
+    "evt2": np.array([-1, 0, 0], np.int64),
+    "evt21": np.array([-1, 0, 0], np.int64),
+    "evt3": np.array([-1, 0, 0, 0, 0, 0, 0, 0], np.int64),
+}
+"""State of :func:`decode` before the first word. EVT2: time high (-1: none yet), wraps, events without a time. EVT3:
+time high, y, low, vector base x, polarity, wraps, TIME_HIGH words that were missing, events without a time."""
+_MOST = {"evt2": 1, "evt21": 32, "evt3": 12}
+"""Events of a word: a vector of EVT3 holds twelve."""
+
+
+def room(version: str, words: int) -> list[np.ndarray]:
+    """Return arrays for x, y, t and p of all events that so many words may hold."""
+    return [np.empty(_MOST[version] * words, kind) for kind in (np.uint16, np.uint16, np.int64, np.uint8)]
+
+
+@functools.lru_cache(maxsize=2)
+def _single(words: int) -> np.ndarray:
+    """Return masks of one event a word."""
+    return np.ones(words, np.uint32)
+
+
+def decode(
+    version: str,
+    words: np.ndarray,
+    state: np.ndarray,
+    *,
+    upper_first: bool = False,
+    mend: bool = False,
+    buffers: list[np.ndarray] | None = None,
+) -> tuple[Events, int]:
+    """Return the events of words, and the index of the first word that the format does not have (-1: none). state : of
+    :data:`START`, kept up to date.   upper_first : order of the halves of EVT2.1.   mend : count a missing TIME_HIGH
+    where EVT3's low bits begin again.   buffers : of :func:`room`, for as many words or more."""
+    columns = buffers or room(version, len(words))
+    if version == "evt3":
+        n, bad = _decode_evt3(words, state, *columns, mend)
+    elif version == "evt2":
+        n, bad = _decode_evt2(words, _single(len(words)), state, *columns)
+    else:
+        upper, lower = (words.view("<u4")[half::2].copy() for half in ((0, 1) if upper_first else (1, 0)))
+        n, bad = _decode_evt2(upper, lower, state, *columns)
+    return Events(*(column[:n].copy() for column in columns)), bad
 
 
 def _read_header(path: Path) -> tuple[str, int]:
@@ -265,17 +283,21 @@ def _encode_evt3(x, y, t, p, state, first, words):
 
 
 @kernel
-def _decode_evt3(words, state, x, y, t, p):
+def _decode_evt3(words, state, x, y, t, p, mend):
     """Decode words; return (events, index of the first word of an unknown type, or whose vector exceeds the 11 bits of
-    x; -1: none)."""
+    x; -1: none).
+
+    mend : count a missing TIME_HIGH where the low bits begin again."""
     n, bad = 0, -1
-    high, row, low, base, polarity, wraps, untimed = state
+    high, row, low, base, polarity, wraps, mended, untimed = state
     for i in range(len(words)):
         word = np.int64(words[i])
         kind = word >> 12
-        if kind == 0:
-            row = word & 0x7FF
+        if kind <= 1:
+            row = word & 0x7FF if kind == 0 else -1
         elif kind == 2:
+            if row < 0:
+                continue
             # Before the first TIME_HIGH the time is unknown.
             if high < 0:
                 untimed += 1
@@ -289,7 +311,7 @@ def _decode_evt3(words, state, x, y, t, p):
             width = 12 if kind == 4 else 8
             # Bit k of a vector is the pixel base + k; the base then moves on by the vector's width.
             for k in range(width):
-                if (word >> k) & 1:
+                if (word >> k) & 1 and row >= 0:
                     if base + k > 0x7FF:
                         bad = i
                         break
@@ -303,23 +325,23 @@ def _decode_evt3(words, state, x, y, t, p):
             if bad >= 0:
                 break
         elif kind == 6:
+            # The low bits began again without a new TIME_HIGH, which some writers and lost words leave out.
+            if mend and low - (word & 0xFFF) > 1 << 11:
+                wraps, high, mended = wraps + (high == 0xFFF), (high + 1) & 0xFFF, mended + 1
             low = word & 0xFFF
         elif kind == 8:
             new = word & 0xFFF
-            # The 12-bit counter fell by more than half of its range: it has wrapped.
-            if high - new > 1 << 11:
+            # The 12-bit counter fell by half of its range or more: it has wrapped.
+            if high - new >= 1 << 11:
                 wraps += 1
+            # A new TIME_HIGH begins its 4096 µs: the low bits of before belong to the block that has ended, and
+            # TIME_LOW follows only with the next event that needs one. A repeated word changes nothing. (OpenEB)
+            if new != max(high, 0):
+                low = 0
             high = new
         elif kind != 7 and kind != 10 and kind < 14:  # 7, 15 continued, 10 external trigger, 14 others
             bad = i
             break
-    state[0], state[1], state[2], state[3], state[4], state[5], state[6] = (
-        high,
-        row,
-        low,
-        base,
-        polarity,
-        wraps,
-        untimed,
-    )
+    state[0], state[1], state[2], state[3] = high, row, low, base
+    state[4], state[5], state[6], state[7] = polarity, wraps, mended, untimed
     return n, bad

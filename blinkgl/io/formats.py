@@ -15,9 +15,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from blinkgl.errors import AssetError, OutputError
+from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.io.atomic import atomic_file
-from blinkgl.io.columns import CameraFrame, ImuSamples, check_events, check_size
+from blinkgl.io.columns import CameraFrame, ImuSamples, check_events, check_size, on_or_off
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
 
 
@@ -26,26 +27,27 @@ class EventFormat:
     """One event format.
 
     endings : of its files.   module : of ``blinkgl.io``, imported when a file of it is opened or written.
-    reader : class made from a path.   writer : class made from (path, height, width) and ``fixed``; "": the format is
-    only read.   dataset : of an HDF5 file, which distinguishes files with one ending; "": the format of files without
-    the others'.
-    takes : options of :func:`event_writer` that the writer has.   causes : it can store the causes of events."""
+    reader : class made from (path, :class:`~blinkgl.io.reading.EventReading`).   writer : class made from (path,
+    height, width) and ``fixed``; "": the format is only read.   magic : first bytes of its files, which decide where
+    several formats share an ending.   takes : options of :func:`event_writer` that the writer has.   causes : it can
+    store the causes of events.   sized : it cannot be written without the sensor's size."""
 
     name: str
     endings: tuple[str, ...]
     module: str
     reader: str
     writer: str = ""
-    dataset: str = ""
+    magic: bytes = b""
     fixed: Mapping[str, Any] = field(default_factory=dict)
     takes: tuple[str, ...] = ()
     causes: bool = False
+    sized: bool = False
 
-    def open(self, path: Path) -> Any:
+    def open(self, path: Path, reading: EventReading) -> Any:
         """Return a reader of the file. Raises AssetError: not what the ending says."""
-        return getattr(import_module(f"blinkgl.io.{self.module}"), self.reader)(path)
+        return getattr(import_module(f"blinkgl.io.{self.module}"), self.reader)(path, reading)
 
-    def create(self, path: Path, height: int, width: int, options: Mapping[str, Any]) -> EventWriter:
+    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> EventWriter:
         """Return a writer of the file. options : those that it takes are used."""
         given = {name: options[name] for name in self.takes}
         return getattr(import_module(f"blinkgl.io.{self.module}"), self.writer)(
@@ -54,22 +56,26 @@ class EventFormat:
 
 
 HDF5 = (".h5", ".hdf5")
+_TEXT = {"module": "text", "reader": "TextReader", "writer": "TextWriter", "takes": ("write_unit",)}
 FORMATS = {
     one.name: one
     for one in (
         EventFormat("dsec", HDF5, "dsec", "DsecEventReader", "DsecEventWriter", takes=("t_offset_us",), causes=True),
-        EventFormat("mvsec", HDF5, "mvsec", "MvsecReader", dataset="davis/left/events"),
+        EventFormat("hdf5", HDF5, "hdf5_tables", "Hdf5TableReader"),
         EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter"),
-        EventFormat("aedat4", (".aedat4",), "aedat4", "Aedat4Reader"),
         EventFormat("aedat2", (".aedat",), "aedat2", "Aedat2Reader"),
         EventFormat(
-            "text", (".txt",), "text", "TextReader", "TextWriter", fixed={"separator": " "}, takes=("time_unit",)
+            "aedat4", (".aedat4", ".aedat"), "aedat4", "Aedat4Reader", "Aedat4Writer", b"#!AER-DAT4", sized=True
         ),
-        EventFormat(
-            "csv", (".csv",), "text", "TextReader", "TextWriter", fixed={"separator": ","}, takes=("time_unit",)
-        ),
+        EventFormat("text", (".txt",), fixed={"separator": " "}, **_TEXT),
+        EventFormat("csv", (".csv",), fixed={"separator": ","}, **_TEXT),
+        EventFormat("gzip", (".txt.gz", ".csv.gz"), "text", "TextReader"),
         EventFormat("es", (".es",), "event_stream", "EventStreamReader"),
+        EventFormat("dat", (".dat",), "fixed_records", "DatReader"),
+        EventFormat("nmnist", (".bin",), "fixed_records", "NMnistReader"),
         EventFormat("mat", (".mat",), "arrays", "MatReader"),
+        EventFormat("mat73", (".mat",), "hdf5_tables", "Hdf5TableReader", magic=b"MATLAB 7.3"),
+        EventFormat("rosbag", (".bag", ".mcap", ".db3"), "ros", "BagReader"),
         EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
         EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     )
@@ -84,6 +90,10 @@ WITH_CAUSES = tuple(name for name, one in FORMATS.items() if one.causes)
 """Formats that can store the causes of events; the others refuse events with causes."""
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files without a size."""
+_FOUND = ("moved", "late", "cut", "outside")
+"""Lines about what salvage found, which every pass over a file finds anew."""
+_OVERLAP_US = 10_000
+"""With ``damaged="keep"``, events that come up to so much too late are put in their place."""
 
 
 class EventWriter(Protocol):
@@ -101,32 +111,128 @@ class EventWriter(Protocol):
 class EventFile:
     """An event file opened for reading, in any format.
 
-    height, width : px, None when the file does not give them. t_offset_us : DSEC's, else 0 (already added to the
-    times)."""
+    height, width : px, None when neither the file nor the user gives them. t_offset_us : DSEC's, else 0 (already added
+    to the times). reading : what is declared. guessed_size : whether the size is a guess of :meth:`sized`."""
 
     path: Path
     format: str
     height: int | None
     width: int | None
     t_offset_us: int = 0
+    reading: EventReading = AS_FILE
+    guessed_size: bool = False
     _reader: Any = field(default=None, repr=False)
+    told: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
     def causes(self) -> bool:
         """Return whether its events have causes."""
         return getattr(self._reader, "causes", False)
 
+    @property
+    def fixed_unit(self) -> bool:
+        """Return whether the format itself counts µs."""
+        return not hasattr(self._reader, "unit")
+
+    @property
+    def notes(self) -> list[str]:
+        """Return a line for each thing that was guessed, with the option that overrules it, and, after reading, for
+        each that was left out or moved."""
+        unit = getattr(self._reader, "unit", None)
+        lines = [*getattr(self._reader, "notes", ()), unit.line if unit else None]
+        if self.guessed_size:
+            known = (self.height, self.width) in SENSORS
+            why = "the smallest sensor that holds all events" if known else "as far as events go, beyond known sensors"
+            lines.append(f"size taken as {self.width}x{self.height}, {why} (--size if that is wrong)")
+        if unread := getattr(self._reader, "unread", 0):
+            lines.append(f"left out: rows that are no events: {unread:,}")
+        return [line for line in (*lines, *self.told.values()) if line]
+
     def chunks(self) -> Iterator[Events]:
-        """Yield all events from the beginning, in pieces, in constant memory (npz, npy: all in memory).
+        """Yield all events from the beginning, in pieces, in constant memory (npz, npy, mat, and with ``sort``: all in
+        memory).
 
         Raises, naming event and value, EventDataError: decreasing times, an event outside height and width where those
-        are known, or that :class:`~blinkgl.types.events.Events` cannot hold; AssetError when the file is damaged."""
+        are known, or that :class:`~blinkgl.types.events.Events` cannot hold; AssetError when the file is damaged. With
+        ``damaged="keep"`` what is whole is yielded, and :attr:`notes` tells what is not."""
         last, count = None, 0
-        for events in self._reader.chunks():
-            last = check_events(events, str(self.path), count, height=self.height, width=self.width, after=last)
+        flipped = (self.reading.origin or getattr(self._reader, "origin", "top")) == "bottom"
+        if flipped and self.height is None:
+            raise ConfigError("y counts from the bottom of an unknown height", where=str(self.path), accepted="--size")
+        for events in self._salvaged() if self.reading.keep or self.reading.sort else self._declared():
+            try:
+                last = check_events(events, str(self.path), count, height=self.height, width=self.width, after=last)
+            except EventDataError as error:
+                raise _with_remedy(error) from None
             count += len(events)
+            if flipped:
+                events = replace(events, y=(self.height - 1 - events.y.astype(np.int32)).astype(np.uint16))
             if len(events):
                 yield events
+
+    def _declared(self) -> Iterator[Events]:
+        """Yield the reader's events; a polarity that is declared of a format with one of its own counts."""
+        pair = self.reading.polarity if self.fixed_unit else None
+        try:
+            for events in self._reader.chunks():
+                yield replace(events, p=on_or_off(events.p, pair, str(self.path))) if pair else events
+        except AssetError as error:
+            accepted = f"{error.accepted or 'a whole file'}; or --damaged keep"
+            raise AssetError(error.problem, where=error.where, value=error.value, accepted=accepted) from error
+
+    def _salvaged(self) -> Iterator[Events]:
+        """Yield what is whole, in order of time; count the rest."""
+        for kind in _FOUND:
+            self.told.pop(kind, None)
+        whole = self._inside(self._until_damage() if self.reading.keep else self._declared())
+        if self.reading.sort:
+            whole = iter([Events.concatenate(list(whole))])
+        held, latest, moved, most, late = Events.empty(), -(1 << 62), 0, 0, 0
+        for events in whole:
+            t = events.t
+            peak = np.maximum.accumulate(np.append(latest, t))[1:]  # the latest time so far, at each event
+            latest, behind = (int(peak[-1]) if len(t) else latest), peak - t
+            lost = (behind > _OVERLAP_US) & (not self.reading.sort)
+            late, moved = late + int(np.count_nonzero(lost)), moved + int(np.count_nonzero(behind[~lost]))
+            most = max(most, int(behind[~lost].max(initial=0)))
+            events = events.part(~lost) if lost.any() else events
+            held = Events.concatenate([held, events])
+            if (np.diff(held.t) < 0).any():
+                held = held.part(np.argsort(held.t, kind="stable"))
+            # What is still to come is not earlier than this.
+            ready, held = held.split(latest - (0 if self.reading.sort else _OVERLAP_US))
+            yield ready
+        yield held
+        if late:
+            self.told["late"] = (
+                f"left out: events more than {_OVERLAP_US // 1000} ms late: {late:,} (--sort keeps them)"
+            )
+        if moved:
+            self.told["moved"] = f"put in order: events that came late: {moved:,}, by up to {most:,} µs"
+
+    def _until_damage(self) -> Iterator[Events]:
+        count = 0
+        try:
+            for events in self._declared():
+                count += len(events)
+                yield events
+        except (AssetError, EventDataError) as error:
+            self.told["cut"] = f"kept: events before the damage: {count:,} ({error.problem})"
+
+    def _inside(self, whole: Iterable[Events]) -> Iterator[Events]:
+        outside, first = 0, ""
+        for events in whole:
+            good = np.ones(len(events), bool)
+            if self.reading.keep and self.height is not None and self.width is not None:
+                good = (events.x < self.width) & (events.y < self.height)
+            if not good.all():
+                i = int(np.argmin(good))
+                first = first or f"x {events.x[i]}, y {events.y[i]}"
+                outside += int(np.count_nonzero(~good))
+                events = events.part(good)
+            yield events
+        if outside:
+            self.told["outside"] = f"left out: events outside {self.width}x{self.height}: {outside:,} (first: {first})"
 
     def frames(self) -> Iterator[CameraFrame]:
         """Yield the camera's own frames, one in memory at a time. Raises AssetError: the format, or the recording, has
@@ -172,29 +278,66 @@ class EventFile:
             largest = np.maximum(largest, (int(events.y.max()), int(events.x.max())))
         fits = (s for s in SENSORS if s[0] > largest[0] and s[1] > largest[1])
         height, width = next(fits, tuple(int(v) + 1 for v in largest))
-        return replace(self, height=height, width=width)
+        check_size(height, width, str(self.path))
+        return replace(self, height=height, width=width, guessed_size=True)
 
 
-def open_events(path: str | os.PathLike) -> EventFile:
+def _with_remedy(error: EventDataError) -> EventDataError:
+    """Return a refusal of :func:`check_events` that names the options which help."""
+    remedy = "--sort, or --damaged keep" if "decrease" in error.problem else "a larger --size, or --damaged keep"
+    accepted = f"{error.accepted}; or {remedy}" if error.accepted else f"times that do not; or {remedy}"
+    return EventDataError(error.problem, where=error.where, value=error.value, accepted=accepted)
+
+
+def ending_of(path: Path) -> str:
+    """Return the ending that tells the format: ``.txt.gz`` of ``e.txt.gz``."""
+    return "".join(path.suffixes[-2:] if path.suffix.lower() == ".gz" else path.suffixes[-1:]).lower()
+
+
+def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> EventFile:
     """Open an event file; the content decides where the ending is ambiguous.
 
-    Raises AssetError: missing, unknown ending, or content that does not match the ending."""
+    reading : what the user declares. Raises AssetError: missing, unknown ending, or content that does not match the
+    ending."""
     path = Path(path)
-    kind = ENDINGS.get(path.suffix.lower())
-    if kind is None:
+    kind = _kind(path, reading)
+    reader = FORMATS[kind].open(path, reading)
+    kind = getattr(reader, "version", kind)  # a .raw file says whether it is EVT2, EVT2.1 or EVT3
+    height, width = reading.size or (reader.height, reader.width)
+    check_size(height, width, str(path))
+    file = EventFile(path, kind, height, width, getattr(reader, "t_offset_us", 0), reading, _reader=reader)
+    if reading.size and reader.height and (reader.height, reader.width) != reading.size:
+        file.told["size"] = f"the file says {reader.width}x{reader.height}; --size is used"
+    if file.fixed_unit and reading.time_unit not in (None, "us"):
+        file.told["unit"] = f"{kind} counts µs; --time-unit {reading.time_unit} is not used"
+    return file
+
+
+def _kind(path: Path, reading: EventReading) -> str:
+    """Return the format of a file. Raises AssetError."""
+    ending = ending_of(path)
+    found = [one for one in FORMATS.values() if ending in one.endings]
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        return "rosbag"
+    if not found:
         raise AssetError("unknown event file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
-    if path.suffix.lower() in HDF5:
-        kind = _held(path)
-    reader = FORMATS[kind].open(path)
-    kind = getattr(reader, "version", kind)  # a .raw file says whether it is EVT2, EVT2.1 or EVT3
-    return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
+    if ending in HDF5:
+        from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
+        from blinkgl.io.hdf5_tables import is_dsec
+
+        with open_hdf5(path) as file, hdf5_errors(path):
+            return "dsec" if is_dsec(file, reading) else "hdf5"
+    with open(path, "rb") as file:
+        begin = file.read(16)
+    marked = next((one for one in found if one.magic and begin.startswith(one.magic)), None)
+    return (marked or next((one for one in found if not one.magic), found[0])).name
 
 
 def output_format(path: str | os.PathLike) -> str:
     """Return the format for writing ``path``. Raises OutputError: no written format has its ending."""
-    kind = ENDINGS.get(Path(path).suffix.lower())
+    kind = ENDINGS.get(ending_of(Path(path)))
     if kind is None or not FORMATS[kind].writer:
         raise OutputError(
             "unknown event file ending" if kind is None else f"{kind} files are read only",
@@ -205,45 +348,43 @@ def output_format(path: str | os.PathLike) -> str:
     return kind
 
 
-def _held(path: Path) -> str:
-    """Return the name of the format that an HDF5 file holds, by its datasets."""
-    from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
-
-    with open_hdf5(path) as file, hdf5_errors(path):
-        return next((name for name, one in FORMATS.items() if one.dataset and one.dataset in file), "dsec")
-
-
-def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, time_unit: str) -> EventWriter:
+def _writer(
+    path: Path, kind: str, height: int | None, width: int | None, t_offset_us: int, write_unit: str
+) -> EventWriter:
     check_size(height, width, str(path))
-    if time_unit != "s" and "time_unit" not in FORMATS[kind].takes:
+    if write_unit != "s" and "write_unit" not in FORMATS[kind].takes:
         raise OutputError(
             f"{kind} has a fixed unit of time",
             where=str(path),
-            value=time_unit,
-            accepted="a unit with .txt and .csv only",
+            value=write_unit,
+            accepted="--write-unit with .txt and .csv only; --time-unit is the unit of what is read",
         )
-    return FORMATS[kind].create(path, height, width, {"t_offset_us": t_offset_us, "time_unit": time_unit})
+    if FORMATS[kind].sized and height is None:
+        raise OutputError(
+            f"{kind} stores the sensor's size, and the file does not give it", accepted="--size WIDTHxHEIGHT"
+        )
+    return FORMATS[kind].create(path, height, width, {"t_offset_us": t_offset_us, "write_unit": write_unit})
 
 
 @contextlib.contextmanager
 def event_writer(
     path: str | os.PathLike,
-    height: int,
-    width: int,
+    height: int | None,
+    width: int | None,
     *,
     t_offset_us: int = 0,
-    time_unit: str = "s",
+    write_unit: str = "s",
     overwrite: bool = True,
 ) -> Iterator[EventWriter]:
     """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the
     block ends without an exception, and not at all otherwise.
 
-    t_offset_us : DSEC only, the time of the recording's start. time_unit : text and CSV only, "s" or "us". Raises
-    OutputError, EventDataError.
+    height, width : px; None: not known, and not written. t_offset_us : DSEC only, the time of the recording's start.
+    write_unit : text and CSV only, "s" or "us". Raises OutputError, EventDataError.
     """
     kind = output_format(path)
     with atomic_file(path, overwrite=overwrite) as temporary:
-        writer = _writer(temporary, kind, height, width, t_offset_us, time_unit)
+        writer = _writer(temporary, kind, height, width, t_offset_us, write_unit)
         try:
             yield writer
             writer.close()
@@ -253,7 +394,7 @@ def event_writer(
 
 
 def write_events(
-    path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options: Any
+    path: str | os.PathLike, chunks: Events | Iterable[Events], height: int | None, width: int | None, **options: Any
 ) -> int:
     """Write events or an iterable of chunks; options as :func:`event_writer`. Return the number of events."""
     count = 0
@@ -273,25 +414,29 @@ def write_events(
 def convert(
     source: str | os.PathLike,
     target: str | os.PathLike,
+    reading: EventReading = AS_FILE,
     *,
-    size: tuple[int, int] | None = None,
     zero_time: bool = False,
-    time_unit: str = "s",
+    write_unit: str = "s",
     overwrite: bool = True,
 ) -> tuple[EventFile, int]:
-    """Copy events from one format to another, streaming.
+    """Copy events from one format to another, streaming. A size that neither the source nor the user gives is not
+    written.
 
-    size : (height, width) for sources without a size (default: guessed, see :meth:`EventFile.sized`).
-    time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for EVT3, which
-    counts from the start.
+    reading : what is declared of the source. write_unit : of text and CSV, "s" or "us". zero_time : shift times so that
+    the first event is at 0, for EVT3, which counts from the start.
     Causes of events are left out where the format cannot store them.
-    Returns the source with its size, and the number of events written.
+    Returns the source, and the number of events written.
     """
     kind = output_format(target)
-    with open_events(source) as file:
-        if size is not None:
-            file = replace(file, height=size[0], width=size[1])
-        file = file.sized()
+    with open_events(source, reading) as file:
+        if file.fixed_unit and reading.time_unit not in (None, "us"):
+            raise ConfigError(
+                f"{file.format} files count µs",
+                where="--time-unit",
+                value=reading.time_unit,
+                accepted="no --time-unit for them; --write-unit is the unit of text that is written",
+            )
         first = next((int(e.t[0]) for e in file.chunks()), 0)
         shift = first if zero_time else 0
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
@@ -305,7 +450,7 @@ def convert(
             file.height,
             file.width,
             t_offset_us=offset,
-            time_unit=time_unit,
+            write_unit=write_unit,
             overwrite=overwrite,
         )
     return file, count

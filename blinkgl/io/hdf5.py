@@ -32,6 +32,11 @@ CODECS = {"zstd": 5, "lz4": 1}
 _NAMES = {number: name.encode() for name, number in CODECS.items()}
 _BLOSC_VALUES = 4
 """Parameters that Blosc's filter reads without checking their number; with fewer it crashes."""
+_FILTERS = {1: "gzip", 2: "shuffle", 32000: "lzf", 32001: "Blosc", 32004: "LZ4", 32015: "zstd"}
+"""Filters that are run on files of strangers. Others that HDF5 or hdf5plugin know (szip, Fletcher32, SZ, ZFP …) end the
+process on a damaged chunk."""
+_ECF = 0x8ECF
+"""Prophesee's filter."""
 
 
 def open_hdf5(path: Path) -> h5py.File:
@@ -127,8 +132,24 @@ def dataset(
             value=f"{found.dtype} {found.shape}",
             accepted=f"{wanted} ({', '.join('N' if n is None else str(n) for n in shape)})",
         )
+    check_storage(found, name, path)
+    return found
+
+
+def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
+    """Check how a data set is stored before a value of it is read. Raises AssetError: a filter that is not run, values
+    that were never written, huge chunks, a filter without its parameters."""
     layout = found.id.get_create_plist()
-    for code, _, values, _ in (layout.get_filter(k) for k in range(layout.get_nfilters())):
+    for code, _, values, called in (layout.get_filter(k) for k in range(layout.get_nfilters())):
+        if code not in _FILTERS:
+            raise AssetError(
+                f"dataset '{name}' is packed by an HDF5 filter that is not run here",
+                where=str(path),
+                value=f"{code} {called.decode(errors='replace')}".strip(),
+                accepted="the camera's .raw"
+                if code == _ECF
+                else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
+            )
         if code == hdf5plugin.Blosc.filter_id and len(values) < _BLOSC_VALUES:
             raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks data that Blosc needs", where=str(path))
     if found.chunks is None:
@@ -144,11 +165,10 @@ def dataset(
         whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
     if not whole:
         raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
-    return found
 
 
-def attribute(file: h5py.File, name: str, path: Path) -> Any:
-    """Return the file's attribute ``name``, numbers or text; None where there is none.
+def attribute(file: h5py.HLObject, name: str, path: Path) -> Any:
+    """Return the attribute ``name`` of a file or an object in it, numbers or text; None where there is none.
 
     Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type
     that is taken for one ends the process."""

@@ -28,6 +28,7 @@ SHAPES: dict[str, tuple[tuple[int | None, ...], str]] = {
     "occluded": ((None, None, None), "iub"),
 }
 """Shape of each array (None any length), and NumPy kinds."""
+_LONGEST = 1 << 62
 
 
 def encode_intervals(t_ns: int, interval_ns: np.ndarray, arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -50,20 +51,29 @@ def intervals_in(path: str | os.PathLike) -> np.ndarray:
     """Return the intervals of the labels in a file, (K,) int64 ns. Raises AssetError."""
     path = Path(path)
     with open_hdf5(path) as file, hdf5_errors(path):
-        return dataset(file, "interval_ns", path, shape=(None,))[()].astype(np.int64)
+        return _int64(dataset(file, "interval_ns", path, shape=(None,))[()], "interval_ns", path)
+
+
+def _int64(values: np.ndarray, name: str, path: Path) -> np.ndarray:
+    if len(values) and not -_LONGEST < int(values.min()) <= int(values.max()) < _LONGEST:
+        raise AssetError(f"'{name}' holds no times", where=str(path), value=values.tolist()[:8])
+    return values.astype(np.int64)
 
 
 def read_intervals(path: str | os.PathLike, names: tuple[str, ...]) -> tuple[int, np.ndarray, dict[str, np.ndarray]]:
     """Return from_us, interval_ns (K,) int64, and the arrays of these names; "valid" and "occluded" as bool. Raises
-    AssetError: missing, damaged, arrays of different sizes, or intervals that do not increase."""
+    AssetError: missing, damaged, arrays of different sizes, times beyond int64, valid flow that is no number, or
+    intervals that do not increase."""
     path = Path(path)
     with open_hdf5(path) as file, hdf5_errors(path):
-        from_us = int(dataset(file, "from_us", path, shape=())[()])
-        interval_ns = dataset(file, "interval_ns", path, shape=(None,))[()].astype(np.int64)
+        from_us = int(_int64(dataset(file, "from_us", path, shape=())[()].reshape(1), "from_us", path)[0])
+        interval_ns = _int64(dataset(file, "interval_ns", path, shape=(None,))[()], "interval_ns", path)
         arrays = {name: dataset(file, name, path, shape=SHAPES[name][0], kinds=SHAPES[name][1])[()] for name in names}
     sizes = {array.shape[:3] for array in arrays.values()}
     if len(sizes) != 1 or next(iter(sizes))[0] != len(interval_ns):
         raise AssetError("arrays of different sizes", where=str(path), value=sorted(sizes))
     if (np.diff(interval_ns) <= 0).any() or (interval_ns == 0).any():
         raise AssetError("the intervals do not increase", where=str(path), value=interval_ns.tolist()[:8])
+    if "flow" in arrays and "valid" in arrays and not np.isfinite(arrays["flow"][arrays["valid"].astype(bool)]).all():
+        raise AssetError("valid flow that is no number", where=str(path))
     return from_us, interval_ns, {k: a.astype(np.float32 if k == "flow" else bool) for k, a in arrays.items()}

@@ -1,38 +1,19 @@
-"""MVSEC's ``*_data.hdf5``: ``davis/left/events`` (N, 4) float64 = x, y, t[s], ±1 (346x260)."""
+"""Rows of MVSEC's ``*_data.hdf5``: ``davis/left/events`` (N, 4) float64 = x, y, t[s], ±1 (346x260)."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from blinkgl.io.columns import events_of, microseconds
-from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.hdf5 import dataset
 from blinkgl.types.events import Events
 
 DATASET = "davis/left/events"
-
-
-class MvsecReader:
-    """Events of the left camera (or another ``davis/*/events``); times rounded to int64 µs since 1970."""
-
-    height, width = 260, 346
-
-    def __init__(self, path: str | os.PathLike, name: str = DATASET):
-        self.path, self._name = Path(path), name
-        with open_hdf5(self.path) as file, hdf5_errors(self.path):
-            event_table(file, self.path, name)
-
-    def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        with open_hdf5(self.path) as file:
-            table = event_table(file, self.path, self._name)
-            for i in range(0, len(table), size):
-                with hdf5_errors(self.path):
-                    rows = table[i : i + size]
-                yield events_of_rows(rows, str(self.path), i)
+EVENTS = (DATASET, "davis/right/events")
+"""Of both cameras: x, y, t, p; t in s."""
 
 
 def event_table(file: h5py.File, path: Path, name: str = DATASET) -> h5py.Dataset:

@@ -14,7 +14,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
-from blinkgl.io.tables import is_number, read_rows, titles_of
+from blinkgl.io.rows import is_number, read_rows, titles_of
 
 
 @dataclass(frozen=True)

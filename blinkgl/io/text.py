@@ -1,90 +1,142 @@
-"""Events as text, the Event Camera Dataset's ``t[s] x y p`` and its relatives, parsed and
-printed by numba at disk speed.
+"""Events as text, the Event Camera Dataset's ``t[s] x y p`` and its relatives, parsed and printed by numba at disk
+speed; also packed by gzip.
 
-Read: separators space, tab, comma; comment lines (``#``, ``%``) anywhere; before the first event a line
-``width height`` (as E2VID's files have) and a line that names the columns, also as faery writes it
-(``t,x@640,y@480,on``); p as 0/1 or -1/1; t in seconds when it is written with a point or an exponent, in µs when it is
-an integer, the same way in the whole file. Written: seconds with six decimals, or integer µs (exact both).
+Read: separators space, tab, comma, semicolon; comment lines (``#``, ``%``) anywhere; before the first event a line
+``width height`` (as E2VID's files have) and a line, perhaps a comment, that names the columns, also as faery writes it
+(``t,x@640,y@480,on``); p as 0/1, -1/1 or True/False; t in the unit of its name, else in one that is guessed for the
+whole file. Written: seconds with six decimals, or integer µs (exact both).
 """
 
 from __future__ import annotations
 
+import codecs
+import contextlib
+import gzip
 import os
 import re
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size, refuse_causes
+from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
+from blinkgl.io.columns import CheckedWriter
+from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.tables import guessed_order, order_line, slot_of
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
 _LONGEST_LINE = 1 << 16
-_ACCEPTED = "t x y p"
-_MICROSECONDS, _SECONDS = 0, 1
-_COLUMN = re.compile(r"(?P<name>[a-z]+)[ _]?[\[(]?(?P<unit>s|us|µs|px)?[\])]?(@(?P<size>\d{1,9}))?")
-_COLUMN_NAMES = ({"t", "ts", "time", "times", "timestamp", "timestamps"}, {"x"}, {"y"}, {"p", "pol", "polarity", "on"})
+_PLACES = {"t": 0, "x": 1, "y": 2, "p": 3, "_": 4}
+"""Numbers of columns for the parser; 4 is ignored."""
+_SHIFT = {"s": 6, "ms": 3, "us": 0, "ns": -3}
+"""Decimal places from each unit of time to µs."""
 
 
 class TextReader:
-    """Reads events from text. ``height`` and ``width`` are None when the file does not give them. Raises AssetError
-    with the number of a line that is not an event."""
+    """Reads events from text. height, width : px, None when the file does not give them.   unit : of the times.   notes
+    : lines for the user.   unread : lines left out so far, with ``damaged="keep"``. Raises AssetError with the number
+    of a line that is not an event."""
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path, self._reading, self.notes, self.unread = Path(path), reading, [], 0
         self.height = self.width = None
         self._start = self._lines = 0  # bytes and lines before the first event
-        self._unit = -1  # unit of integer and of decimal times: not known yet
-        named = False
-        try:
-            with open(path, "rb") as file:
-                while line := file.readline(_LONGEST_LINE + 1):
-                    if len(line) > _LONGEST_LINE:
-                        raise AssetError(
-                            f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes",
-                            where=str(path),
-                            value=line[:40],
-                        )
-                    text = line.decode("utf-8-sig", "replace").strip()
-                    if text and text[0] not in "#%":
-                        # Two integers before the first event are the sensor's size.
-                        size = re.fullmatch(r"(\d{1,9})[ \t,]+(\d{1,9})", text)
-                        if size and self.width is None:
-                            self.width, self.height = int(size[1]), int(size[2])
-                        elif not named and text[0].isalpha() and not re.match(r"(nan|inf)\b", text, re.I):
-                            self._name_columns(text)
-                            named = True
-                        else:
-                            break
-                    self._start, self._lines = file.tell(), self._lines + 1
-        except OSError as error:
-            raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-        check_size(self.height, self.width, str(path))
+        self._order: tuple[str, ...] = ()
+        unit = None
+        with self._open() as file:
+            while line := file.readline(_LONGEST_LINE + 1):
+                if len(line) > _LONGEST_LINE:
+                    raise AssetError(
+                        f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes",
+                        where=str(path),
+                        value=line[:40],
+                    )
+                text = line.decode("utf-8-sig", "replace").strip()
+                comment = text[:1] in ("#", "%")
+                # Two integers before the first event are the sensor's size.
+                size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
+                if size and self.width is None:
+                    self.width, self.height = int(size[1]), int(size[2])
+                elif text and (comment or _is_heading(text)):
+                    names = _names(text.lstrip("#% "))
+                    order = tuple(slot_of(name.partition("@")[0]) for name in names)
+                    named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
+                    if not self._order and named:
+                        self._order, unit = order, self._heading(dict(zip(order, names)))
+                    elif not comment and not reading.columns:
+                        self._refuse_heading(text)
+                elif text:
+                    self._start += 3 if line.startswith(codecs.BOM_UTF8) else 0
+                    break
+                self._start, self._lines = file.tell(), self._lines + 1
+            sample, count = self._sample(file)
+        self._order = reading.columns or self._order
+        if not self._order:
+            self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
+            self.notes.append(order_line(self._order))
+        self.unit = TimeUnit("us", "read")
+        if reading.time_unit or unit:
+            self.unit = TimeUnit(reading.time_unit or unit or "", "declared" if reading.time_unit else "read")
+        elif len(sample) and sample.shape[1] == len(self._order):
+            self.unit = guessed_event_unit(sample[:, self._order.index("t")], count)
 
-    def _name_columns(self, text: str) -> None:
-        """Read sizes and the unit of time from a line with column names. Raises AssetError when it names others, or in
-        another order."""
-        names = re.split(r"[,\t]|\s+(?![\[(])", text.lower().replace('"', ""))
-        found = [_COLUMN.fullmatch(name.strip()) for name in names if name.strip()]
-        if len(found) != 4 or not all(m and m["name"] in known for m, known in zip(found, _COLUMN_NAMES)):
-            raise AssetError(
-                f"line {self._lines + 1} is not an event, and not a heading with column names",
-                where=str(self.path),
-                value=text,
-                accepted=f"{_ACCEPTED}, in this order",
-            )
-        if found[0]["unit"]:
-            self._unit = _SECONDS if found[0]["unit"] == "s" else _MICROSECONDS
-        if found[1]["size"] and found[2]["size"]:
-            self.width, self.height = int(found[1]["size"]), int(found[2]["size"])
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        """Give the file, unpacked. Raises AssetError: unreadable, damaged."""
+        try:
+            with gzip.open(self.path) if self.path.suffix.lower() == ".gz" else open(self.path, "rb") as file:
+                yield cast(BinaryIO, file)
+        except (OSError, EOFError, zlib.error) as error:
+            problem = f"cannot read: {getattr(error, 'strerror', None) or error}"
+            raise AssetError(problem, where=str(self.path)) from error
+
+    def _heading(self, names: dict[str, str]) -> str | None:
+        """Return the unit that the name of t states; take the sizes that faery adds to the names of x and y."""
+        sizes = [names[side].partition("@")[2] for side in "xy"]
+        if all(size.isdigit() and len(size) < 10 for size in sizes):
+            self.width, self.height = map(int, sizes)
+            return "us"
+        return named_unit(names["t"])
+
+    def _refuse_heading(self, text: str) -> None:
+        raise AssetError(
+            f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
+            where=str(self.path),
+            value=text,
+            accepted="a heading such as t x y p, or --columns",
+        )
+
+    def _sample(self, file: BinaryIO, size: int = 1 << 15) -> tuple[np.ndarray, int]:
+        """Return events of both ends of the file as (N, K) numbers, and about how many events it holds."""
+        file.seek(self._start)
+        head, tail, total = file.read(size), b"", 0
+        if self.path.suffix.lower() == ".gz":
+            for piece in iter(lambda: file.read(1 << 20), b""):
+                total, tail = total + len(piece), (tail + piece)[-size:]
+        else:
+            total = max(os.fstat(file.fileno()).st_size - self._start - len(head), 0)
+            file.seek(max(file.seek(0, os.SEEK_END) - min(size, total), 0))
+            tail = file.read()
+        lines = head.split(b"\n")
+        lines = (lines if not total else lines[:-1]) + tail.split(b"\n")[len(tail) < total :]
+        rows = [row for row in map(_row, lines) if row]
+        wide = max(map(len, rows), key=[len(row) for row in rows].count, default=4)
+        rows = [row for row in rows if len(row) == wide]
+        density = len(rows) / max(len(head) + len(tail), 1)
+        return np.array(rows, np.float64).reshape(len(rows), wide), max(round(density * (len(head) + total)), len(rows))
 
     def chunks(self, size: int = 1 << 22) -> Iterator[Events]:
         """Yield all events, from about ``size`` bytes of text at a time."""
-        unit = np.array([self._unit])
-        with open(self.path, "rb") as file:
+        places = np.array([_PLACES[slot] for slot in self._order])
+        off, on = (int(v) for v in self._reading.polarity or (0, 1))
+        pair = np.array([off, on, -1 if self._reading.polarity is None else off])  # undeclared, -1 is OFF, too
+        self.unread = 0
+        with self._open() as file:
             file.seek(self._start)
             line, rest = self._lines, b""
             while True:
@@ -103,21 +155,14 @@ class TextReader:
                 x, y, p = np.empty(capacity, np.uint16), np.empty(capacity, np.uint16), np.empty(capacity, np.uint8)
                 t = np.empty(capacity, np.int64)
                 # The kernel indexes lines from 0 within this piece of text.
-                n, bad, mixed = _parse(buffer, x, y, t, p, unit)
-                if bad >= 0:
-                    content = text.split(b"\n", bad + 1)[bad].decode("latin-1")
-                    if mixed:
-                        raise AssetError(
-                            f"line {line + bad + 1} has a time in another unit",
-                            where=str(self.path),
-                            value=content,
-                            accepted="either integers (µs) or numbers with a point (s) in the whole file",
-                        )
+                n, bad, lost = _parse(buffer, x, y, t, p, places, _SHIFT[self.unit.name], pair, self._reading.keep)
+                self.unread += lost
+                if bad >= 0 and not self._reading.keep:
                     raise AssetError(
                         f"line {line + bad + 1} is not an event",
                         where=str(self.path),
-                        value=content,
-                        accepted=_ACCEPTED,
+                        value=text.split(b"\n", bad + 1)[bad].decode("latin-1"),
+                        accepted=" ".join(self._order) + " (--columns), polarity 0/1 or -1/1 (--polarity)",
                     )
                 line += capacity
                 if n:
@@ -126,44 +171,56 @@ class TextReader:
                     return
 
 
-class TextWriter:
-    """Writes ``t x y p``. ``separator`` "," makes a CSV that begins with a line of column names. time_unit : "s" writes
-    seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with the sensor's size in
-    its first line."""
+def _is_heading(text: str) -> bool:
+    return bool(re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I))
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, separator: str = " ", *, time_unit: str = "s"):
-        if time_unit not in ("s", "us"):
-            raise EventDataError("unit of time", where=str(path), value=time_unit, accepted="s or us")
-        self.path, self._separator, self._micro = Path(path), ord(separator), time_unit == "us"
-        self._size, self._count, self._last = (height, width), 0, None
+
+def _names(heading: str) -> list[str]:
+    """Return the names of columns; a first one without a name, as pandas' index, is empty."""
+    names = [name.strip() for name in re.split(r"[,;\t]|\s+(?![\[(])", heading.lower().replace('"', ""))]
+    return [name for k, name in enumerate(names) if name or (k == 0 and heading[0] in ",;")]
+
+
+def _row(line: bytes) -> list[float] | None:
+    """Return the numbers of a line; None: it is not of numbers alone."""
+    words = re.split(rb"[ \t,;\r]+", line.strip())
+    try:
+        return [{b"true": 1.0, b"false": 0.0}.get(word.lower()) or float(word) for word in words]
+    except ValueError:
+        return None
+
+
+class TextWriter(CheckedWriter):
+    """Writes ``t x y p``. ``separator`` "," makes a CSV that begins with a line of column names. write_unit : "s"
+    writes seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with the sensor's
+    size in its first line."""
+
+    kind, limits = "text", (0, 1 << 62, "negative time")
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        height: int | None,
+        width: int | None,
+        separator: str = " ",
+        *,
+        write_unit: str = "s",
+    ):
+        if write_unit not in ("s", "us"):
+            raise EventDataError("unit of time", where=str(path), value=write_unit, accepted="s or us")
+        super().__init__(path, height, width)
+        self._separator, self._micro = ord(separator), write_unit == "us"
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
             if separator == ",":
-                self._file.write(f"t,x@{width},y@{height},on\n".encode() if self._micro else b"t,x,y,p\n")
+                sized = "t[us],x,y,on\n" if height is None else f"t,x@{width},y@{height},on\n"
+                self._file.write((sized if self._micro else "t,x,y,p\n").encode())
 
-    def append(self, events: Events) -> None:
-        refuse_causes(events, "text", str(self.path))
-        if len(events) and events.t[0] < 0:
-            raise EventDataError("negative time", where=str(self.path), value=int(events.t[0]), accepted=">= 0 µs")
-        self._last = check_events(
-            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
-        )
-        self._count += len(events)
+    def _write(self, events: Events) -> None:
         # 13 digits of seconds, point, 6, two coordinates of 5, polarity, separators, newline
         buffer = np.empty(len(events) * 40, np.uint8)
         n = _print(events.x, events.y, events.t, events.p, self._separator, self._micro, buffer)
-        with output_errors(self.path):
-            self._file.write(buffer[:n].data)
-
-    def close(self, t_end_us: int | None = None) -> None:
-        with output_errors(self.path):
-            self._file.close()
-
-    def abort(self) -> None:
-        try:
-            self._file.close()
-        except OSError:
-            pass
+        self._file.write(buffer[:n].data)
 
 
 @kernel
@@ -226,18 +283,35 @@ def _scaled(mantissa, exponent):
 
 
 @kernel
-def _parse(buffer, x, y, t, p, unit):
-    """Parse the events in complete lines of text. Return (count, index of the first bad line or -1, bad for its unit of
-    time?).
+def _separates(c):
+    # Space, tab, comma, semicolon, carriage return.
+    return c == 32 or c == 44 or c == 9 or c == 59 or c == 13
 
-    unit[0] : of the times so far, -1 not known, 0 integers (µs), 1 decimals (s); kept up to date."""
-    n, line, i = 0, 0, 0
-    values = np.empty(4, np.int64)
+
+@kernel
+def _word(buffer, i, place, pair):
+    """Return (value, next index) of a field that is no number: an ignored one, or True and False. Next index -1:
+    neither."""
+    letter = buffer[i] | 32
+    if place != 4 and not (place == 3 and (letter == 116 or letter == 102)):
+        return np.int64(0), -1
+    while not (_separates(buffer[i]) or buffer[i] == 10):
+        i += 1
+    return pair[1 if letter == 116 else 0], i
+
+
+@kernel
+def _parse(buffer, x, y, t, p, places, shift, pair, keep):
+    """Parse the events in complete lines of text. Return (count, index of the first bad line or -1, bad lines).
+
+    places : what each field is, 0 t, 1 x, 2 y, 3 p, 4 ignored.   shift : decimal places from the unit of time to µs.
+    pair : numbers of OFF, of ON, and another of OFF.   keep : go on after a bad line."""
+    n, line, i, bad, lost, values = 0, 0, 0, -1, 0, np.zeros(5, np.int64)
     while i < len(buffer):
-        field = 0
+        field, good = 0, True
         while buffer[i] != 10:
             c = buffer[i]
-            if c == 32 or c == 9 or c == 44 or c == 13:
+            if _separates(c):
                 i += 1
                 continue
             # The rest of a comment line is skipped.
@@ -245,37 +319,48 @@ def _parse(buffer, x, y, t, p, unit):
                 while buffer[i] != 10:
                     i += 1
                 break
-            if field == 4:
-                return n, line, False
-            mantissa, exponent, integer, i = _number(buffer, i)
-            if i < 0:
-                return n, line, False
-            c = buffer[i]
-            if not (c == 32 or c == 9 or c == 44 or c == 13 or c == 10):
-                return n, line, False
-            # Decimal times are seconds: six more places make microseconds.
-            values[field], ok = _scaled(mantissa, exponent + (6 if field == 0 and not integer else 0))
-            if not ok or (field > 0 and exponent < 0 and values[field] * 10.0**-exponent != mantissa):
-                # Coordinates between pixels are refused as well: rectified events are not raw events.
-                return n, line, False
-            # A plain 0 is the same time in both units.
-            if field == 0 and (values[0] != 0 or not integer):
-                kind = 0 if integer else 1
-                if unit[0] >= 0 and unit[0] != kind:
-                    return n, line, True
-                unit[0] = kind
+            if field == len(places):
+                good = False
+                break
+            place = places[field]
             field += 1
+            begin = i
+            mantissa, exponent, _, i = _number(buffer, i)
+            c = buffer[i]
+            if i < 0 or not (_separates(c) or c == 10):
+                values[place], i = _word(buffer, begin, place, pair)
+                if i < 0:
+                    good, i = False, begin
+                    break
+                continue
+            # Times are multiplied by 10^shift: that makes microseconds.
+            values[place], ok = _scaled(mantissa, exponent + (shift if place == 0 else 0))
+            if not ok or (place > 0 and exponent < 0 and values[place] * 10.0**-exponent != mantissa):
+                # Coordinates between pixels are refused as well: rectified events are not raw events.
+                good = False
+                break
+        if field != 0 or not good:
+            on = values[3] == pair[1]
+            good = (
+                good
+                and field == len(places)
+                and 0 <= values[1] <= 65535
+                and 0 <= values[2] <= 65535
+                and (on or values[3] == pair[0] or values[3] == pair[2])
+            )
+            if good:
+                t[n], x[n], y[n], p[n] = values[0], values[1], values[2], on
+                n += 1
+            else:
+                bad = line if bad < 0 else bad
+                lost += 1
+                if not keep:
+                    return n, bad, lost
+                while buffer[i] != 10:
+                    i += 1
         i += 1
-        if field == 4:
-            # -1 and 0 are both OFF.
-            if not (0 <= values[1] <= 65535 and 0 <= values[2] <= 65535 and -1 <= values[3] <= 1):
-                return n, line, False
-            t[n], x[n], y[n], p[n] = values[0], values[1], values[2], max(values[3], 0)
-            n += 1
-        elif field != 0:
-            return n, line, False
         line += 1
-    return n, -1, False
+    return n, bad, lost
 
 
 @kernel

@@ -30,7 +30,7 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
 from blinkgl.io.stamps import read_timestamps
-from blinkgl.io.tables import is_number, read_rows, titles_of
+from blinkgl.io.rows import is_number, read_rows, titles_of
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")

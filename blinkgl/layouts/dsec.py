@@ -5,12 +5,12 @@
       flow/forward/%06d.png, forward_timestamps.txt    backward likewise
       images/timestamps.txt                        two lines a label interval, as DSEC's images are
       images/left/ev_inf/%06d.png                  what the event camera's own lens sees, at the flow's times
-      disparity/event/%06d.png, timestamps.txt     of a stereo rig with depth
+      disparity/event/%06d.png, timestamps.txt     of a stereo rig with depth; 000000 is empty: loaders skip it
       calibration/cam_to_cam.yaml
       imu/imu.csv, imu.h5, imu.yaml …              of an inertial unit, as the sequence has it (EuRoC's, Kalibr's)
 
-A file's number is its line in ``images/timestamps.txt``, so flow k is file 2k, as in the published sequences: loaders
-count on the step of two.
+A file's number is its line in ``images/timestamps.txt``, which begins an interval before the first label, so flow k is
+file 2k + 2, as in the published sequences: loaders count on the step of two, and on a number before each flow's.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from blinkgl.camera.pinhole import rectify_map
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml
 from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.images import encode_png
-from blinkgl.layouts.layout import Layout, Missing, copy, forward_flow, write_bytes, write_lines
+from blinkgl.layouts.layout import Layout, Missing, copy, events_before, forward_flow, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 
 DISPARITY_SCALE = 256.0
@@ -49,10 +49,10 @@ def _over_100_ms(source: Source) -> Missing | None:
     return Missing(f"flow over 100 ms (labels come at {rate:g} Hz)", "time: {label_rate: 10}")
 
 
-def _three_labels(source: Source) -> Missing | None:
-    if not 0 < len(source.flow_times("forward")) < 3:
+def _two_labels(source: Source) -> Missing | None:
+    if len(source.flow_times("forward")) != 1:
         return None
-    return Missing("a third label", "time: {duration: 0.3, label_rate: 10}")
+    return Missing("a second label", "time: {duration: 0.3, label_rate: 10}")
 
 
 class Dsec(Layout):
@@ -63,6 +63,7 @@ class Dsec(Layout):
     size = (480, 640)
     needs = (forward_flow, _rectified)
     splits = ("train", "test")
+    filled = ("train",)
 
     def opened_by(self, out: Path) -> str:
         """Return the loaders: DSEC's own provider requires a folder of disparities and both cameras' events in every
@@ -73,7 +74,9 @@ class Dsec(Layout):
         return f"{self.about} (not DSEC's provider, which asks for 'rig: stereo' and 'labels: {{disparity: true}}')"
 
     def write(self, source: Source, folder: Path) -> list[str]:
-        said: list[str] = []
+        said = []
+        if len(source.flow_times("forward")) == 1:
+            said.append(f"{source.name}: one label, and bflow's loader opens two or more")
         write_events(source, folder / "events/left")
         for towards in ("forward", "backward"):
             write_flow(source, towards, folder / "flow")
@@ -94,34 +97,31 @@ class Dsec(Layout):
 
 
 class ERaft(Layout):
-    """E-RAFT's layout. Its loader reads only a folder ``test``, uses every second line of ``image_timestamps.txt``
+    """E-RAFT's layout. Its loader reads only the folder ``test``, uses every second line of ``image_timestamps.txt``
     except the first and the last, and 100 ms of events on both sides of each."""
 
     name = "eraft"
     about = "E-RAFT's DSEC loader (test sequences, standard and warm start)"
     size = (480, 640)
-    needs = (forward_flow, _rectified, _over_100_ms, _three_labels)
-
-    def folder(self, source: Source) -> str:
-        return f"test/{source.name}"
+    needs = (forward_flow, _rectified, _over_100_ms, _two_labels, events_before)
+    filled = ("test",)
 
     def write(self, source: Source, folder: Path) -> list[str]:
         write_events(source, folder / "events_left")
         write_lines(folder / "image_timestamps.txt", image_times(source))
-        rows = [f"{a}, {b}, {2 * k}" for k, (a, b) in enumerate(source.flow_times("forward"))]
+        rows = [f"{a}, {b}, {2 * k + 2}" for k, (a, b) in enumerate(source.flow_times("forward"))]
         header = "# from_timestamp_us, to_timestamp_us, file_index"
-        write_lines(
-            folder / "test_forward_flow_timestamps.csv", [header, *rows[1:]]
-        )  # its loader makes no sample of label 0
+        write_lines(folder / "test_forward_flow_timestamps.csv", [header, *rows])
         write_flow(source, "forward", folder / "flow")
         return []
 
 
 def image_times(source: Source) -> list[int]:
-    """Return times of DSEC's images, µs: those of the flow labels, the end of the last, and the middle between any
-    two."""
+    """Return times of DSEC's images, µs: an interval before the flow labels, those of the labels, the end of the last,
+    and the middle between any two."""
     times = source.flow_times("forward")
-    return [t for a, b in times for t in (a, (a + b) // 2)] + [times[-1][1]]
+    begin, end = times[0]
+    return [t for a, b in [(2 * begin - end, begin), *times] for t in (a, (a + b) // 2)] + [times[-1][1]]
 
 
 def write_events(source: Source, folder: Path) -> None:
@@ -140,7 +140,7 @@ def write_flow(source: Source, towards: str, folder: Path) -> None:
     if not times:
         return
     for k in range(len(times)):
-        copy(source.file(f"flow_{towards}", k), folder / f"{towards}/{2 * k:06d}.png")
+        copy(source.file(f"flow_{towards}", k), folder / f"{towards}/{2 * k + 2:06d}.png")
     write_lines(
         folder / f"{towards}_timestamps.txt",
         ["# from_timestamp_us, to_timestamp_us", *(f"{a}, {b}" for a, b in times)],
@@ -166,8 +166,10 @@ def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
         return [f"{left.name}: no disparity without 'labels: {{disparity: true}}'"]
     for k in range(len(times)):
         disparity = left.value("disparity", k) if labelled else camera.disparity(left.value("depth", k), baseline)
-        write_bytes(folder / f"event/{2 * k:06d}.png", encode_disparity(disparity))
-    write_lines(folder / "timestamps.txt", [a for a, _ in times])
+        write_bytes(folder / f"event/{2 * k + 2:06d}.png", encode_disparity(disparity))
+    # DSEC's provider drops the first disparity, of a time without events before it.
+    write_bytes(folder / "event/000000.png", encode_disparity(np.zeros((left.height, left.width))))
+    write_lines(folder / "timestamps.txt", image_times(left)[:-1:2])
     return []
 
 

@@ -58,6 +58,7 @@ class EventKubric(Layout):
             part = events.window(start_us, start_us + round(SECONDS * 1e6))
             if len(part):
                 arrays = dict(x=part.x.astype(np.int16), y=part.y.astype(np.int16), t=(part.t - start_us) * 1000)
+                arrays["time_unit"] = np.array("ns")  # for readers other than ETAP's
                 buffer = io.BytesIO()
                 np.savez_compressed(buffer, p=2 * part.p.astype(np.int8) - 1, **arrays)
                 write_bytes(folder / f"events/{number:010d}.npz", buffer.getvalue())

@@ -13,13 +13,14 @@ from blinkgl.layouts.event_kubric import EventKubric
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
+from blinkgl.layouts.rosbag import RosBag
 from blinkgl.layouts.source import Source, sources_of
 from blinkgl.layouts.tapvid import TapVid
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The available layouts.
 
-_ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric())
+_ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag())
 LAYOUTS: dict[str, Layout] = {row.name: row for row in _ROWS}
 
 
@@ -62,6 +63,8 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
             said += row.write(source, folder / place)
         for split in row.splits:
             (folder / split).mkdir(exist_ok=True)
+    held = {place.split("/")[0] for place in places}
+    said += [f"nothing in {split}/, which its loaders open" for split in row.filled if split not in held]
     return Exported(len(sources), tuple(said), row.opened_by(out))
 
 

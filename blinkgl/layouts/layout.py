@@ -31,13 +31,14 @@ class Layout:
 
     name : as in ``--layout``.   about : what opens it, for tables.   size : (height, width) fixed in its loaders, None:
     any; other sizes are exported with a note.   needs : what its loaders require.
-    splits : folders that its loaders require, empty or not."""
+    splits : folders that its loaders require, empty or not.   filled : folders that they require to hold sequences."""
 
     name: str
     about: str
     size: tuple[int, int] | None = None
     needs: tuple[Need, ...] = ()
     splits: tuple[str, ...] = ()
+    filled: tuple[str, ...] = ()
 
     def opened_by(self, out: Path) -> str:
         """Return what opens the export in the folder ``out``: some loaders need more than the layout does."""
@@ -60,6 +61,14 @@ class Layout:
 def forward_flow(source: Source) -> Missing | None:
     """Require forward flow, as nearly every layout does."""
     return None if source.flow_times("forward") else Missing("forward flow", "labels: {flow: [forward]}")
+
+
+def events_before(source: Source) -> Missing | None:
+    """Require events of an interval before the first label, where loaders begin."""
+    times = source.flow_times("forward")
+    if not times or source.start_us <= 2 * times[0][0] - times[0][1]:
+        return None
+    return Missing("a recording that begins a label interval before the first label", "time: {start: 0}")
 
 
 def images(source: Source) -> Missing | None:

@@ -53,6 +53,7 @@ class MultiFlow(Layout):
     name = "multiflow"
     about = "bflow's MultiFlow loader (flow at many times after one; folders train and val)"
     size = (384, 512)
+    filled = ("train", "val")
     needs = (_flow_over_half_a_second, images, _samples, _sensor_pixels)
 
     def folder(self, source: Source) -> str:

@@ -3,7 +3,7 @@
     <split>/<sequence>_data.hdf5         davis/left/events (N, 4) f8 = x, y, t [s], ±1; image_raw (n, H, W) u1,
                                          image_raw_ts (n,) f8 s, image_raw_event_inds (n,) i8; imu (m, 6), imu_ts
     <split>/<sequence>_gt.hdf5           davis/left/depth_image_raw, depth_image_rect (n, H, W) f4, NaN: nothing;
-                                         depth_image_raw_ts …; pose (n, 4, 4), pose_ts
+                                         depth_image_raw_ts …; pose (n, 4, 4), pose_ts; flow_dist (n, 2, H, W)
     <split>/<sequence>_gt_flow_dist.npz  timestamps (n,) s; x_flow_dist, y_flow_dist (n, H, W) px from one to the next
 
 ``davis/right`` likewise, of a stereo rig. Without distortion raw and rectified images are the same. MVSEC has no mask:
@@ -43,8 +43,11 @@ class Mvsec(Layout):
             with output_errors(path), h5py.File(path, "w") as file:
                 for eye, one in eyes.items():
                     write(one, file, f"davis/{eye}")
-        _flow(source, folder / f"{source.name}_gt_flow_dist.npz")
-        return []
+        times, flow = np.array([a * 1e-6 for a, _ in source.flow_times("forward")]), _flow(source)
+        path = folder / f"{source.name}_gt_flow_dist.npz"
+        with output_errors(path), open(path, "wb") as npz:
+            np.savez(npz, timestamps=times, x_flow_dist=flow[:, 0], y_flow_dist=flow[:, 1])
+        return [] if source.right else [f"{source.name}: no davis/right, which some loaders open (rig: stereo)"]
 
 
 def _data(source: Source, file: h5py.File, group: str) -> None:
@@ -74,22 +77,23 @@ def _truth(source: Source, file: h5py.File, group: str) -> None:
                 depth = source.value("depth", k)
                 append(maps, np.where(np.isfinite(depth), depth, np.float32(np.nan))[None])
             _keep(file, f"{group}/{name}_ts", np.array([a * 1e-6 for a, _ in times]))
+    _keep(file, f"{group}/flow_dist", _flow(source))
+    _keep(file, f"{group}/flow_dist_ts", np.array([a * 1e-6 for a, _ in times]))
     if "T_world_cam" in source.poses:
         poses = source.poses["T_world_cam"]
         _keep(file, f"{group}/pose", np.linalg.inv(poses[0]) @ poses)  # of the camera, in its first one's axes
         _keep(file, f"{group}/pose_ts", source.poses["t_ns"] * 1e-9)
 
 
-def _flow(source: Source, path: Path) -> None:
-    times = source.flow_times("forward")
-    x, y = np.zeros((2, len(times), source.height, source.width), np.float32)
-    for k in range(len(times)):
+def _flow(source: Source) -> np.ndarray:
+    """Return (n, 2, H, W) float32 px; where a flow is valid and 0, x is almost nothing."""
+    flows = np.zeros((len(source.flow_times("forward")), 2, source.height, source.width), np.float32)
+    for k in range(len(flows)):
         flow, valid = source.flow("forward", k)
         still = valid & (flow == 0).all(-1)
-        x[k] = np.where(still, _ALMOST_NOTHING, np.where(valid, flow[..., 0], 0))
-        y[k] = np.where(valid, flow[..., 1], 0)
-    with output_errors(path), open(path, "wb") as file:
-        np.savez(file, timestamps=np.array([a * 1e-6 for a, _ in times]), x_flow_dist=x, y_flow_dist=y)
+        flows[k, 0] = np.where(still, _ALMOST_NOTHING, np.where(valid, flow[..., 0], 0))
+        flows[k, 1] = np.where(valid, flow[..., 1], 0)
+    return flows
 
 
 def _keep(file: h5py.File, name: str, array: np.ndarray) -> None:

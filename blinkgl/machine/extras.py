@@ -16,7 +16,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, purpose)
     "tensors": (("torch",), "events as tensors: TensorEsim, TensorV2e, events.device: cuda"),
     "cluster": (("ray",), "many machines"),
     "physics": (("mujoco",), "scenes in which things fall"),
-    "formats": (("faery",), "checks of EVT2 and EVT3, which need nothing"),
+    "formats": (("rosbags", "dv-processing"), "ROS bags and MCAP; writing AEDAT4"),
     "view": (("viser",), "sequences in the browser: blinkgl view, generate --view"),
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),

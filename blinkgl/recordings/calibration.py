@@ -19,6 +19,7 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.frames import NOTHING, Declared
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.clip import (
     PLAIN,
     Clip,
@@ -130,6 +131,7 @@ def calibrate(
     starts: int = 3,
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
+    events: EventReading = AS_FILE,
 ) -> Calibration:
     """Fit an emulator to a recording.
 
@@ -138,7 +140,8 @@ def calibrate(
     zero_time also counts events from the first.   reading : how they are interpreted.
     still : a static scene in constant light, without frames: only noise.
     emulator : a name, or the initial configuration; ``fixed``: keys that keep their values.
-    starts : of the search.   progress : called with (current activity, fraction).
+    starts : of the search.   progress : called with (current activity, fraction).   events : what is declared of the
+    recording.
 
     Raises EventDataError, one line: no frames, frames of another size, saturated, not of this recording's time or
     clock; too few events. ConfigError: an emulator without parameters to fit, an unknown key, interpolation.
@@ -149,18 +152,18 @@ def calibrate(
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
     if progress:
         progress("reading", 0.0)
-    events, size = read_recording(recording, least=LEAST_EVENTS)
-    given, said = None, []
+    stream, size, said = read_recording(recording, events, least=LEAST_EVENTS)
+    given = None
     if not still:
         frames = _own_frames(recording) if frames is None else frames
         source, exposures = timed_frames(frames, declared)
-        given, said = list(source), source.notes
+        given, said = list(source), [*said, *source.notes]
         codes = replace(reading.codes, white_level=declared.white_level, range=declared.range).of(source)
         reading = replace(reading, codes=codes, exposures=exposures, name=os.fspath(frames))
     if declared.zero_time:
-        events = replace(events, t=events.t - events.t[0])
+        stream = replace(stream, t=stream.t - stream.t[0])
     search = dict(emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    result = calibrate_events(events, size, given, reading, name=os.fspath(recording), **search)
+    result = calibrate_events(stream, size, given, reading, name=os.fspath(recording), **search)
     return replace(result, notes=[*result.notes, *said])
 
 

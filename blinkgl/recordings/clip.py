@@ -21,6 +21,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import NOTHING, Declared, FrameSource, open_frames
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
 from blinkgl.recordings.decoding import UNKNOWN, Codes, OwnFrames, meaning
@@ -435,10 +436,12 @@ def polarity_counts(events: Events, size: tuple[int, int]) -> tuple[np.ndarray, 
     return count(1), count(0)
 
 
-def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, tuple[int, int]]:
-    """Return all events of a file, and the (height, width) of its sensor. Raises EventDataError: fewer than
-    ``least``."""
-    with open_events(path) as file:
+def read_recording(
+    path: str | os.PathLike, reading: EventReading = AS_FILE, *, least: int = 0
+) -> tuple[Events, tuple[int, int], list[str]]:
+    """Return all events of a file, the (height, width) of its sensor, and what was guessed or left out, a line each.
+    Raises EventDataError: fewer than ``least``."""
+    with open_events(path, reading) as file:
         file = file.sized()
         events = file.read()
     if len(events) < least:
@@ -449,7 +452,7 @@ def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, 
             accepted=f"{least:,} or more",
         )
     assert file.height is not None and file.width is not None
-    return events, (file.height, file.width)
+    return events, (file.height, file.width), file.notes
 
 
 def timed_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> tuple[FrameSource, bool]:

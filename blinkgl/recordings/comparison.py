@@ -19,6 +19,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
 from blinkgl.io.frames import NOTHING, Declared
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -89,7 +90,7 @@ class Comparison:
     halves: tuple[Judgement, ...] = ()
     """how well it distinguishes the halves of each recording, a's first"""
     notes: list[str] = field(default_factory=list)
-    """what was read of the frames that is unusual, guessed or left out, a line each"""
+    """what was guessed, left out or unusual when files and frames were read, a line each"""
 
     @property
     def same_size(self) -> bool:
@@ -196,6 +197,7 @@ def compare(
     interval_ms: float = 20.0,
     zero_time: bool = False,
     judge: bool = False,
+    reading: EventReading = AS_FILE,
 ) -> Comparison:
     """Compare event file ``a`` with event file ``b``, with ``frames``, or with both, over their common time; alone,
     ``a`` is described.
@@ -208,14 +210,15 @@ def compare(
     camera's own, whose codes are intensities.
     frame_delay_ms : added to the frames' times; a stamp of the exposure's start is before its centre. zero_time : count
     both recordings from their first event, and frames from the first of them. judge : also train a classifier to
-    distinguish them (:mod:`~blinkgl.recordings.judge`), which holds their events in memory.
+    distinguish them (:mod:`~blinkgl.recordings.judge`), which holds their events in memory. reading : what is declared
+    of both event files.
 
     Raises EventDataError: frames of another size than a recording, no common time, too few events for a judge.
     AssetError: unreadable.
     """
     if b is not None and frames is None and not _is_event_file(b):
         b, frames = None, b
-    files = [open_events(p).sized() for p in ((a,) if b is None else (a, b))]
+    files = [open_events(p, reading).sized() for p in ((a,) if b is None else (a, b))]
     spans = [_span(f) for f in files]
     shifts = [s[0] if zero_time else 0 for s in spans]
     start, stop = max(s[0] - d for s, d in zip(spans, shifts)), min(s[1] - d for s, d in zip(spans, shifts))
@@ -240,6 +243,7 @@ def compare(
             accepted="recordings that overlap (seconds shown), or --zero-time",
         )
     result = _accumulate(files, shifts, edges, changes)
+    result.notes += [f"{file.path}: {line}" for file in files for line in file.notes]
     result.notes += notes
     if judge:
         result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))

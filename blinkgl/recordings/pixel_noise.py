@@ -22,6 +22,7 @@ from scipy.stats import binom, ks_2samp, poisson
 from blinkgl.config.readout import PixelsConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.pixels import PixelNoise
+from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.clip import read_recording
 from blinkgl.types.events import Events
 
@@ -95,13 +96,19 @@ class PixelFit:
 
 
 def fit_pixels(
-    recording: str | os.PathLike, *, seed: int = 0, progress: Callable[[str, float], None] | None = None
-) -> PixelFit:
-    """Fit :func:`fit_pixels_of` to a file.   Raises EventDataError (too few events), AssetError (unreadable)."""
+    recording: str | os.PathLike,
+    reading: EventReading = AS_FILE,
+    *,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> tuple[PixelFit, list[str]]:
+    """Fit :func:`fit_pixels_of` to a file; return also what was guessed or left out, a line each.
+
+    Raises EventDataError (too few events), AssetError (unreadable)."""
     if progress:
         progress("reading", 0.0)
-    events, size = read_recording(recording, least=2 * LEAST_EVENTS)
-    return fit_pixels_of(events, size, name=os.fspath(recording), seed=seed, progress=progress)
+    events, size, said = read_recording(recording, reading, least=2 * LEAST_EVENTS)
+    return fit_pixels_of(events, size, name=os.fspath(recording), seed=seed, progress=progress), said
 
 
 def fit_pixels_of(

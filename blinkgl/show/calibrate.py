@@ -108,7 +108,9 @@ def _pixels(
     with _bar(console, quiet) as bar:
         task = bar.add_task("reading", total=1.0)
         progress = lambda what, done: bar.update(task, description=what, completed=done)
-        result = fit_pixels(recording, seed=options["seed"], progress=progress)
+        result, said = fit_pixels(recording, options["events"], seed=options["seed"], progress=progress)
+    for line in said:
+        say(plain_console(stderr=True), f"note: {line}")
     text = to_short_yaml(result.sensor())
     _write(target, text, pixel_noise.page(result, text), overwrite)
     title = f"noise of single pixels beside {Path(recording).name}, other half"

@@ -1,28 +1,24 @@
-"""``blinkgl convert``: prints one line about the output."""
+"""``blinkgl convert``: prints one line about the output, and one for each thing that was guessed or left out."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from blinkgl.errors import ConfigError
 from blinkgl.io.formats import WITH_CAUSES, convert, output_format
+from blinkgl.io.reading import EventReading
 from blinkgl.machine.terminal import plain_console, say
 
 
-def run(source: str, target: str, *, size: str | None = None, **options: Any) -> int:
-    """``options``: of :func:`~blinkgl.io.formats.convert`. size : "WIDTHxHEIGHT"."""
-    file, count = convert(source, target, size=size_of(size), **options)
-    say(plain_console(), f"{target}: {count:,} events, {file.width}x{file.height}, from {file.format}")
-    if file.causes and output_format(target) not in WITH_CAUSES:
+def run(source: str, target: str, *, reading: EventReading, **options: Any) -> int:
+    """``options``: of :func:`~blinkgl.io.formats.convert`."""
+    file, count = convert(source, target, reading, **options)
+    size = f"{file.width}x{file.height}" if file.height else "no size in it (--size WIDTHxHEIGHT)"
+    say(plain_console(), f"{target}: {count:,} events, {size}, from {file.format}")
+    written = output_format(target)
+    if file.causes and written not in WITH_CAUSES:
         say(plain_console(), "the causes of the events are left out: the format cannot hold them")
+    for line in file.notes:
+        say(plain_console(stderr=True), f"{source}: {line}")
+    if reading.time_unit and written in ("text", "csv") and options.get("write_unit") == "s":
+        say(plain_console(stderr=True), "--time-unit is the unit of IN; --write-unit us writes OUT in µs")
     return 0
-
-
-def size_of(text: str | None) -> tuple[int, int] | None:
-    """Return (height, width) of the option ``--size``. Raises ConfigError."""
-    if text is None:
-        return None
-    width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdigit() and height.isdigit() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536):
-        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
-    return int(height), int(width)

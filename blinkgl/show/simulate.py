@@ -13,8 +13,8 @@ from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.errors import ConfigError
+from blinkgl.io.reading import parsed_size
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
-from blinkgl.show.convert import size_of
 
 if TYPE_CHECKING:
     from blinkgl.recordings.simulation import SimulationReport
@@ -80,7 +80,7 @@ def run(
     options["use"] = FrameUse(Codes(gamma, own=options.pop("own")), interpolate, max_px, keep_noise)
     options["declared"] = Declared(**(declared or {}))
     if size is not None:
-        options["size"] = size_of(size)
+        options["size"] = parsed_size(size)
     console = plain_console(quiet=quiet)
     if sensor is not None and not load_sensor(sensor).pixels_known:
         say(console, f"of {sensor} only the size is known: thresholds and noise are the emulator's defaults")

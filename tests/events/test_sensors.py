@@ -153,7 +153,7 @@ def test_a_dvxplorers_noise_is_its_single_pixels_and_counts_once(emulator):
 
 def test_a_still_scene_is_as_noisy_as_the_recorded_one():
     """Rates and hot pixels of dvxplorer.yaml against the recording; its first half was fitted, so the second judges."""
-    events, (_, width) = read_recording(shared("data/events/noise/dvxplorer_constant_light.aedat4"), least=1000)
+    events, (_, width), _ = read_recording(shared("data/events/noise/dvxplorer_constant_light.aedat4"), least=1000)
     begin, end = (int(events.t[0]) + int(events.t[-1])) // 2, int(events.t[-1])
     made = still(load_sensor("dvxplorer"), "esim", end - begin)
     halves = [(e, e.y.astype(int) * width + e.x) for e in (events.window(begin, end), made)]

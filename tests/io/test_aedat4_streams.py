@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io import aedat4
 from blinkgl.io.aedat4 import Aedat4Reader
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import EventReading
 from blinkgl.recordings.comparison import compare
 from tests.shared_data import shared
 
@@ -96,6 +98,7 @@ def recorded(monkeypatch, kind, packets):
             return self.packets
 
     monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=Decoder))
+    monkeypatch.setattr(aedat4, "_check_claims", lambda path: iter(()))
     return Aedat4Reader("e.aedat4")
 
 
@@ -104,6 +107,7 @@ def test_damage_is_one_line(monkeypatch):
         raise RuntimeError("no  such\n stream")
 
     monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=decoder))
+    monkeypatch.setattr(aedat4, "_check_claims", lambda path: iter(()))
     with pytest.raises(AssetError, match="^e.aedat4: damaged AEDAT4 file: no such stream$"):
         Aedat4Reader("e.aedat4")
 
@@ -122,3 +126,20 @@ def test_samples_whose_times_run_backwards(monkeypatch):
     rows["t"] = (5, 9, 8)
     with pytest.raises(EventDataError, match=r"times decrease at sample 2 of the inertial unit \(got \(9, 8\)\)"):
         recorded(monkeypatch, "imus", [rows]).imu()
+
+
+def test_a_packet_longer_than_the_file_is_refused_before_memory_is_set_aside(tmp_path):
+    """The decoder would ask for what is claimed; what comes before is kept on request."""
+    data = bytearray(shared("field/events/overlap.aedat4").read_bytes())
+    begin = 18 + int.from_bytes(data[14:18], "little")
+    second = begin + 8 + int.from_bytes(data[begin + 4 : begin + 8], "little")
+    data[second + 4 : second + 8] = (0x7FFFFFF0).to_bytes(4, "little")
+    (tmp_path / "e.aedat4").write_bytes(data)
+    with pytest.raises(AssetError, match=rf"a packet at byte {second} of 2147483632 bytes; .*or --damaged keep"):
+        open_events(tmp_path / "e.aedat4").read()
+    with open_events(tmp_path / "e.aedat4", EventReading(damaged="keep")) as file:
+        assert len(file.read()) == 100 and "kept: events before the damage: 100" in file.notes[0]
+    data[14:18] = (0x7FFFFFF0).to_bytes(4, "little")
+    (tmp_path / "e.aedat4").write_bytes(data)
+    with pytest.raises(AssetError, match="a header of 2147483632 bytes"):
+        open_events(tmp_path / "e.aedat4")

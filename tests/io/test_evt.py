@@ -42,8 +42,8 @@ def slow_evt3(words) -> list[tuple[int, int, int, int]]:
     for word in words:
         kind, rest = divmod(word, 1 << 12)
         found = []
-        if kind == 0:
-            row = rest % 2048
+        if kind <= 1:
+            row = rest % 2048 if kind == 0 else None
         elif kind == 2:
             found = [(rest % 2048, rest // 2048)]
         elif kind == 3:
@@ -55,9 +55,10 @@ def slow_evt3(words) -> list[tuple[int, int, int, int]]:
         elif kind == 6:
             low = rest
         elif kind == 8:
-            turns += high is not None and high - rest > 2**11
+            turns += high is not None and high - rest >= 2**11
+            low = low if rest == (high or 0) else 0
             high = rest
-        if high is not None:
+        if high is not None and row is not None:
             rows += [(x, row, (turns * 2**12 + high) * 4096 + low, p) for x, p in found]
     return rows
 
@@ -104,13 +105,25 @@ def test_random_words_of_evt3(tmp_path, block):
     for _ in range(600):
         kind = int(
             rng.choice(
-                [0, 2, 3, 4, 5, 6, 8, 7, 10, 14, 15], p=[0.1, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.025, 0.025, 0.025, 0.025]
+                [0, 1, 2, 3, 4, 5, 6, 8, 7, 10, 14, 15],
+                p=[0.1, 0.02, 0.28, 0.1, 0.1, 0.1, 0.1, 0.1, 0.025, 0.025, 0.025, 0.025],
             )
         )
         rest = int(rng.integers(0, 1 << 12))
         words.append(kind << 12 | (rest % 512 | rest & 0x800 if kind == 3 else rest & 0xFF if kind == 5 else rest))
     rows = decoded(tmp_path / "e.raw", "evt3", words, block)
     assert rows == slow_evt3(words) and len(rows) > 400
+
+
+def test_the_low_bits_belong_to_their_time_high(tmp_path):
+    """As OpenEB's decoder: a TIME_HIGH that differs clears them, one that repeats keeps them; the counter has wrapped
+    where it falls by half of its range."""
+    words = [0x8001, 0x6FA0, 5, 0x280A, 0x8002, 0x280B, 0x8003, 0x200C, 0x8004, 0x6FA1, 0x200D, 0x8004, 0x200E]
+    assert [t for _, _, t, _ in decoded(tmp_path / "e.raw", "evt3", words)] == [8096, 8192, 12288, 20385, 20385]
+    assert [t for _, _, t, _ in decoded(tmp_path / "e.raw", "evt3", [0x8800, 0x2001, 0x8000, 0x2001])] == [
+        1 << 23,
+        1 << 24,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -136,7 +149,7 @@ def test_a_vector_may_not_leave_the_row(tmp_path, words, bad):
     assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3000 | 2040, 0x5080]) == [(2047, 0, 0, 0)]
 
 
-@pytest.mark.parametrize("version, kinds", [("evt2", (2, 3, 7, 9, 11, 13)), ("evt3", (1, 9, 11, 12, 13))])
+@pytest.mark.parametrize("version, kinds", [("evt2", (2, 3, 7, 9, 11, 13)), ("evt3", (9, 11, 12, 13))])
 def test_kinds_of_words_that_do_not_exist(tmp_path, version, kinds):
     shift = 28 if version == "evt2" else 12
     for kind in kinds:

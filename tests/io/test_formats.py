@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from scipy.io import savemat
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.formats import convert, open_events, write_events
+from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
 from tests.io.some_events import same, some_events
 from tests.shared_data import shared
@@ -108,8 +111,9 @@ def test_real_recordings(tmp_path, name, kind, size, count):
         # keeps them.
         assert np.abs(a["t"].astype(np.int64) - events.t).max() <= (11 if kind == "evt3" else 0)
     source, written = convert(path, tmp_path / "e.h5")
-    assert written == count and (source.height, source.width) == size
-    assert same(open_events(tmp_path / "e.h5").read(), events)
+    assert written == count and (source.height, source.width) in (size, (None, None))
+    with open_events(tmp_path / "e.h5") as back:  # a size that the source lacks is not made up
+        assert (back.height, back.width) == (source.height, source.width) and same(back.read(), events)
 
 
 def test_event_stream(tmp_path):
@@ -119,11 +123,14 @@ def test_event_stream(tmp_path):
     for x, y, t, p in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist(), strict=True):
         gap, last = t - last, t
         data += b"\xff" * (gap // 127) + b"\xfe" + bytes([gap % 127 << 1 | p])
-        data += x.to_bytes(2, "little") + y.to_bytes(2, "little")
+        data += x.to_bytes(2, "little") + (179 - y).to_bytes(2, "little")  # y counts from the bottom
     (tmp_path / "e.es").write_bytes(data)
     with open_events(tmp_path / "e.es") as file:
         assert (file.height, file.width) == (180, 240) and same(file.read(), e)
-        assert same(Events.concatenate(list(file._reader.chunks(7))), e)
+        upside_down = replace(e, y=179 - e.y)
+        assert same(Events.concatenate(list(file._reader.chunks(7))), upside_down)
+    with open_events(tmp_path / "e.es", EventReading(origin="top")) as file:
+        assert same(file.read(), upside_down)
     (tmp_path / "e.es").write_bytes(data[:-1])
     with pytest.raises(AssetError, match="the last event is not whole"):
         open_events(tmp_path / "e.es").read()
@@ -147,9 +154,6 @@ def test_matlab(tmp_path):
         (tmp_path / "cut.mat").write_bytes(whole[:size])
         with pytest.raises(AssetError, match="damaged .mat|no column"):
             open_events(tmp_path / "cut.mat")
-    (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM" + bytes(200))
-    with pytest.raises(AssetError, match="version 7.3.*expected save"):
-        open_events(tmp_path / "new.mat")
 
 
 def test_times_named_by_their_unit_are_microseconds(tmp_path):
@@ -239,7 +243,8 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
 @pytest.mark.parametrize(
     "array, message",
     [
-        (np.zeros((5, 4)), "no column 't'.*plain array"),
+        (np.zeros((5, 3)), "no column 't'.*plain array"),
+        (np.zeros((5, 5)), r"columns without names .got \(5, 5\).; expected --columns x,y,t,p"),
         (np.zeros(3, [("t", "f8"), ("x", "i4"), ("y", "i4")]), "no column 'p'"),
         (
             np.array([(np.nan, 1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]),
@@ -251,7 +256,7 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
 def test_arrays_that_are_not_events(tmp_path, array, message):
     np.save(tmp_path / "e.npy", array)
     with pytest.raises(BlinkGLError, match=message):
-        open_events(tmp_path / "e.npy")
+        open_events(tmp_path / "e.npy").read()
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.io import atomic
+from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.formats import open_events
 from blinkgl.io.hdf5 import dataset, growing_dataset, open_hdf5, write_rows
 from blinkgl.io.records import read_text
@@ -98,8 +99,8 @@ def test_dsec_data_sets_of_wrong_shape_or_type(tmp_path, change, message):
             if name in file:
                 del file[name]
             file.create_group(name) if value is None else file.create_dataset(name, data=value)
-    with pytest.raises(BlinkGLError, match=message):
-        open_events(tmp_path / "e.h5").read()
+    with pytest.raises(BlinkGLError, match=message), DsecEventReader(tmp_path / "e.h5") as reader:
+        list(reader.chunks())
 
 
 def test_claims_without_data(tmp_path):
@@ -133,7 +134,7 @@ def test_a_filter_that_is_not_installed_is_named(tmp_path):
         space = h5py.h5s.create_simple((3,))
         made = h5py.h5d.create(file["events"].id, b"x", h5py.h5t.STD_U16LE, space, layout)
         made.write_direct_chunk((0,), np.zeros(3, np.uint16).tobytes())
-    with pytest.raises(AssetError, match="compressed with an HDF5 filter that is not installed .*hdf5plugin"):
+    with pytest.raises(AssetError, match="packed by an HDF5 filter that is not run here .*expected gzip"):
         open_events(path).read()
 
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError
+from blinkgl.io.reading import EventReading
 from blinkgl.io.text import TextReader, TextWriter
 from blinkgl.types.events import Events
 
 
-def read(path, text: str) -> Events:
+def read(path, text: str, unit: str | None = None) -> Events:
     path.write_text(text)
-    return Events.concatenate([Events.empty(), *TextReader(path).chunks()])
+    return Events.concatenate([Events.empty(), *TextReader(path, EventReading(time_unit=unit)).chunks()])
 
 
 def decimals(count: int) -> list[str]:
@@ -56,10 +57,10 @@ def test_times_are_the_nearest_microsecond(tmp_path):
     ]:
         exact = (Decimal(text) * 10**6).to_integral_value(ROUND_HALF_UP)
         if abs(exact) < 10**17:
-            assert read(tmp_path / "e.txt", f"{text} 1 2 1\n").t.tolist() == [int(exact)], text
+            assert read(tmp_path / "e.txt", f"{text} 1 2 1\n", "s").t.tolist() == [int(exact)], text
         elif abs(exact) > 10**19:
             with pytest.raises(AssetError, match="line 1 is not an event"):
-                read(tmp_path / "e.txt", f"{text} 1 2 1\n")
+                read(tmp_path / "e.txt", f"{text} 1 2 1\n", "s")
 
 
 @pytest.mark.parametrize(
@@ -92,17 +93,16 @@ def test_coordinates_and_polarities_that_are_none(tmp_path, line):
 
 
 @pytest.mark.parametrize(
-    "text, lines",
+    "text, times",
     [
-        ("0.5 1 2 1\n3 1 2 1\n", 2),
-        ("3 1 2 1\n# c\n0.5 1 2 1\n", 3),
-        ("0 1 2 1\n1.5 1 2 1\n2 1 1 1\n", 3),
-        ("1 1 2 1\n2e0 1 2 1\n", 2),
+        ("0.5 1 2 1\n3 1 2 1\n", [500_000, 3_000_000]),
+        ("0 1 2 1\n1.5 1 2 1\n2 1 1 1\n", [0, 1_500_000, 2_000_000]),
+        ("1 1 2 1\n2e0 1 2 1\n", [1, 2]),
     ],
 )
-def test_units_of_time_do_not_mix(tmp_path, text, lines):
-    with pytest.raises(AssetError, match=f"line {lines} has a time in another unit"):
-        read(tmp_path / "e.txt", text)
+def test_all_times_have_one_unit(tmp_path, text, times):
+    """Whether a time is written with a point says nothing about that line alone."""
+    assert read(tmp_path / "e.txt", text).t.tolist() == times
 
 
 def test_separators_comments_and_empty_lines(tmp_path):
@@ -129,11 +129,8 @@ def test_the_unit_that_a_name_says_binds(tmp_path, head, unit):
     path = tmp_path / "e.txt"
     for t, microseconds in (("0.5", 500_000), ("5", 5)):
         seconds = "." in t
-        if unit is None or (unit == 0.5) == seconds:
-            assert read(path, f"{head}\n{t} 1 2 1\n").t.tolist() == [microseconds]
-        else:
-            with pytest.raises(AssetError, match="line 2 has a time in another unit"):
-                read(path, f"{head}\n{t} 1 2 1\n")
+        said = microseconds if unit is None or (unit == 0.5) == seconds else 5_000_000 if unit == 0.5 else 1
+        assert read(path, f"{head}\n{t} 1 2 1\n").t.tolist() == [said]
 
 
 def test_the_longest_line(tmp_path):
@@ -156,7 +153,7 @@ def test_what_is_written_is_what_python_would_print(tmp_path, separator, unit):
         t,
         np.array([0, 1, 1, 0, 1, 0, 1], np.uint8),
     )
-    writer = TextWriter(tmp_path / "e.txt", 720, 1280, separator, time_unit=unit)
+    writer = TextWriter(tmp_path / "e.txt", 720, 1280, separator, write_unit=unit)
     writer.append(Events.empty())
     writer.append(events)
     writer.close()
@@ -167,5 +164,6 @@ def test_what_is_written_is_what_python_would_print(tmp_path, separator, unit):
         for k, v in enumerate(t)
     ]
     assert (tmp_path / "e.txt").read_text() == "".join(line + "\n" for line in head + rows)
-    back = Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(64)))
+    reading = EventReading(time_unit=None if separator == "," and unit == "us" else unit)
+    back = Events.concatenate(list(TextReader(tmp_path / "e.txt", reading).chunks(64)))
     assert all(np.array_equal(getattr(back, k), getattr(events, k)) for k in "xytp")

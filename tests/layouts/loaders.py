@@ -63,6 +63,7 @@ def dsec_sequence(folder, height, width):
     assert times.shape == (len(files), 2) and all(f.suffix == ".png" for f in files)
     images = np.loadtxt(folder / "images/timestamps.txt", dtype="int64")
     numbers = [int(f.stem) for f in files]
+    assert numbers[0] == 2, "bflow's asks for the number two before each"
     assert set(np.diff(numbers)) == {2}, "flow at half the images' rate: the window before flow k is that of k - 2"
     for number, file, (start, end) in zip(numbers, files, times.tolist()):
         assert images[number] == start and images[number + 2] == end

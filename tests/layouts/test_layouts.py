@@ -97,7 +97,7 @@ def test_dsec(data, sequence, tmp_path):
     events, found = read_events(sequence / "events.h5"), list(dsec_sequence(folder, HEIGHT, WIDTH))
     assert len(found) == 4
     for (number, start, end, flow, valid, before, during), k in zip(found, range(4)):
-        assert (number, start, end) == (2 * k, *label_times(sequence)[k])
+        assert (number, start, end) == (2 * k + 2, *label_times(sequence)[k])
         same(before, events.window(2 * start - end, start))
         same(during, events.window(start, end))
         true, _ = read_flow_npy(sequence / f"flow/forward_npy/{k:06d}.npy")
@@ -116,6 +116,23 @@ def test_dsec(data, sequence, tmp_path):
     assert (tmp_path / "dsec/test").is_dir(), "bflow's provider asserts both splits"
 
 
+def test_what_loaders_will_miss_is_said(data, stereo, tmp_path):
+    """A split that they open, a second camera, a second label; training sequences never land in test/."""
+    one = generate(tmp_path / "one", {**RECIPE, "time": {**RECIPE["time"], "duration": 0.1}})
+    said = {
+        "eraft": ["nothing in test/, which its loaders open"],
+        "mvsec": ["sequence_000000: no davis/right, which some loaders open (rig: stereo)"],
+        "dsec": [],
+    }
+    for layout, lines in said.items():
+        found = [s for s in export_layout(data, tmp_path / layout, layout).said if "published loaders expect" not in s]
+        assert found == lines and not list((tmp_path / layout).glob("test/*"))
+    assert not [s for s in export_layout(stereo, tmp_path / "two", "mvsec").said if "davis/right" in s]
+    assert "sequence_000000: one label, and bflow's loader opens two or more" in (
+        export_layout(one, tmp_path / "one_dsec", "dsec").said
+    )
+
+
 def test_dsecs_provider_is_named_where_it_finds_what_it_asserts(data, stereo, tmp_path):
     """It asserts a folder of disparities: a monocular data set is not for it."""
     opened_by = [export_layout(one, tmp_path / one.name, "dsec").opened_by for one in (data, stereo)]
@@ -124,11 +141,11 @@ def test_dsecs_provider_is_named_where_it_finds_what_it_asserts(data, stereo, tm
 
 
 def test_eraft(data, sequence, tmp_path):
-    folder = exported(data, tmp_path, "eraft") / "test/sequence_000000"
+    folder = exported(data, tmp_path, "eraft") / "train/sequence_000000"
     events, found = read_events(sequence / "events.h5"), list(eraft_sequence(folder, HEIGHT, WIDTH))
-    assert [number for number, *_ in found] == [2, 4, 6]
+    assert [number for number, *_ in found] == [2, 4, 6, 8]
     for number, t, before, after in found:
-        assert t == label_times(sequence)[number // 2, 0]
+        assert t == label_times(sequence)[number // 2 - 1, 0]
         same(before, events.window(t - 100_000, t))
         same(after, events.window(t, t + 100_000))
         assert (folder / f"flow/forward/{number:06d}.png").is_file()
@@ -209,6 +226,8 @@ def test_eventkubric(data, sequence, tmp_path, monkeypatch):
     np.testing.assert_array_equal(occluded, tracks["occluded"])
     for k, frame in enumerate(rgb):
         np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
+    with open_events(folder / "train/sequence_000000/events/0000000000.npz") as file:  # says its own unit, ns
+        assert file.read().t.tolist() == (part.t - tracks["t_us"][0]).tolist() and file.notes == []
 
 
 def test_generate_writes_a_layout_too_when_all_are_whole(tmp_path, capsys):
@@ -357,10 +376,10 @@ def test_a_stereo_rig_has_a_right_eye_disparity_and_a_calibration(stereo, tmp_pa
     poses = np.load(stereo / "left/poses.npz")
     eyes = {eye: read_events(stereo / eye / "events.h5") for eye in ("left", "right")}
     found = list(dsec_disparity(folder, HEIGHT, WIDTH))
-    assert len(found) == 1
-    for disparity, windows in found:
-        t = label_times(stereo / "left")[1, 0]
-        depth = 2.0 - poses["T_world_cam"][2, 0, 3]  # the wall's face is at x = 2
+    assert len(found) == 2, "the first of three, which the provider drops, is of no label"
+    for k, (disparity, windows) in enumerate(found):
+        t = label_times(stereo / "left")[k, 0]
+        depth = 2.0 - poses["T_world_cam"][k + 1, 0, 3]  # the wall's face is at x = 2
         assert disparity == pytest.approx(poses["K"][0, 0] * 0.1 / depth, abs=0.5 / 256 + 1e-5)
         for eye, window in windows.items():
             same(window, eyes[eye].window(t - 50_000, t))
@@ -399,3 +418,62 @@ def test_a_lens_that_distorts_has_its_rectify_map_and_truth_that_is_rectified(tm
     calibration = yaml.safe_load((folder / "calibration/cam_to_cam.yaml").read_text())
     assert calibration["intrinsics"]["cam0"]["distortion_coeffs"] == pytest.approx([-0.2, 0.05, 0, 0])
     assert list(dsec_sequence(folder, HEIGHT, WIDTH))
+
+
+def messages(path):
+    """Topic -> [(time, message)], by rosbags' own deserialisation."""
+    rosbags = pytest.importorskip("rosbags.highlevel", reason="optional extra [formats]")
+    found = {}
+    with rosbags.AnyReader([path]) as bag:
+        for connection, t_ns, data in bag.messages():
+            found.setdefault(connection.topic, []).append((t_ns, bag.deserialize(data, connection.msgtype)))
+    return found
+
+
+def test_rosbag_on_the_topics_of_esim(data, sequence, tmp_path):
+    """Events, images, depth, flow in px/s, poses and the inertial unit, at their own times."""
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
+    path = exported(data, tmp_path, "rosbag") / "train/sequence_000000.bag"
+    found, events = messages(path), read_events(sequence / "events.h5")
+    assert set(found) == {"/imu", "/pose"} | {
+        f"/cam0/{name}" for name in ("events", "image_raw", "camera_info", "depthmap", "optic_flow")
+    }
+    with open_events(path) as file:
+        assert (file.height, file.width) == (HEIGHT, WIDTH) and file.notes == []
+        same([getattr(file.read(), k) for k in "xytp"], events)
+    rows = [e for _, message in found["/cam0/events"] for e in message.events]
+    assert [(e.x, e.y, e.ts.sec * 10**6 + e.ts.nanosec // 1000, int(e.polarity)) for e in rows] == list(
+        zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist())
+    )
+    times, labels = np.loadtxt(sequence / "images/timestamps.txt", dtype="int64"), label_times(sequence)
+    for topic, at in (("image_raw", times), ("camera_info", times), ("depthmap", labels[:, 0])):
+        assert [t for t, _ in found[f"/cam0/{topic}"]] == (at * 1000).tolist()
+    for k, (_, image) in enumerate(found["/cam0/image_raw"]):
+        grey = cv2.imread(str(sequence / f"images/{k:06d}.png"), 0)
+        assert image.encoding == "mono8" and np.abs(image.data.reshape(HEIGHT, WIDTH).astype(int) - grey).max() <= 1
+    for k, (_, depth) in enumerate(found["/cam0/depthmap"]):
+        values = depth.data.view("<f4").reshape(HEIGHT, WIDTH)
+        np.testing.assert_array_equal(values, np.load(sequence / f"depth/{k:06d}.npy"))
+    for k, (t_ns, flow) in enumerate(found["/cam0/optic_flow"]):
+        true = np.load(sequence / f"flow/forward_npy/{k:06d}.npy")
+        speed = np.where(true[..., 2] > 0, true[..., 0] * 10, np.nan)  # 100 ms
+        np.testing.assert_allclose(flow.flow_x.reshape(HEIGHT, WIDTH), speed, rtol=1e-6)
+        assert t_ns == labels[k, 0] * 1000
+    poses = np.load(sequence / "poses.npz")
+    for (t_ns, message), t, T in zip(found["/pose"], poses["t_ns"], poses["T_world_cam"], strict=True):
+        q, p = message.pose.orientation, message.pose.position
+        np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), T[:3, :3], atol=1e-12)
+        assert (t_ns, [p.x, p.y, p.z]) == (t, T[:3, 3].tolist())
+    K = found["/cam0/camera_info"][0][1].K
+    np.testing.assert_array_equal(K.reshape(3, 3), poses["K"])
+    imu = read_imu(sequence)
+    np.testing.assert_array_equal([m.linear_acceleration.x for _, m in found["/imu"]], imu["acceleration"][:, 0])
+
+
+def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
+    path = exported(stereo.parents[1], tmp_path, "rosbag") / "train/sequence_000000.bag"
+    with open_events(path) as file:
+        assert file.notes == ["2 topics of events: /cam0/events is read (--stream for another)"]
+        same([getattr(file.read(), k) for k in "xytp"], read_events(stereo / "left/events.h5"))
+    assert export_layout(bare, tmp_path / "bare", "rosbag").said == ()

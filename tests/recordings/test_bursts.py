@@ -40,7 +40,7 @@ def test_bursts_at_the_frames_interval():
 
 def test_of_a_davis():
     """slider_depth: four intervals of 38.8 ms, ON at each, OFF a ms after two of them; 12 % of all events."""
-    events, _ = read_recording(shared("data/events/slider_depth/events_chunk.txt"))
+    events, _, _ = read_recording(shared("data/events/slider_depth/events_chunk.txt"))
     spans = frame_bursts(events, 38_770)
     assert len(spans) == 6
     assert 0.10 < inside_any(events.t, spans).mean() < 0.13

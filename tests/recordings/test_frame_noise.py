@@ -243,7 +243,7 @@ def test_still_pixels_of_a_recording():
     """cuke_davis346, a still camera: of the pixels where nothing changes no more events are left than the camera's
     own, where there were many times as many."""
     path = shared("data/events/cuke_davis346/demo-01.aedat4")
-    events, size = read_recording(path)
+    events, size, _ = read_recording(path)
     frames, exposures = timed_frames(path)
     clip = clip_of_frames(events, frames, size, FrameReading(exposures=exposures, delay_ms=5.0))
     rate = lambda stream: np.count_nonzero(clip.still[stream.y, stream.x])

@@ -1,0 +1,94 @@
+"""Formats whose events are records of one length: Prophesee's ``.dat`` and the ``.bin`` of N-MNIST and N-Caltech101.
+
+.dat (Prophesee, "DAT format" page): lines that begin with ``%``, of which ``% Height`` and ``% Width`` matter; two
+bytes, type of event (0 and 12: x, y, polarity) and bytes a record (8); then t uint32 µs, which wraps after 71.6
+minutes, and an address, x in bits 13..0, y 27..14, polarity from 28 (version 2; of version 1 x in bits 8..0, y 16..9,
+polarity 17).
+.bin (Orchard et al. 2015): 40 bits, big-endian: x 8, y 8, polarity 1, t 23 bits µs. y = 240 marks no event but that
+2^13 µs have passed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.types.events import Events
+
+_DAT = np.dtype([("t", "<u4"), ("address", "<u4")])
+_NMNIST = np.dtype([("x", "u1"), ("y", "u1"), ("high", "u1"), ("low", ">u2")])
+_LONGEST_HEADER = 1 << 16
+_PASSES, _PASSED_US = 240, 1 << 13
+_SHORT, _LONG = (0x1FF, 9, 0xFF, 17), (0x3FFF, 14, 0x3FFF, 28)
+"""Masks and shifts of a .dat address: x, then y, then polarity; of version 1 and 2."""
+
+
+def _records(file: BinaryIO, path: Path, dtype: np.dtype, count: int) -> Iterator[np.ndarray]:
+    while data := file.read(count * dtype.itemsize):
+        if len(data) >= dtype.itemsize:
+            yield np.frombuffer(data, dtype, len(data) // dtype.itemsize)
+        if stray := len(data) % dtype.itemsize:
+            raise AssetError(f"truncated: {stray} stray bytes after the last event", where=str(path))
+
+
+class DatReader:
+    """Size and events of a .dat file. Raises AssetError: another type of events, truncated."""
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path = Path(path)
+        with open(path, "rb") as file:
+            begin = file.read(_LONGEST_HEADER)
+        found = re.match(rb"(?:% [^\n]*\n)*", begin)
+        header, self._start = found[0].decode("latin-1") if found else "", found.end() + 2 if found else 2
+        kind = begin[self._start - 2 : self._start]
+        if len(kind) < 2 or kind[0] not in (0, 12) or kind[1] != _DAT.itemsize:
+            raise AssetError(
+                "not a .dat file of events", where=str(path), value=kind, accepted="type 0 or 12, 8 bytes an event"
+            )
+        sides = {k.lower(): int(v) for k, v in re.findall(r"^% (Height|Width) (\d{1,5})\s*$", header, re.M)}
+        self.height, self.width = sides.get("height"), sides.get("width")
+        version = re.search(r"^% Version (\d)", header, re.M)
+        self._places = _LONG if version and version[1] == "2" else _SHORT
+
+    def chunks(self, count: int = 1 << 20) -> Iterator[Events]:
+        """Yield all events."""
+        x_mask, y_from, y_mask, p_from = self._places
+        wraps, last = 0, 0
+        with open(self.path, "rb") as file:
+            file.seek(self._start)
+            for rows in _records(file, self.path, _DAT, count):
+                t, address = rows["t"].astype(np.int64), rows["address"]
+                # A step back by more than half of the counter's range is its wrap.
+                turns = wraps + np.cumsum(np.diff(t, prepend=last) < -(1 << 31))
+                wraps, last = int(turns[-1]), int(t[-1])
+                x, y = address & x_mask, address >> y_from & y_mask
+                p = (address >> p_from & 1).astype(np.uint8)
+                yield Events(x.astype(np.uint16), y.astype(np.uint16), t + (turns << 32), p)
+
+
+class NMnistReader:
+    """Events of a .bin file; it has no size. Raises AssetError: truncated."""
+
+    height = width = None
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path = Path(path)
+
+    def chunks(self, count: int = 1 << 20) -> Iterator[Events]:
+        """Yield all events."""
+        passed = 0
+        with open(self.path, "rb") as file:
+            for rows in _records(file, self.path, _NMNIST, count):
+                marks = rows["y"] == _PASSES
+                base = passed + np.cumsum(marks) * _PASSED_US
+                passed = int(base[-1])
+                t = ((rows["high"].astype(np.int64) & 0x7F) << 16) + rows["low"] + base
+                x, y, p = rows["x"].astype(np.uint16), rows["y"].astype(np.uint16), rows["high"] >> 7
+                yield Events(x, y, t, p).part(~marks)

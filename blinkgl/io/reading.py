@@ -1,0 +1,116 @@
+"""What a user declares about an event file. What is not declared is read from the file; the rest is guessed, and said.
+
+One value of :class:`EventReading` passes from a command's options, or a Python function's arguments, to every reader.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from blinkgl.errors import ConfigError
+from blinkgl.io.clock import checked_unit
+
+_MOST_SIDE = 65536
+
+
+@dataclass(frozen=True)
+class EventReading:
+    """Declarations about an event file; None: as the file says, else guessed.
+
+    time_unit : "s", "ms", "us" or "ns".   size : (height, width), px.   origin : "top" or "bottom", the row with y 0.
+    columns : order of the columns of a table, "_" for one to ignore, or "x=NAME" for the array that holds x.
+    polarity : the numbers that mean OFF and ON.   stream : number of one of several streams of events.
+    damaged : "refuse", or "keep" what is whole.   sort : put events in order of time.
+    """
+
+    time_unit: str | None = None
+    size: tuple[int, int] | None = None
+    origin: str | None = None
+    columns: tuple[str, ...] | None = None
+    polarity: tuple[float, float] | None = None
+    stream: int | None = None
+    damaged: str = "refuse"
+    sort: bool = False
+
+    @property
+    def keep(self) -> bool:
+        """Return whether the whole parts of damaged files are kept."""
+        return self.damaged == "keep"
+
+    @property
+    def named(self) -> dict[str, str]:
+        """Return column -> name of its array, as declared."""
+        return dict(entry.split("=", 1) for entry in self.columns or () if "=" in entry)
+
+    @classmethod
+    def of(
+        cls,
+        time_unit: str | None = None,
+        size: str | Sequence[int] | None = None,
+        origin: str | None = None,
+        columns: str | Sequence[str] | None = None,
+        polarity: str | Sequence[float] | None = None,
+        stream: int | None = None,
+        damaged: str = "refuse",
+        sort: bool = False,
+    ) -> EventReading:
+        """Return the declarations of options: size as "WIDTHxHEIGHT" or (height, width), columns as "x,y,t,p", polarity
+        as "OFF/ON" ("-1/1"), or sequences of such. Raises ConfigError, naming the option."""
+        for option, value, known in (("origin", origin, (None, "top", "bottom")), ("damaged", damaged, _DAMAGED)):
+            if value not in known:
+                raise _refused(option, value, " or ".join(word for word in known if word))
+        return cls(
+            checked_unit(time_unit),
+            parsed_size(size) if size is None or isinstance(size, str) else (int(size[0]), int(size[1])),
+            origin,
+            _columns(columns),
+            _polarity(polarity),
+            stream,
+            damaged,
+            sort,
+        )
+
+
+_DAMAGED = ("refuse", "keep")
+AS_FILE = EventReading()
+"""Nothing is declared."""
+
+
+def parsed_size(text: str | None) -> tuple[int, int] | None:
+    """Return (height, width) of ``WIDTHxHEIGHT``. Raises ConfigError."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+    if not found or not all(0 < int(side) <= _MOST_SIDE for side in found.groups()):
+        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
+    return int(found[2]), int(found[1])
+
+
+def _columns(columns: str | Sequence[str] | None) -> tuple[str, ...] | None:
+    if columns is None:
+        return None
+    entries = tuple(part.strip() for part in (columns.split(",") if isinstance(columns, str) else columns))
+    slots = [entry.split("=", 1)[0] for entry in entries if entry != "_"]
+    whole = any("=" in entry for entry in entries) or len(slots) == 4
+    if not whole or len(set(slots)) != len(slots) or not set(slots) <= set("xytp"):
+        raise _refused("columns", columns, "x, y, t and p in the file's order, _ for others; or names, as t=stamp")
+    return entries
+
+
+def _polarity(polarity: str | Sequence[float] | None) -> tuple[float, float] | None:
+    if polarity is None:
+        return None
+    try:
+        off, on = (float(v) for v in (polarity.split("/") if isinstance(polarity, str) else polarity))
+    except (ValueError, TypeError):
+        off = on = 0.0
+    if off == on:
+        raise _refused("polarity", polarity, "the numbers of OFF and ON: 0/1, -1/1, 1/0 …")
+    return off, on
+
+
+def _refused(option: str, value: Any, accepted: str) -> ConfigError:
+    return ConfigError(f"cannot read --{option}", where=f"--{option}", value=value, accepted=accepted)

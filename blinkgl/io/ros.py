@@ -1,0 +1,174 @@
+"""Events in ROS 1 and 2 bags and MCAP files, read by the package rosbags.
+
+``dvs_msgs/EventArray`` and ``prophesee_event_msgs/EventArray`` hold rows x, y, time, polarity, which are read as arrays
+and not event by event; ``event_camera_msgs/EventPacket`` holds a camera's own bytes, of which EVT3 and ``mono`` are
+read. Times are the events' own: ROS time, or the camera's for EVT3.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.io.columns import events_of, joined
+from blinkgl.io.evt import START, decode
+from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.machine.extras import install
+from blinkgl.types.events import Events
+
+_HEADER = "std_msgs/Header header\nuint32 height\nuint32 width\n"
+FLOW = "esim_msgs/msg/OpticFlow"
+_EVENT = "uint16 x\nuint16 y\ntime ts\nbool polarity\n"
+DEFINITIONS = {
+    "dvs_msgs/msg/Event": _EVENT,
+    "dvs_msgs/msg/EventArray": f"{_HEADER}dvs_msgs/Event[] events\n",
+    "prophesee_event_msgs/msg/Event": _EVENT,
+    "prophesee_event_msgs/msg/EventArray": f"{_HEADER}prophesee_event_msgs/Event[] events\n",
+    "event_camera_msgs/msg/EventPacket": f"{_HEADER}uint64 seq\nuint64 time_base\nstring encoding\nbool is_bigendian\n"
+    "uint8[] events\n",
+    FLOW: f"{_HEADER}float32[] flow_x\nfloat32[] flow_y\n",
+}
+"""Messages of event cameras, as their packages define them (for bags that do not say)."""
+_EVENTS = frozenset(DEFINITIONS) - {FLOW}
+_PACKET = "event_camera_msgs/msg/EventPacket"
+_FIELDS = [("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")]
+_PACKED = np.dtype(_FIELDS)
+"""An event of a ROS 1 message; of ROS 2 the first one."""
+_ALIGNED = np.dtype(
+    {"names": [k for k, _ in _FIELDS], "formats": [f for _, f in _FIELDS], "offsets": [1, 3, 7, 11, 15]}
+)
+"""Every later event of a ROS 2 message: from the polarity before it, times on multiples of four bytes."""
+
+
+def typestore(ros2: bool) -> Any:
+    """Return rosbags' table of messages, with those of events. Raises AssetError: rosbags is not installed."""
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise AssetError("bags are read by the package rosbags", accepted=f"run {install('rosbags')}") from None
+    store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
+    types: dict[str, Any] = {}
+    for name, text in DEFINITIONS.items():
+        types |= get_types_from_msg(text, name)
+    store.register(types)
+    return store
+
+
+class BagReader:
+    """The events of one topic; of several the first by name, or another by ``stream``. height, width : px, of its first
+    message.   notes : a line where there are several topics. Raises AssetError: damaged, no topic of events."""
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path, self.notes = Path(path), []
+        self.height = self.width = None
+        with self._opened() as bag:
+            self._topics = sorted({c.topic for c in bag.connections if c.msgtype in _EVENTS})
+            number = reading.stream or 0
+            if not 0 <= number < len(self._topics):
+                raise AssetError(
+                    "no such topic of events" if self._topics else "no topic of events",
+                    where=str(path),
+                    value=number if self._topics else sorted({c.msgtype for c in bag.connections})[:8],
+                    accepted=", ".join(f"--stream {k} ({topic})" for k, topic in enumerate(self._topics))
+                    or "dvs_msgs/EventArray, prophesee_event_msgs/EventArray or event_camera_msgs/EventPacket",
+                )
+            self._topic = self._topics[number]
+            if len(self._topics) > 1:
+                self.notes = [f"{len(self._topics)} topics of events: {self._topic} is read (--stream for another)"]
+            for _, _, (height, width) in self._messages(bag):
+                self.height, self.width = (height, width) if height and width else (None, None)
+                break
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[Any]:
+        ros2 = self.path.suffix.lower() != ".bag"
+        store = typestore(ros2)
+        from rosbags.highlevel import AnyReader
+
+        try:
+            with AnyReader([self.path], default_typestore=store) as bag:
+                yield bag
+        except (AssetError, GeneratorExit):
+            raise
+        except Exception as error:
+            text = " ".join(str(error).split())[:160] or type(error).__name__
+            raise AssetError(f"damaged bag: {text}", where=str(self.path)) from error
+
+    def _messages(self, bag: Any) -> Iterator[tuple[Any, Any, tuple[int, int]]]:
+        """Yield, for each message of the topic, its connection, its content, and (height, width)."""
+        for connection, _, data in bag.messages([c for c in bag.connections if c.topic == self._topic]):
+            if connection.msgtype == _PACKET:
+                message = bag.deserialize(data, connection.msgtype)
+                yield connection, message, (message.height, message.width)
+            else:
+                rows, size = _rows(data, bag.is2)
+                yield connection, rows, size
+
+    def chunks(self, least: int = 1 << 20) -> Iterator[Events]:
+        """Yield all events, joined to about ``least``."""
+        yield from joined(self._events(), least)
+
+    def _events(self) -> Iterator[Events]:
+        state, first = START["evt3"].copy(), 0
+        with self._opened() as bag:
+            for connection, content, _ in self._messages(bag):
+                packet = connection.msgtype == _PACKET
+                events = _unpacked(content, state, self.path) if packet else _timed(content, str(self.path), first)
+                first += len(events)
+                yield events
+
+
+def _rows(data: memoryview | bytes, ros2: bool) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return the rows of an EventArray, and (height, width). The header is ROS 1's sequence number, time and name of a
+    frame; in ROS 2 without the number, and with numbers on multiples of four bytes after a mark of four."""
+    at = 12
+    at += 4 + int.from_bytes(data[at : at + 4], "little")
+    if ros2:
+        if bytes(data[:2]) != b"\0\1":
+            raise ValueError("not little-endian CDR")
+        at += -at % 4
+    height, width, count = np.frombuffer(data, "<u4", 3, at).tolist()
+    at += 12
+    if not ros2 or not count:
+        return np.frombuffer(data, _PACKED, count, at), (height, width)
+    rows = np.empty(count, _PACKED)
+    rows[0] = np.frombuffer(data, _PACKED, 1, at)[0]
+    rows[1:] = np.frombuffer(data, _ALIGNED, count - 1, at + _PACKED.itemsize) if count > 1 else []
+    return rows, (height, width)
+
+
+def event_array(events: Events, height: int, width: int) -> tuple[str, bytes]:
+    """Return the type and the bytes of a ROS 1 message, ``dvs_msgs/EventArray``, stamped by its last event."""
+    rows = np.zeros(len(events), _PACKED)
+    rows["x"], rows["y"], rows["p"] = events.x, events.y, events.p
+    rows["s"], rows["ns"] = events.t // 10**6, events.t % 10**6 * 1000
+    # Number in sequence, time, an empty name of a frame; height, width, count.
+    header = np.array([0, rows["s"][-1], rows["ns"][-1], 0, height, width, len(events)], "<u4")
+    return "dvs_msgs/msg/EventArray", header.tobytes() + rows.tobytes()
+
+
+def _timed(rows: np.ndarray, where: str, first: int) -> Events:
+    t = rows["s"].astype(np.int64) * 1_000_000 + (rows["ns"].astype(np.int64) + 500) // 1000
+    return events_of(rows["x"], rows["y"], t, rows["p"], where, first)
+
+
+def _unpacked(message: Any, state: np.ndarray, path: Path) -> Events:
+    """Return the events of an EventPacket. state : of the EVT3 decoder, which goes on from packet to packet."""
+    data = np.ascontiguousarray(message.events)
+    if message.encoding == "evt3":
+        events, bad = decode("evt3", data.view("<u2"), state)
+        if bad >= 0:
+            raise ValueError(f"no valid EVT3 word in packet {message.seq}")
+        return events
+    if message.encoding == "mono":  # p 1 bit, y 15, x 16, ns since time_base 32
+        words = data.view(">u8" if message.is_bigendian else "<u8")
+        t = (np.int64(message.time_base) + (words & 0xFFFFFFFF).astype(np.int64) + 500) // 1000
+        x, y = (words >> 32 & 0xFFFF).astype(np.uint16), (words >> 48 & 0x7FFF).astype(np.uint16)
+        return Events(x, y, t, (words >> 63).astype(np.uint8))
+    raise AssetError("unknown encoding of events", where=str(path), value=message.encoding, accepted="evt3 or mono")

@@ -29,8 +29,8 @@ from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
-from blinkgl.io.stamps import read_timestamps
 from blinkgl.io.rows import is_number, read_rows, titles_of
+from blinkgl.io.stamps import read_timestamps
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")

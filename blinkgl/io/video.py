@@ -11,6 +11,7 @@ import errno
 import functools
 import os
 import re
+import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -23,6 +24,7 @@ from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.alpha import over
 from blinkgl.io.ticks import frame_times
 from blinkgl.io.yuv import known, rgb_from_yuv
+from blinkgl.machine.interrupts import uninterrupted
 
 if TYPE_CHECKING:
     import av
@@ -401,8 +403,8 @@ def decode_exr(data: bytes, where: str) -> np.ndarray:
 
 @functools.cache
 def _imported() -> Any:
-    import av
-
+    with uninterrupted(signal.SIGINT, signal.SIGTERM):
+        import av
     return av
 
 

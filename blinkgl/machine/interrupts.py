@@ -53,3 +53,22 @@ def interruptible(*numbers: int) -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         sys.unraisablehook = hook_before
+
+
+@contextlib.contextmanager
+def uninterrupted(*numbers: int) -> Iterator[None]:
+    """Signals ``numbers`` that come inside take effect at the end: an exception in the middle of the import of extension
+    modules leaves them half initialised, and they end the process later. In another thread than the main one, which no
+    handler interrupts, nothing changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)

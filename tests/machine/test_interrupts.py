@@ -87,3 +87,13 @@ def test_another_thread_is_left_alone():
     thread.start()
     thread.join()
     assert found == [signal.getsignal(signal.SIGTERM)]
+
+
+def test_a_signal_waits_until_what_must_not_be_interrupted_is_done():
+    from blinkgl.machine.interrupts import uninterrupted
+
+    done = []
+    with pytest.raises(KeyboardInterrupt), uninterrupted(signal.SIGINT):
+        signal.raise_signal(signal.SIGINT)
+        done.append("whole")
+    assert done == ["whole"]

@@ -57,9 +57,9 @@ def interruptible(*numbers: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def uninterrupted(*numbers: int) -> Iterator[None]:
-    """Signals ``numbers`` that come inside take effect at the end: an exception in the middle of the import of extension
-    modules leaves them half initialised, and they end the process later. In another thread than the main one, which no
-    handler interrupts, nothing changes."""
+    """Signals ``numbers`` that come inside take effect at the end: an exception in the middle of the import of
+    extension modules leaves them half initialised, and they end the process later. In another thread than the main one,
+    which no handler interrupts, nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

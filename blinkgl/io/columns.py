@@ -70,6 +70,8 @@ def microseconds(times: np.ndarray, where: str, first: int = 0, unit_ns: int = 1
     times = np.asarray(times)
     if times.dtype.kind not in "iufb":
         raise AssetError("event column 't' holds no numbers", where=where, value=str(times.dtype))
+    if times.dtype.kind in "iu" and unit_ns == 1000 and len(times) and abs(int(times.max())) < _MAX_TIME:
+        return times.astype(np.int64, copy=False)
     scale = unit_ns / 1000
     rounded = np.rint(times.astype(np.float64, copy=False) * scale)
     if len(times) and not (good := np.abs(rounded) < _MAX_TIME).all():  # NaN compares False

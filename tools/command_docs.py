@@ -24,7 +24,7 @@ Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `
 `shader check` found something wrong; 2 your input or the machine (`error: …`, one line); 3 done but for
 sequences (`trade --suite`: scenes) that were set aside; 130 interrupted.
 """
-SHARED_BY = 3
+SHARED_BY = 2
 """An option of so many commands is described once."""
 HEAD = "|option|meaning|default, limits|\n|---|---|---|\n"
 REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
@@ -63,7 +63,7 @@ def _section(name: str, command, rows: list[str], shared: list[str]) -> str:
     context = typer.Context(command, info_name=name)
     usage = " ".join([name, *(piece.strip("{}") for piece in command.collect_usage_pieces(context))])
     own = [row for row in rows if row not in shared]
-    also = ", ".join(row.split("|")[1] for row in rows if row in shared)
+    also = ", ".join(re.sub(r" <\w+>", "", row.split("|")[1]) for row in rows if row in shared)
     table = f"\n{HEAD}{''.join(own)}" if own else ""
     return (
         f"\n## {name}\n\n{' '.join((command.help or '').split())}\n\n```\n{usage}\n```\n{table}"

@@ -7,7 +7,9 @@
 
 Two tables of medians, each of the network's flow as it is and as long as makes the events sharpest (`eflow predict`):
 over the windows of a rendered pool, by their true length; and over pans across photographs (one velocity everywhere,
-three speeds, three emulators), by the length of a window. At pixels with events.
+three speeds, three emulators), by the length of a window. At pixels with events. ``--views`` prints three tables of
+errors over all pixels, as shares of zero flow's: of each view; of thinned windows beside others with so few events; of
+tripled ones by the length of their flow.
 """
 
 from __future__ import annotations

@@ -141,8 +141,7 @@ class Radtan(DistortedModel):
         xy = np.asarray(xy, np.float64)
         u = self.rays(xy).reshape(-1, 3)[:, :2]
         D = self._distort(u)[1]
-        # Cramer's rule: a nan, where there is no ray, passes through, while np.linalg.inv would refuse a singular
-        # matrix.
+        # Cramer's rule, through which the nan of a pixel without a ray passes.
         inverse = np.stack([D[:, 1, 1], -D[:, 0, 1], -D[:, 1, 0], D[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
         inverse /= (D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0])[:, None, None]
         out = np.concatenate([inverse / [self.fx, self.fy], 0.0 * inverse[:, :1]], axis=1)

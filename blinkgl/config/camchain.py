@@ -259,6 +259,9 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
     model = table.get("camera_model", "pinhole")
     if model != "pinhole":
         raise ConfigError("unsupported camera model", where=f"{where}.camera_model", value=model, accepted="pinhole")
+    if table.get("flip") is True:
+        accepted = "the calibration of images as they are stored"
+        raise ConfigError("of images turned upside down first", where=f"{where}.flip", value=True, accepted=accepted)
     size = _numbers(table, "resolution", (2,), where)
     if any(v != round(v) for v in size):
         raise ConfigError("not a size", where=f"{where}.resolution", value=size, accepted="[width, height], whole px")

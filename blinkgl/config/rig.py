@@ -129,8 +129,9 @@ class RigSensorConfig(Config):
 
     @property
     def sees(self) -> bool:
-        """Return whether it is a camera."""
-        return self.events is not None or self.images is not None
+        """Return whether it is a camera: of events, of images, or of labels alone."""
+        told = self.tracks is not None or self.labels != LabelsConfig(images=False, flow=())
+        return self.events is not None or self.images is not None or told
 
 
 def load_rig(name: Any) -> list[dict[str, Any]]:
@@ -206,7 +207,7 @@ def _complete(
             )
     other = own.get("images") is not None or own.get("imu") is not None
     events = own["events"] is not None if "events" in own else not other
-    camera = events or own.get("images") is not None
+    camera = events or any(own.get(key) for key in ("labels", "tracks")) or own.get("images") is not None
     keys = [key for key in INHERITED if key in tree and (events or key in ("camera", "sensor"))]
     sections = {key: own[key] for key in SECTIONS if key in own and (events or key not in ("events", "readout"))}
     above = {key: copy.deepcopy(tree[key]) for key in keys if camera}

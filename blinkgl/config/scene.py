@@ -55,7 +55,7 @@ class ObjectsConfig(Config):
 
 BOTH_SIDES = Field(
     None,
-    description="false: faces of files are drawn from their front alone; null: as each [file says](scenes.md#sides)",
+    description="faces of files: true both sides, false the front alone; null: as each [file says](scenes.md#sides)",
 )
 
 

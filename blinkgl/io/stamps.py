@@ -14,9 +14,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
-
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?")
-_COLUMN = re.compile(r"[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
+from blinkgl.io.rows import is_number, read_rows, titles_of
 
 
 @dataclass(frozen=True)
@@ -40,18 +38,19 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
     Raises AssetError: unreadable. EventDataError: not a time, with its line; two units in one list; no times.
     ConfigError: "frames" without fps."""
     try:
-        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    heading, rows, numbers = _rows(lines, path)
+    heading, numbered = read_rows(text)
+    rows = [fields for _, fields in numbered]
     if not rows:
         raise EventDataError("no time stamps", where=str(path))
-    titles = _COLUMN.findall(heading)
+    titles = titles_of(heading)
     columns = _time_columns(rows, titles)
     texts: list[str] = []
-    for row, number in zip(rows, numbers):
+    for number, row in numbered:
         chosen = [row[k] for k in columns if k < len(row)]
-        if len(chosen) < len(columns) or not all(map(_is_number, chosen)):
+        if len(chosen) < len(columns) or not all(map(is_number, chosen)):
             raise EventDataError(
                 f"line {number} is not a time stamp",
                 where=str(path),
@@ -88,31 +87,6 @@ def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str)
     return Stamps(nanoseconds(values, found), None, found.line)
 
 
-def _rows(lines: Sequence[str], path: Path) -> tuple[str, list[list[str]], list[int]]:
-    """Return the heading, the fields of each line, and the lines' numbers."""
-    heading, rows, numbers = "", [], []
-    for number, line in enumerate(lines, 1):
-        text, _, comment = line.partition("#")
-        if not text.strip():
-            # The last comment before the first line of data is the heading, if any is.
-            heading = comment.strip() if comment.strip() and not rows else heading
-            continue
-        fields = text.replace(",", " ").replace(";", " ").split()
-        if not rows and not heading and not any(_is_number(part) for part in fields):
-            heading = text.strip()
-            continue
-        if not rows and len(fields) > 1 and not any(_is_number(part) for part in fields):
-            heading = text.strip()
-            continue
-        rows.append(fields)
-        numbers.append(number)
-    return heading, rows, numbers
-
-
-def _is_number(text: str) -> bool:
-    return _NUMBER.fullmatch(text) is not None
-
-
 def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[int]:
     """Return the column of the times, or the two whose middle is the time."""
     width = min(len(row) for row in rows)
@@ -123,10 +97,10 @@ def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[
         called = [k for k, title in enumerate(titles) if re.match(r"(#|.*[_ ])?(time|t|ts|stamp)", title, re.I)]
         if called:
             return called[:1]
-    numeric = [k for k in range(width) if all(_is_number(row[k]) for row in rows)]
+    numeric = [k for k in range(width) if all(is_number(row[k]) for row in rows)]
     if len(numeric) < 2:
         # One odd line among numbers is named by its line, so the first column stays the time.
-        return numeric[:1] if numeric and not _is_number(rows[0][0]) else [0]
+        return numeric[:1] if numeric and not is_number(rows[0][0]) else [0]
     first = [Fraction(row[numeric[0]]) for row in rows]
     counts = len(first) > 2 and first[0] in (0, 1) and all(b - a == 1 for a, b in pairwise(first))
     return [numeric[1] if counts else numeric[0]]
@@ -135,15 +109,15 @@ def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[
 def _names(rows: Sequence[Sequence[str]], columns: Sequence[int], path: Path) -> list[str] | None:
     others = [[" ".join(part for k, part in enumerate(row) if k not in columns)] for row in rows]
     names = [other[0] or None for other in others]
-    if all(name is None or _is_number(name) for name in names):
+    if all(name is None or is_number(name) for name in names):
         return None
     if None in names:
         raise EventDataError(
             "times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line"
         )
     # A row of other columns and one name: the name has a letter.
-    return [next((part for part in reversed(str(name).split(" ")) if not _is_number(part)), str(name))
-            if len(rows[k]) > 2 and any(_is_number(part) for part in str(name).split(" ")) else str(name)
+    return [next((part for part in reversed(str(name).split(" ")) if not is_number(part)), str(name))
+            if len(rows[k]) > 2 and any(is_number(part) for part in str(name).split(" ")) else str(name)
             for k, name in enumerate(names)]  # fmt: skip
 
 

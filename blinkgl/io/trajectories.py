@@ -29,12 +29,12 @@ from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
+from blinkgl.io.rows import is_number, read_rows, titles_of
 from blinkgl.io.stamps import read_timestamps
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")
 MAPS_FROM = ("camera", "world")
-_MOST_LINES = 5_000_000
 _GAP = 20
 """A step this many times the usual one is a gap."""
 _COLUMNS = {
@@ -49,7 +49,6 @@ _TO_OPENCV = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ned": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
 }
-_TITLE = re.compile(r"[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
 _SURE = 0.9
 """Mean size of the component of a quaternion that is taken for w where nothing says which is."""
 _FASTEST = 60.0
@@ -156,35 +155,10 @@ def _form(path: Path, text: str) -> str | None:
     return "kitti" if count == 12 and "," not in row else None
 
 
-def _rows(path: Path, text: str) -> tuple[str, list[tuple[int, list[str]]]]:
-    """Return the heading, and (line, fields) of every line of data."""
-    heading, rows = "", []
-    for number, line in enumerate(text.splitlines()[:_MOST_LINES], 1):
-        body = line.strip()
-        if not body:
-            continue
-        fields = [part for part in re.split(r"[\s,;]+", body) if part]
-        if body.startswith("#") or (not rows and not heading and not any(map(_is_number, fields))):
-            if not rows:
-                # The last line before the data that names a w is the heading.
-                titles = body.lstrip("# ")
-                heading = titles if re.search(r"w\b", titles, re.I) or not heading else heading
-            continue
-        rows.append((number, fields))
-    return heading, rows
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return bool(np.isfinite(float(text)))
-    except ValueError:
-        return False
-
-
 def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     """Read a table of positions and quaternions."""
-    heading, rows = _rows(path, text)
-    titles = _TITLE.findall(heading)
+    heading, rows = read_rows(text)
+    titles = titles_of(heading)
     roles = (declared.columns or "").replace(",", " ").split() or _roles(titles)
     notes: list[str] = []
     if not roles and declared.form is not None:
@@ -247,7 +221,7 @@ def _roles(titles: Sequence[str]) -> list[str]:
 def _numbers(path: Path, rows: Sequence[tuple[int, list[str]]], columns: list[int], accepted: str) -> np.ndarray:
     out = np.empty((len(rows), len(columns)))
     for i, (number, fields) in enumerate(rows):
-        if max(columns) >= len(fields) or not all(_is_number(fields[k]) for k in columns):
+        if max(columns) >= len(fields) or not all(is_number(fields[k]) for k in columns):
             raise _no_pose(path, number, fields, accepted)
         out[i] = [float(fields[k]) for k in columns]
     return out
@@ -283,7 +257,7 @@ def _matrices(path: Path, given: np.ndarray, lines: list[int]) -> tuple[np.ndarr
 
 
 def _kitti(path: Path, text: str, declared: PoseFile) -> _Table:
-    _, rows = _rows(path, text)
+    _, rows = read_rows(text)
     numbers = _numbers(path, rows, list(range(12)), "12 numbers, the rows of T_world_cam").reshape(-1, 3, 4)
     lines = [number for number, _ in rows]
     return _Table(None, *_matrices(path, numbers, lines), lines)
@@ -339,7 +313,7 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
     else:
         texts = table.times
         for number, text in zip(table.lines, texts):
-            if not _is_number(text) or not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,2})?", text):
+            if not is_number(text):
                 raise _no_pose(path, number, [text], "a time first, a finite number")
         unit = _unit(table, texts, declared, path)
         if unit.line is not None:

@@ -107,6 +107,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     # Quantisation and sub-pixel shifts are not compared, as in `compare`.
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
     other = polarity if against is None else against.polarity
+    # Sums of products, not correlations, since only sums can be added over groups, and without one of them.
     products = np.stack(
         [
             _by(on_group, np.einsum("kn,kn->n", x, y))
@@ -114,7 +115,6 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
         ],
         1,
     )
-    # Sums of products, not correlations, since only sums can be added over groups, and without one of them.
     pixels = np.stack([_by(on_group, np.ones(len(group))), _by(np.where(still, group, GROUPS), np.ones(len(group)))], 1)
     seconds = np.diff(clip.edges_us[first : stop + 1]) * 1e-6
     mine = both.sum(axis=1)
@@ -333,7 +333,7 @@ def numbers(
         rates, lights = (part.sum(axis=-1, keepdims=True) for part in (rates, lights))
     if pixels[0] >= LEAST_STILL:
         seconds = s.seconds[:, None] * pixels[0]
-        # A pixel more or less in an empty interval must not decide: 1, 2 or 4 events are added before each logarithm.
+        # One event must not decide about an empty interval: 1, 2 or 4 are added before each logarithm.
         add("rate", np.log((rates + 1) / seconds))
         add("rate", np.log((rates.sum(axis=0) + 1) / seconds.sum()))
         add("total", np.log((rates.sum() + 1) / seconds.sum()))

@@ -156,6 +156,10 @@ def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[
 
 def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[Path], list[Path]]:
     everything, pairs = _listed(folder, _FLOW), len(images) - 1
+    names = f"{folder.name}/{everything[0].name if everything else ''}"
+    if re.search(r"backward|bwd|into_?past|flow_?bw", names, re.I):
+        accepted = "the flow from each frame to the next"
+        raise AssetError("the names say that this flow leads to the frame before", where=str(folder), accepted=accepted)
     masks = [p for p in everything if p.stem.endswith("_mask")]
     flows = [p for p in everything if p not in set(masks)]
     if len(flows) < first + pairs or (masks and len(masks) < first + pairs):
@@ -285,6 +289,13 @@ class RecordedSequence(Simulation):
             (read_frame(self.files[k]), read_frame(self.files[k + 1]), *read_flow_of(self.flows[k], size, self._form))
             for k in chosen
         ]
+        if pairs and not any(valid.any() for _, _, _, valid in pairs):
+            raise AssetError(
+                "no pixel of the flow is valid",
+                where=str(self.flows[int(chosen[0])]),
+                value=f"read as {self._form}",
+                accepted="a third channel that is not 0 where flow is valid, or frames.check_flow: false",
+            )
         if (found := factor_that_fits([pair for pair in pairs if pair[0].shape == pair[1].shape])) is not None:
             factor, error, own = found
             what = {0.0: "no motion at all", -1.0: "its negative (flow to the frame before?)"}

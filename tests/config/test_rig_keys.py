@@ -167,3 +167,15 @@ def test_a_calibration_places_its_cameras(tmp_path):
     unit = made.sensors[1].imu
     np.testing.assert_allclose(unit.position, turned[:3, 3], atol=1e-12)
     np.testing.assert_allclose(Rotation.from_euler("xyz", unit.rotation, degrees=True).as_matrix(), turned[:3, :3])
+
+
+def test_a_sensor_of_labels_alone_is_a_camera():
+    """It inherits the camera of the top, and its labels are written; an inertial unit alone is none."""
+    config = read(
+        "camera: {width: 64, height: 48}\n"
+        "sensors: [{name: left}, {name: truth, events: null, labels: {depth: true}}, {name: unit, imu: {rate: 100}},"
+        " {name: points, events: null, tracks: {points: 10}}]"
+    )
+    assert [one.sees for one in config.sensors] == [True, True, False, True]
+    assert [one.name for one in config.cameras()] == ["left", "truth", "points"]
+    assert config.sensors[1].camera.width == 64 and config.sensors[1].events is None

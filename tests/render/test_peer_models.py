@@ -15,6 +15,7 @@ from blinkgl.config.deform import AnimationConfig
 from blinkgl.config.scene import PoolConfig, RandomSceneConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
+from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf
@@ -88,6 +89,10 @@ def test_a_model_is_drawn_as_its_file_says(name, gl, tmp_path):
             ends = round(to * 1e9), round(at * 1e9)
             frame = r.labels(round(at * 1e9), LabelRequest("depth", "normals", "flow_forward"), *ends)
             drawn_colour = r.colour(round(at * 1e9)).read()
+        cast_too = casting.cast(scene, round(at * 1e9))  # which decides what hides what
+        assert (cast_too.hit != hit).sum() <= 12, door
+        same = cast_too.hit & hit
+        assert (np.abs(cast_too.depth[same] / seen.depth[same] - 1) > 1e-6).sum() <= 12, door
         drawn = np.isfinite(frame.depth)
         assert (drawn != hit.reshape(H, W)).sum() <= 12, door
         both = (inner & hit.reshape(H, W)).ravel()

@@ -169,3 +169,16 @@ def test_forms_are_guessed_by_their_values(tmp_path):
         write(tmp_path / f"{name}.png", field())
         flow, valid = read_flow(tmp_path / f"{name}.png", name)
         assert np.abs(flow - MOTION).max() < 0.02 and valid.all()
+
+
+def test_backward_flow_by_its_name_and_flow_without_a_valid_pixel(tmp_path):
+    recorded(tmp_path, flo, field(), "flo")
+    (tmp_path / "clip/flow").rename(tmp_path / "clip/flow_backward")
+    tree = yaml.safe_load((tmp_path / "run.yaml").read_text())
+    tree["frames"]["flow"] = "flow_backward"
+    (tmp_path / "run.yaml").write_text(yaml.safe_dump(tree))
+    with pytest.raises(AssetError, match="flow_backward: the names say that this flow leads to the frame before"):
+        simulate_sequence(SequenceRequest(load_run(tmp_path / "run.yaml").sequence(0), 0, base=tmp_path))
+    invalid = lambda path, flow: np.save(path, np.dstack([flow, np.zeros((H, W), np.float32)]))
+    with pytest.raises(AssetError, match="frame0.npy: no pixel of the flow is valid"):
+        recorded(tmp_path / "b", invalid, field(), "npy")

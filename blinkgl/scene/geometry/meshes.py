@@ -17,7 +17,7 @@ from blinkgl.scene.types import Mesh, Scene
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
 _MAX_REPEATS = 1e9  # of a texture: float32 has no fraction left, and overflows later
-_MAX_COORDINATE = 1e15  # squares of larger coordinates are inaccurate in float32 and overflow soon after
+MAX_COORDINATE = 1e15  # squares of larger coordinates are inaccurate in float32 and overflow soon after
 
 
 def make_mesh(
@@ -97,11 +97,11 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
     faces = faces.astype(np.int64)
     used = np.zeros(len(vertices), bool)
     used[faces] = True
-    bad = used & ~(np.abs(vertices) < _MAX_COORDINATE).all(axis=1)  # NaN compares false
+    bad = used & ~(np.abs(vertices) < MAX_COORDINATE).all(axis=1)  # NaN compares false
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
         raise AssetError(
-            f"{int(bad.sum())} vertices are NaN, infinite or beyond {_MAX_COORDINATE:g}, the first is {first}",
+            f"{int(bad.sum())} vertices are NaN, infinite or beyond {MAX_COORDINATE:g}, the first is {first}",
             where=where,
             value=vertices[first].tolist(),
             accepted="finite coordinates",

@@ -34,7 +34,8 @@ _MAPS |= dict.fromkeys(("map_ks", "map_pr", "map_pm"), "shine (drawn matt)") | {
 _COMMENT = re.compile(r"(?:^|\s)#")
 _FLOAT = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OPTION = re.compile(
-    rf"(?:-(?:blendu|blendv|cc|boost|texres|clamp|bm|imfchan|type|colorspace)\s+\S+|-mm\s+\S+\s+\S+|-[ost](?:\s+{_FLOAT}(?=\s)){{1,3}})\s+",
+    r"(?:-(?:blendu|blendv|cc|boost|texres|clamp|bm|imfchan|type|colorspace)\s+\S+|-mm\s+\S+\s+\S+"
+    rf"|-[ost](?:\s+{_FLOAT}(?=\s)){{1,3}})\s+",
     re.IGNORECASE,
 )
 """An option before the name of a texture, with its values."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.geometry.meshes import crease_normals, weld
+from blinkgl.scene.geometry.meshes import MAX_COORDINATE, crease_normals, weld
 from blinkgl.scene.geometry.polygons import triangulate
 from blinkgl.scene.importing.gltf_file import inside
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
@@ -98,13 +98,14 @@ def _check(given: Polygons, max_faces: int, where: str) -> None:
         raise AssetError("a polygon has too many corners", where=where, value=most, accepted=accepted)
     last = len(given.points) - 1
     beyond = (given.places < 0) | (given.places > last)
-    wrong = np.flatnonzero(beyond | ~np.isfinite(given.points[given.places.clip(0, max(last, 0))]).all(axis=1))
+    large = ~(np.abs(given.points[given.places.clip(0, max(last, 0))]) < MAX_COORDINATE).all(axis=1)  # NaN, too
+    wrong = np.flatnonzero(beyond | large)
     if len(wrong):
         corner, face = wrong[0], int(np.searchsorted(np.cumsum(given.sizes), wrong[0], "right"))
         place = f"{where}, face {face}" if given.lines is None else f"{where}, line {given.lines[face]}"
         if not beyond[corner]:
-            value, accepted = given.points[given.places[corner]].tolist(), "finite numbers"
-            raise AssetError("a face has a vertex that is NaN or infinite", where=place, value=value, accepted=accepted)
+            problem, value = "a face has a vertex that is NaN or infinite", given.points[given.places[corner]].tolist()
+            raise AssetError(problem, where=place, value=value, accepted=f"numbers below {MAX_COORDINATE:g}")
         problem, value = "a face refers to a vertex that does not exist", int(given.places[corner])
         raise AssetError(problem, where=place, value=value, accepted=f"0 to {last}")
 

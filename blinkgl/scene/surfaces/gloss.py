@@ -79,13 +79,11 @@ def visible(
     the eye, y, z, along the normal), and the fraction that leaves, (N, count); its mean is the energy of uniform
     light."""
     i = np.arange(count)
-    # A lattice by the golden ratio instead of random points: it converges faster, and tables are the same
-    # everywhere.
+    # A lattice by the golden ratio: it converges faster than random points, and is the same everywhere.
     u1, u2 = (i + 0.5) / count, (i * 0.6180339887498949 + 0.5) % 1.0
     sv = np.sqrt(np.maximum(1 - nv**2, 0))
     alpha = max(roughness, SMOOTHEST) ** 2
-    # Stretched by alpha, the surface is a hemisphere, whose visible normals are the eye's direction plus a spherical
-    # cap.
+    # Stretched by alpha, the surface is a hemisphere. Its visible normals bisect the eye and a spherical cap.
     x, z = alpha * sv, nv.copy()
     length = np.hypot(x, z)
     x, z = (x / length)[:, None], (z / length)[:, None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import struct
+import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -61,20 +62,29 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _unpacked(data: memoryview, path: str | os.PathLike) -> Iterator[tuple[int, memoryview]]:
-    left = max(_MOST_BYTES, _MOST_RATIO * len(data))
+    total = 0
     for kind, body in _elements(data):
         if kind == _COMPRESSED:
-            unpacked = zlib.decompressobj().decompress(body, left)
-            left -= len(unpacked)
-            if left <= 0:
-                raise AssetError(
-                    f"unpacks to more than {_MOST_RATIO} times its size",
-                    where=os.fspath(path),
-                    accepted="save(…, '-v6')",
-                )
-            yield from _elements(memoryview(unpacked))
+            packed = zlib.decompressobj()
+            # The first eight bytes say what the element unpacks to.
+            head = packed.decompress(body, 8)
+            size = struct.unpack_from("<I", head, 4)[0]
+            total += size
+            _check_ratio(total, len(data), path)
+            yield from _elements(memoryview(head + packed.decompress(packed.unconsumed_tail, size) if size else head))
         else:
             yield kind, body
+
+
+def _check_ratio(unpacked: int, packed: int, path: str | os.PathLike) -> None:
+    """Raise AssetError for a file that unpacks to far more than events do, before it is unpacked."""
+    if unpacked > max(_MOST_BYTES, _MOST_RATIO * packed):
+        raise AssetError(
+            f"unpacks to more than {_MOST_RATIO} times its size",
+            where=os.fspath(path),
+            value=f"{unpacked} bytes",
+            accepted="a file that is not packed",
+        )
 
 
 def _matrix(body: memoryview) -> tuple[str, Any]:
@@ -115,7 +125,8 @@ class ArrayReader(TableReader):
             if path.suffix.lower() == ".npy":
                 arrays: dict[str, Any] = {"": read_npy(path)}
             else:
-                with NpzReader(path) as archive:
+                with NpzReader(path) as archive, zipfile.ZipFile(path) as members:
+                    _check_ratio(sum(one.file_size for one in members.infolist()), path.stat().st_size, path)
                     wanted = [
                         n for n in archive.names if slot_of(n) != "_" or n in _KNOWN or n in reading.named.values()
                     ]

@@ -70,6 +70,8 @@ def microseconds(times: np.ndarray, where: str, first: int = 0, unit_ns: int = 1
     times = np.asarray(times)
     if times.dtype.kind not in "iufb":
         raise AssetError("event column 't' holds no numbers", where=where, value=str(times.dtype))
+    if times.dtype.kind in "iu" and unit_ns == 1000 and len(times) and abs(int(times.max())) < _MAX_TIME:
+        return times.astype(np.int64, copy=False)
     scale = unit_ns / 1000
     rounded = np.rint(times.astype(np.float64, copy=False) * scale)
     if len(times) and not (good := np.abs(rounded) < _MAX_TIME).all():  # NaN compares False
@@ -203,16 +205,16 @@ class CheckedWriter:
             self._file.close()
 
 
-def check_size(height: int | None, width: int | None, where: str) -> None:
+def check_size(height: int | None, width: int | None, where: str, most: int = MAX_PIXELS) -> None:
     """Raise AssetError when a sensor's declared size (None: not declared) is impossible, before anything of that size
     is made."""
     sides = [side for side in (height, width) if side is not None]
-    if not all(0 < side <= MAX_SIDE for side in sides) or (len(sides) == 2 and sides[0] * sides[1] > MAX_PIXELS):
+    if not all(0 < side <= MAX_SIDE for side in sides) or (len(sides) == 2 and sides[0] * sides[1] > most):
         raise AssetError(
             "impossible sensor size",
             where=where,
             value=f"{width}x{height}",
-            accepted=f"1 to {MAX_SIDE} px a side and at most {MAX_PIXELS} px: --size WIDTHxHEIGHT",
+            accepted=f"1 to {MAX_SIDE} px a side and at most {most} px: --size WIDTHxHEIGHT",
         )
 
 

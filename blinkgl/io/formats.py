@@ -17,7 +17,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.io.atomic import atomic_file
-from blinkgl.io.columns import CameraFrame, ImuSamples, check_events, check_size, on_or_off
+from blinkgl.io.columns import MAX_SIDE, CameraFrame, ImuSamples, check_events, check_size, on_or_off
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
 
@@ -176,9 +176,9 @@ class EventFile:
         try:
             for events in self._reader.chunks():
                 yield replace(events, p=on_or_off(events.p, pair, str(self.path))) if pair else events
-        except AssetError as error:
+        except (AssetError, EventDataError) as error:
             accepted = f"{error.accepted or 'a whole file'}; or --damaged keep"
-            raise AssetError(error.problem, where=error.where, value=error.value, accepted=accepted) from error
+            raise type(error)(error.problem, where=error.where, value=error.value, accepted=accepted) from error
 
     def _salvaged(self) -> Iterator[Events]:
         """Yield what is whole, in order of time; count the rest."""
@@ -351,7 +351,7 @@ def output_format(path: str | os.PathLike) -> str:
 def _writer(
     path: Path, kind: str, height: int | None, width: int | None, t_offset_us: int, write_unit: str
 ) -> EventWriter:
-    check_size(height, width, str(path))
+    check_size(height, width, str(path), MAX_SIDE**2)
     if write_unit != "s" and "write_unit" not in FORMATS[kind].takes:
         raise OutputError(
             f"{kind} has a fixed unit of time",

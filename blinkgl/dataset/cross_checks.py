@@ -92,8 +92,8 @@ def strangers(root: Path, folders: list[Path]) -> list[str]:
         name = path.relative_to(root).as_posix()
         if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
             continue
-        left = ".blinkgl-tmp-" in path.name
-        problems.append(f"{shown(name)}: {'left by a run that was cut off' if left else 'belongs to no sequence'}")
+        why = "left by a run that was cut off" if ".blinkgl-tmp-" in path.name else "belongs to no sequence"
+        problems.append(f"{shown(name)}: {'a symbolic link, which is not followed' if path.is_symlink() else why}")
     return problems
 
 
@@ -240,7 +240,7 @@ def plan_of(root: Path) -> Plan | None:
     known = RunFolder(root).read("run.json")
     if known is None:
         return None
-    recipe = root / RUN_FOLDER / "recipe.yaml"
+    recipe = RunFolder(root).record("recipe.yaml")
     with suppress(FileNotFoundError):
         open(open_regular(recipe), "rb").close()
         template = load_run(recipe)

@@ -85,7 +85,10 @@ def run_dataset(
     plan = Plan.of(template, num)
     assets = plan.check_assets()
     folder = RunFolder(out)
-    with interruptible(signal.SIGTERM), folder.locked():  # batch systems and `docker stop` end a run like Ctrl-C
+    with (
+        interruptible(signal.SIGTERM),
+        folder.locked(plan.tasks.splits),
+    ):  # batch systems and `docker stop` end a run like Ctrl-C
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
         missing = outcome.planned - outcome.found

@@ -21,7 +21,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
 from blinkgl.io.images import NpzReader, numpy_errors
+from blinkgl.io.records import shown
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
@@ -44,11 +45,17 @@ _FLOW = LABELS["flow_forward"]
 
 
 def export_shards(
-    root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0
+    root: str | Path,
+    out: str | Path,
+    *,
+    shard_bytes: int = 512_000_000,
+    seed: int = 0,
+    note: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[int]]:
     """Write ``<out>/<split>-000000.tar`` …, each completely or not at all; return the samples per shard of each split.
 
-    Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially. Raises
+    Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially.
+    note : called with a line for each sequence that is left out. Raises
     AssetError (no labels, a damaged sequence), OutputError (existing shards, disk full)."""
     root, out = Path(root), Path(out)
     if out.is_dir() and any(out.glob("*-*.tar")):
@@ -65,7 +72,9 @@ def export_shards(
             )
         manifest = read_manifest(folder)
         count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
-        labels.setdefault(str(manifest.get("split", "all")), []).extend((folder, k) for k in range(count))
+        labels.setdefault(manifest.get("split") or "all", []).extend((folder, k) for k in range(count))
+        if not count:
+            note(f"{shown(folder.relative_to(root))}: no forward flow")
     if not any(labels.values()):
         raise AssetError("no flow labels found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
     written = {}

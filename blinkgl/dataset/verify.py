@@ -165,8 +165,6 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
     found: list[Known] = []
 
     def check() -> list[str]:
-        if name != "." and folder.is_symlink():
-            return ["a symbolic link, not a folder"]
         if problems := verify_sequence(folder):
             return problems
         manifest = read_manifest(folder)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.atomic import atomic_folder
+from blinkgl.io.records import inside
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
 from blinkgl.layouts.event_kubric import EventKubric
@@ -75,10 +76,10 @@ def _refuse_what_lacks(row: Layout, source: Source) -> None:
 
 
 def _places(row: Layout, sources: list[Source]) -> list[str]:
-    places = [f"{row.folder(source)}/{source.name}" for source in sources]
+    places = [inside("", f"{row.folder(source)}/{source.name}") for source in sources]
     if twice := [place for place in places if places.count(place) > 1]:
         raise OutputError(
-            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=twice[0]
+            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=str(twice[0])
         )
     return [row.folder(source) for source in sources]
 

@@ -18,7 +18,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import NpzReader, numpy_errors, read_image
 from blinkgl.io.imu import H5 as IMU
-from blinkgl.io.records import read_text
+from blinkgl.io.records import inside, read_text
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
@@ -208,9 +208,9 @@ def _of_rig(folder: Path) -> Source:
     cameras = [name for name, one in tables.items() if "events" in one["records"]]
     if not cameras:
         raise AssetError("a rig without an event camera", where=str(folder))
-    unit = next((folder / name for name, one in tables.items() if "imu" in one["records"]), None)
-    one, other = cameras[0], tables[cameras[0]].get("pair")
+    unit = next((inside(folder, name) for name, one in tables.items() if "imu" in one["records"]), None)
+    one, other = cameras[0], tables[cameras[0]]["pair"]
     if other not in cameras:
-        return Source.open(folder / one, folder.name, unit=unit)
+        return Source.open(inside(folder, one), folder.name, unit=unit)
     left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
-    return Source.open(folder / left, folder.name, folder / right, unit)
+    return Source.open(inside(folder, left), folder.name, inside(folder, right), unit)

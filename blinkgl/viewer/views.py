@@ -22,6 +22,7 @@ from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_ex
 from blinkgl.io.imu import H5 as IMU, read_imu
 from blinkgl.io.overlays import TrackLines, with_boxes, with_tracks
 from blinkgl.io.pictures import id_colours, picture
+from blinkgl.io.records import inside
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Label
 from blinkgl.layouts.source import Source
@@ -293,7 +294,7 @@ class SequenceView:
         """Open a sequence. Raises AssetError: damaged, or it has nothing to show."""
         self.folder, self.name = folder, folder.name
         rig = is_rig_folder(folder)
-        places = {name: folder / name for name in read_rig(folder)} if rig else {"camera": folder}
+        places = {name: inside(folder, name) for name in read_rig(folder)} if rig else {"camera": folder}
         cameras = {name: place for name, place in places.items() if (place / MANIFEST).is_file()}
         self.sensors = [CameraView(Source.open(place), name) for name, place in cameras.items()]
         units = {name if rig else "imu": place for name, place in places.items() if (place / IMU).is_file()}

@@ -28,6 +28,7 @@ from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_npy, read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.records import inside
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
 from eflow.data.pool import ABOUT, PoolSource
@@ -214,7 +215,7 @@ def find_blinkgl(root: Path) -> list[Sequence]:
     found = []
     indexed = (root / INDEX).is_file()
     folders = (
-        [root / line["path"] for line in read_index(root)]
+        [root if line["path"] == "." else inside(root, line["path"]) for line in read_index(root)]
         if indexed
         else [m.parent for m in sorted(below(root, "manifest.json"))]
     )

@@ -1,0 +1,178 @@
+"""Data sets that somebody else made: no name leads out of them, and whatever is wrong with them is one line."""
+
+import contextlib
+import io
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from tiny_recipe import TINY
+
+from blinkgl.cli import run
+from blinkgl.config.run import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.io.frames import open_frames
+from blinkgl.io.images import encode_png
+from blinkgl.io.records import inside, sealed
+from blinkgl.sequence_files.sequence_dir import digest_of
+
+LABELS = {"flow": ["forward", "backward"], "depth": True, "boxes": True, "images": True, "ids": True}
+ONE = {**TINY, "labels": LABELS, "tracks": {"points": 20}, "images": {"exposure_us": 5000, "bits": 10}}
+RIG = {
+    **{key: value for key, value in TINY.items() if key != "camera"},
+    "labels": {"flow": ["forward"]},
+    "sensors": [
+        {"name": "left", "camera": TINY["camera"], "events": {}, "imu": {"rate": 200}},
+        {"name": "right", "camera": TINY["camera"], "events": {}, "place": {"position": [0.1, 0, 0]}, "pair": "left"},
+    ],
+}
+
+
+def made(folder: Path, recipe: dict) -> Path:
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump(recipe))
+    run_dataset(load_run(path), folder / "set")
+    return folder / "set"
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    return {
+        kind: made(tmp_path_factory.mktemp(kind), recipe) / "train/sequence_000000"
+        for kind, recipe in (("one", ONE), ("rig", RIG))
+    }
+
+
+@pytest.fixture
+def one(sets, tmp_path) -> Path:
+    shutil.copytree(sets["one"].parents[1], tmp_path / "set")
+    return tmp_path / "set/train/sequence_000000"
+
+
+@pytest.fixture
+def rig(sets, tmp_path) -> Path:
+    shutil.copytree(sets["rig"].parents[1], tmp_path / "set")
+    return tmp_path / "set/train/sequence_000000"
+
+
+def forge(sequence: Path, file: str = "", **changes) -> None:
+    """Bring the manifest in line with a changed file, and change what it says."""
+    path = sequence / "manifest.json"
+    manifest = json.loads(path.read_text())
+    if file:
+        manifest["files"][file] = digest_of(sequence / file)
+    path.write_text(sealed({**manifest, **changes}))
+
+
+def said(*arguments) -> list[str]:
+    """Run a command that must refuse; return its lines."""
+    error = io.StringIO()
+    with contextlib.redirect_stderr(error):
+        assert run([str(one) for one in arguments]) == 2
+    lines = error.getvalue().splitlines()
+    assert len(lines) == 1 and "Traceback" not in lines[0]
+    return lines
+
+
+def commands(sequence: Path, out: Path) -> list[tuple]:
+    data = sequence.parents[1]
+    return [
+        ("export", data, "-o", out / "shards"),
+        *(("export", data, "-o", out / name, "--layout", name) for name in ("dsec", "blinkflow", "mvsec", "tapvid")),
+        ("view", sequence, "--save", out / "page.html"),
+    ]
+
+
+# ---- names that become paths -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("split", ["../../away", "/tmp/away", "a/b", "..", ".git", "a\\b", "a\x1b[31m", "", "a\0"])
+def test_a_split_leads_nowhere(one, tmp_path, split):
+    forge(one, split=split)
+    before = sorted(tmp_path.rglob("*"))
+    for command in commands(one, tmp_path / "out"):
+        assert "damaged manifest: split: not" in said(*command)[0]
+    assert [path for path in sorted(tmp_path.rglob("*")) if path not in before and path.name != "out"] == []
+
+
+@pytest.mark.parametrize("name", ["../../../other/train/sequence_000000", "left/..", ".hidden", "/etc"])
+def test_a_sensors_name_leads_to_no_other_data_set(rig, tmp_path, name):
+    rows = yaml.safe_load((rig / "rig.yaml").read_text())
+    shutil.copytree(rig.parents[1], tmp_path / "other")
+    sensor = rows["sensors"].pop("left")
+    rows["sensors"]["right"] |= {"pair": None}
+    rows["sensors"] = {name: sensor, **rows["sensors"]}
+    (rig / "rig.yaml").write_text(yaml.safe_dump(rows, sort_keys=False))
+    forge(rig, "rig.yaml")
+    for command in (
+        ("export", rig.parents[1], "-o", tmp_path / "out", "--layout", "dsec"),
+        ("view", rig, "--save", tmp_path / "page.html"),
+    ):
+        assert "rig.yaml: damaged: " in said(*command)[0]
+    forge(rig, cameras=[name, "right"])
+    assert "damaged manifest: cameras.0: not" in verify_dataset(rig.parents[1]).problems["train/sequence_000000"][0]
+
+
+def test_links_out_of_a_data_set_are_not_followed(one, rig_or_other, tmp_path, capsys):
+    other, data = rig_or_other, one.parents[1]
+    (data / "train/sequence_000001").symlink_to(other / "train/sequence_000000")
+    (data / "test").symlink_to(other / "train")
+    assert run(["export", str(data), "-o", str(tmp_path / "out"), "--layout", "dsec"]) == 0
+    assert [path.name for path in (tmp_path / "out/train").iterdir()] == ["sequence_000000"]
+    printed = capsys.readouterr().out
+    assert "left out: train/sequence_000001: a symbolic link, which is not followed" in printed
+    assert "left out: test: a symbolic link, which is not followed" in printed
+
+
+@pytest.fixture
+def rig_or_other(sets, tmp_path) -> Path:
+    return Path(shutil.copytree(sets["one"].parents[1], tmp_path / "other"))
+
+
+def test_a_camera_that_is_a_link_is_refused(rig, tmp_path):
+    shutil.move(rig / "left", tmp_path / "elsewhere")
+    (rig / "left").symlink_to(tmp_path / "elsewhere")
+    for layout in ("dsec", "webdataset"):
+        line = said("export", rig.parents[1], "-o", tmp_path / "out", "--layout", layout)[0]
+        assert "left: a symbolic link, which is not followed" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("place", [".run/logs", ".run/logs/train", ".run/costs.jsonl", "train"])
+def test_a_run_goes_on_in_no_folder_that_leads_elsewhere(one, tmp_path, place):
+    data = one.parents[1]
+    shutil.rmtree(one)
+    target = data / place
+    away = tmp_path / "away"
+    if target.exists():
+        shutil.move(target, away)
+    else:
+        away.mkdir()
+    target.symlink_to(away)
+    before = {path: path.stat().st_mtime_ns for path in [away, *away.rglob("*")]}
+    recipe = data / ".run/recipe.yaml"
+    assert "is a symbolic link" in said("generate", recipe, "-o", data, "--resume", "-q")[0]
+    assert {path: path.stat().st_mtime_ns for path in [away, *away.rglob("*")]} == before
+
+
+def test_a_list_of_times_names_files_beside_it_only(tmp_path):
+    (tmp_path / "clip").mkdir()
+    for place in ("a.png", "clip/b.png"):
+        (tmp_path / place).write_bytes(encode_png(np.zeros((16, 16), np.uint8)))
+    (tmp_path / "clip/images.txt").write_text("0.0 b.png\n0.1 ../a.png\n")
+    (tmp_path / "clip/b.png").rename(tmp_path / "clip/b")
+    with pytest.raises(Exception, match="names not a path inside the folder"):
+        open_frames(tmp_path / "clip")
+
+
+def test_one_rule_for_names(tmp_path):
+    assert inside(tmp_path, "a/b.txt") == tmp_path / "a/b.txt"
+    (tmp_path / "link").symlink_to("/etc")
+    for name in ("", "/", "../a", "a/../../b", "a//b", "./a", "link", "link/passwd", "a\0", "x" * 300, os.sep + "etc"):
+        with pytest.raises(Exception, match="names |a symbolic link"):
+            inside(tmp_path, name)

@@ -1,24 +1,29 @@
 """Data sets that somebody else made: no name leads out of them, and whatever is wrong with them is one line."""
 
 import contextlib
+import html
 import io
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from rich.table import Table
 from tiny_recipe import TINY
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
+from blinkgl.errors import AssetError
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import encode_png
 from blinkgl.io.records import inside, sealed
+from blinkgl.machine.terminal import plain_console, say
 from blinkgl.sequence_files.sequence_dir import digest_of
 
 LABELS = {"flow": ["forward", "backward"], "depth": True, "boxes": True, "images": True, "ids": True}
@@ -176,3 +181,41 @@ def test_one_rule_for_names(tmp_path):
     for name in ("", "/", "../a", "a/../../b", "a//b", "./a", "link", "link/passwd", "a\0", "x" * 300, os.sep + "etc"):
         with pytest.raises(Exception, match="names |a symbolic link"):
             inside(tmp_path, name)
+
+
+# ---- text ------------------------------------------------------------------------------------------------------------
+
+EVIL = "![x](/etc/hostname) <img src=x onerror=alert(1)> {1+1} [a](javascript:b) \x1b]0;title\x07 \u202etxt `c` **d**"
+
+
+def test_the_viewer_shows_text_of_files_as_text(one):
+    pytest.importorskip("viser", reason="the extra [view] is not installed")
+    from blinkgl.viewer import page, views
+
+    forge(one, emulator=EVIL)
+    sequence = views.SequenceView(one)
+    said = page._about(sequence)
+    sequence.close()
+    text = said.split("px, ")[1].split("events, ")[-1]
+    assert re.fullmatch(r"(?:[0-9A-Za-z ]|&#\d+;)+", text), "letters, digits and references only"
+    assert html.unescape(text).startswith("![x](/etc/hostname) <img src=x onerror=alert(1)> {1+1}")
+    assert "\x1b" not in html.unescape(text) and "\u202e" not in html.unescape(text)
+
+
+def test_a_report_shows_text_of_files_as_text(one, tmp_path):
+    forge(one, emulator=EVIL, events_by_cause={EVIL: 1})
+    assert run(["report", str(one.parents[1]), "-o", str(tmp_path / "page.html")]) == 0
+    text = (tmp_path / "page.html").read_text()
+    assert "&lt;img src=x onerror=alert(1)&gt;" in text and "<img src=x" not in text
+    assert "\x1b" not in text and "\u202e" not in text
+
+
+def test_terminal_and_messages_show_text_of_files_as_text(capsys):
+    say(plain_console(), EVIL)
+    table = Table()
+    table.add_row(EVIL)
+    plain_console().print(table)
+    said = str(AssetError("x", where=EVIL, value=EVIL, accepted=EVIL))
+    for text in (*capsys.readouterr().out.split("\n"), said):
+        assert "\x1b" not in text and "\u202e" not in text and "\x07" not in text
+    assert r"\x1b]0;title\x07 \u202etxt" in said

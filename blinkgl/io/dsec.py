@@ -252,7 +252,8 @@ class DsecEventReader:
     AssetError : not a readable HDF5 file (truncated, wrong type) or without the DSEC datasets.
     """
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, size: tuple[int, int] | None = None):
+        """size : (height, width) of the sensor as known from elsewhere; None: only what the file says counts."""
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
@@ -283,6 +284,15 @@ class DsecEventReader:
             if "ms_to_idx" in self._file:
                 self._ms_to_idx = dataset(self._file, "ms_to_idx", self.path, shape=(None,))
             self.height, self.width = (self._declared(name) for name in ("height", "width"))
+            if size is not None:
+                if (self.height or size[0], self.width or size[1]) != size:
+                    raise AssetError(
+                        "another size than the sequence's",
+                        where=str(path),
+                        value=f"{self.width}x{self.height}",
+                        accepted=f"{size[1]}x{size[0]}",
+                    )
+                self.height, self.width = size
             check_size(self.height, self.width, str(path))
 
     def _declared(self, name: str) -> int | None:
@@ -342,9 +352,12 @@ class DsecEventReader:
             return self.count if otherwise else (int(table[-1]) if len(table) else 0)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """Yield all events in pieces of ``size``."""
+        """Yield all events in pieces of ``size``. Raises EventDataError as :meth:`slice`."""
+        last = None
         for start in range(0, self.count, size):
-            yield self._read(start, min(self.count, start + size))
+            events = self._read(start, min(self.count, start + size))
+            last = check_events(events, str(self.path), start, height=self.height, width=self.width, after=last)
+            yield events
 
     def _read(self, start: int, stop: int) -> Events:
         with hdf5_errors(self.path):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, model_validator
 
+from blinkgl.io.frame_camera import EXPOSURES
 from blinkgl.io.records import InsidePath, PlainName
 
 _LARGEST = 2**62
@@ -67,6 +68,12 @@ class Manifest(_Common):
     emulator: str | None = Field(None, max_length=255)
     sensor: PlainName | None = None
     frame_camera: _FrameCamera | None = None
+
+    @model_validator(mode="after")
+    def _says_what_its_files_need(self) -> Manifest:
+        if EXPOSURES in self.files and self.frame_camera is None:
+            raise ValueError(f"{EXPOSURES}, but no 'frame_camera'")
+        return self
 
 
 class RigManifest(_Common):

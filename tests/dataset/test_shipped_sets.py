@@ -75,7 +75,10 @@ def test_a_fresh_set_is_right(name, tmp_path):
 def test_a_fresh_set_of_a_shipped_run_is_right(path, tmp_path):
     tree = read_table(path)
     sizes = ["camera.width=32", "camera.height=24"] if "width" in tree.get("camera", {}) else []
-    right(load_run(path, [*sizes, "time.duration=0.02", "time.label_rate=50"]), tmp_path / "set")
+    times = [] if path.stem == "multiflow" else ["time.duration=0.02", "time.label_rate=50"]
+    if "frames" in tree:
+        pytest.skip("it reads frames of a published data set")
+    right(load_run(path, [*sizes, *times]), tmp_path / "set")
 
 
 def right(template, out: Path) -> None:

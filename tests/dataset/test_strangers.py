@@ -9,6 +9,7 @@ import re
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -219,3 +220,97 @@ def test_terminal_and_messages_show_text_of_files_as_text(capsys):
     for text in (*capsys.readouterr().out.split("\n"), said):
         assert "\x1b" not in text and "\u202e" not in text and "\x07" not in text
     assert r"\x1b]0;title\x07 \u202etxt" in said
+
+
+# ---- damaged files of sequences --------------------------------------------------------------------------------------
+
+STAMPS = "flow/forward_timestamps.txt"
+
+
+def arrays(path: Path, **changes) -> bytes:
+    with np.load(path) as file:
+        kept = {**{name: file[name] for name in file.files}, **changes}
+    buffer = io.BytesIO()
+    np.savez(buffer, **{name: value for name, value in kept.items() if value is not None})
+    return buffer.getvalue()
+
+
+def npy() -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(1, np.float32))
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "file, damage, message",
+    [
+        (STAMPS, lambda p: p.read_bytes().replace(b"0", b"p", 1), "line 2 is no time"),
+        (STAMPS, lambda p: p.read_bytes() + b"1, 2\n", "files and time stamps differ in number"),
+        (STAMPS, lambda p: b"0, 99999999999999999999999\n", "line 1 is no time"),
+        (STAMPS, lambda p: b"5, 5\n", "line 1 is not an interval"),
+        (STAMPS, lambda p: b"\xff\xfe\n", "not a text file in UTF-8"),
+        ("poses.npz", lambda p: npy(), "cannot read"),
+        ("poses.npz", lambda p: p.read_bytes()[:100], "cannot read"),
+        ("poses.npz", lambda p: arrays(p, K=None), "no such array"),
+        ("poses.npz", lambda p: arrays(p, K=np.eye(2)), "'K' has the wrong shape"),
+        ("poses.npz", lambda p: arrays(p, t_ns=np.array(["a", "b", "c"])), "'t_ns' has the wrong shape or type"),
+        ("poses.npz", lambda p: arrays(p, T_world_cam=np.full((3, 4, 4), np.nan)), "holds NaN"),
+        ("poses.npz", lambda p: arrays(p, object_names=None), "no such array"),
+        ("tracks.npz", lambda p: npy(), "cannot read"),
+        ("tracks.npz", lambda p: arrays(p, t_us=np.zeros(3)), "'t_us' has the wrong shape or type"),
+        ("boxes/000000.npz", lambda p: npy(), "cannot read"),
+        ("flow/forward/000000.png", lambda p: encode_png(np.zeros((8, 8, 3), np.uint16)), "not of this sequence"),
+        ("images/000000.png", lambda p: encode_png(np.zeros((8, 8, 3), np.uint8)), "not 32x32 px"),
+        ("depth/000000.npy", lambda p: npy(), "not of this sequence"),
+    ],
+)
+def test_a_damaged_file_is_one_line(one, tmp_path, file, damage, message):
+    if not (one / file).is_file():
+        pytest.skip(f"{file} is not in this set")
+    (one / file).write_bytes(damage(one / file))
+    forge(one, file)
+    lines = []
+    for command in commands(one, tmp_path / "out"):
+        error = io.StringIO()
+        with contextlib.redirect_stderr(error):
+            status = run([str(part) for part in command])
+        said = error.getvalue().splitlines()
+        assert status in (0, 2) and len(said) == (status == 2), said
+        lines += said
+    assert any(message in line for line in lines), lines
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"frame_camera": {"pictures": ["../x"], "bits": 8}},
+        {"frame_camera": None},
+        {"objects": [{"id": "x"}]},
+        {"objects": [{"id": 1, "box": [1, 2]}]},
+        {"height": "32"},
+        {"events_by_cause": {"noise": "many"}},
+    ],
+)
+def test_a_damaged_manifest_is_one_line(one, tmp_path, changes):
+    forge(one, **changes)
+    for command in commands(one, tmp_path / "out"):
+        assert "damaged manifest: " in said(*command)[0]
+
+
+def test_events_outside_the_picture_are_one_line(one, tmp_path):
+    with h5py.File(one / "events.h5", "r+") as file:
+        for name in ("height", "width"):
+            file.attrs.pop(name, None)
+        file["events/x"][...] = np.full(len(file["events/x"]), 60000)
+    forge(one, "events.h5")
+    for command in commands(one, tmp_path / "out"):
+        if not {"tapvid", "dsec"} & {*command}:  # they have no events, or the file as it is
+            assert "is outside the sensor" in said(*command)[0]
+
+
+@pytest.mark.parametrize("text", ["sensors: {left: 3}", "sensors: []", "[]", "sensors: {left: {records: x}}", "a: ["])
+def test_a_damaged_rig_is_one_line(rig, tmp_path, text):
+    (rig / "rig.yaml").write_text(text)
+    forge(rig, "rig.yaml")
+    for command in commands(rig, tmp_path / "out")[1:]:
+        assert "rig.yaml" in said(*command)[0]

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
+from blinkgl.io.atomic import atomic_file, lock_folder, output_errors, remove_stale
 from blinkgl.io.records import entries_below, inside, parse, read_text, shown
 from blinkgl.machine.posix import fcntl
 from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
@@ -172,29 +172,11 @@ class RunFolder:
         detected."""
         while fcntl is not None:
             with output_errors(self.out):
-                handle = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                if not os.access(self.out, os.W_OK | os.X_OK):
-                    raise OutputError(
-                        "cannot be written", where=str(self.out), accepted="a folder with write permission"
-                    )
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise OutputError(
-                        "another run uses this folder",
-                        where=str(self.out),
-                        accepted="another --out, or --resume after it has ended",
-                    ) from None
-                except OSError:  # a file system without locks
-                    pass
-                if _same(self.out, handle):
-                    return handle
-            except BaseException:
-                os.close(handle)
-                raise
+                handle = lock_folder(self.out)
+            if _same(self.out, handle):
+                return handle
             # Another run was refused and removed the folder between our opening and our locking it.
-            os.close(handle)
+            os.close(handle)  # type: ignore[arg-type]
             self._make()
         return None
 

@@ -314,3 +314,33 @@ def test_a_damaged_rig_is_one_line(rig, tmp_path, text):
     forge(rig, "rig.yaml")
     for command in commands(rig, tmp_path / "out")[1:]:
         assert "rig.yaml" in said(*command)[0]
+
+
+# ---- two at once, and what is not whole ------------------------------------------------------------------------------
+
+
+def test_resume_writes_an_index_that_is_missing(one):
+    data = one.parents[1]
+    before = (data / "index.jsonl").read_text()
+    (data / "index.jsonl").unlink()
+    assert run(["generate", str(data / ".run/recipe.yaml"), "-o", str(data), "--resume", "-q"]) == 0
+    assert (data / "index.jsonl").read_text() == before
+
+
+def test_a_report_elsewhere_changes_nothing_in_the_set_and_replaces_nothing_unasked(one, tmp_path):
+    data, page = one.parents[1], tmp_path / "page.html"
+    (data / "index.jsonl").unlink()
+    before = sorted(data.rglob("*"))
+    page.write_text("mine")
+    assert "output file exists" in said("report", data, "-o", page)[0] and page.read_text() == "mine"
+    assert run(["report", str(data), "-o", str(page), "--overwrite"]) == 0 and "<html" in page.read_text()
+    assert sorted(data.rglob("*")) == before
+    assert run(["report", str(data)]) == 0 and (data / "index.jsonl").is_file()
+
+
+def test_an_export_says_what_it_leaves_out(one, tmp_path, capsys):
+    half = one.parent / "sequence_000007"
+    shutil.copytree(one, half)
+    (half / "manifest.json").unlink()
+    assert run(["export", str(one.parents[1]), "-o", str(tmp_path / "out")]) == 0
+    assert "left out: train/sequence_000007: belongs to no sequence" in capsys.readouterr().out

@@ -18,9 +18,11 @@ from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU
+from blinkgl.io.intervals import intervals_in
 from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
+from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
@@ -100,6 +102,15 @@ class Source:
     def image_times(self) -> list[int]:
         """Return the times of the sRGB images; empty: there are none."""
         return [time for (time,) in self._times("images")]
+
+    @functools.cached_property
+    def track_times(self) -> list[int]:
+        """Return the times of the point tracks; empty: there are none. Raises AssetError."""
+        return read_tracks(self.folder)["t_us"].tolist() if self.has(TRACKS) else []
+
+    def interval_ns(self, k: int) -> np.ndarray:
+        """Return the intervals over which label ``k`` leads, (n,) int64 ns. Raises AssetError."""
+        return intervals_in(self.file("flow_intervals", k))
 
     def file(self, label: str, k: int) -> Path:
         """Return the ``k``-th file of a label, in its first format."""

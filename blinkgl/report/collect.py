@@ -289,8 +289,8 @@ def _parameters(found: Collected, rng: np.random.Generator) -> None:
     if found.plan is None:
         return
     here = {task_of(s) for s in found.sequences if s["path"] not in found.damaged}
-    tasks = [task for task in found.plan.tasks if task.name in here]
-    tasks = [tasks[i] for i in sorted(rng.permutation(len(tasks))[:MAX_CONFIGS])]
+    numbers = sorted(n for name in here if (n := found.plan.tasks.number(name)) is not None)
+    tasks = [found.plan.tasks[numbers[i]] for i in sorted(rng.permutation(len(numbers))[:MAX_CONFIGS])]
     configs: dict[str, list[dict]] = {}
     for task in tasks:
         try:

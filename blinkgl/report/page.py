@@ -86,9 +86,9 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
     if found.plan is None:
         return []
     paths = {task_of(x) for x in found.sequences}
-    planned = Counter(task.group for task in found.plan.tasks)
-    here = Counter(task.group for task in found.plan.tasks if task.name in paths)
-    return [(name or "all", here[name], planned[name]) for name in planned]
+    numbers = [number for path in paths if (number := found.plan.tasks.number(path)) is not None]
+    here = Counter(found.plan.tasks[number].group for number in numbers)
+    return [(name or "all", here[name], count) for name, count in found.plan.counts.items()]
 
 
 def _example(e: Example) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from pathlib import Path
@@ -238,8 +239,10 @@ def _speed(said: str) -> float:
 
 def as_text(text: str) -> str:
     """Return Markdown that shows text of a file as text: each character but letters and digits as a reference, which
-    is never syntax. viser would show HTML as it is, and read and send the file of ``![](file)``."""
-    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in printable(text))
+    is never syntax. viser would show HTML as it is, and read and send the file of ``![](file)``. A word joiner, which
+    has no width, keeps addresses from becoming links."""
+    joined = re.sub("(?=[:.@])", "\u2060", printable(text))
+    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in joined)
 
 
 def _about(sequence: SequenceView) -> str:

@@ -306,11 +306,12 @@ def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="Output page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Number of sequences shown in pictures.")] = 6,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing --out.")] = False,
 ) -> int:
-    """Write one self-contained HTML page about a data set, and its index.jsonl."""
+    """Write one self-contained HTML page about a data set; without --out also its index.jsonl."""
     from blinkgl.show import report as command
 
-    return command.run(folder, out, examples=examples)
+    return command.run(folder, out, examples=examples, overwrite=overwrite)
 
 
 @app.command()

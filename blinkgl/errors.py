@@ -22,9 +22,17 @@ def _short(value: Any) -> str:
     return text if len(text) <= _MAX_VALUE_CHARS else text[: _MAX_VALUE_CHARS - 1] + "…"
 
 
+def printable(text: str, besides: str = "") -> str:
+    """Return ``text`` with what is not printed escaped: control characters and a terminal's sequences, marks that turn
+    the direction of text, halves of surrogates. besides : characters that are kept."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in besides else repr(c)[1:-1] for c in text)
+
+
 def _plain(text: str) -> str:
     """Return ``text`` as one readable line; names of files and keys may contain anything and have any length."""
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    text = printable(text)
     return text if len(text) <= _MAX_TEXT_CHARS else f"{text[: _MAX_TEXT_CHARS // 2]}…{text[-_MAX_TEXT_CHARS // 2 :]}"
 
 
@@ -54,7 +62,7 @@ class BlinkGLError(Exception):
                 if not accepted.startswith(("run ", "try ", "use ", "see "))
                 else f"; {accepted}"
             )
-        super().__init__(line)
+        super().__init__(printable(line))
 
 
 class ConfigError(BlinkGLError):

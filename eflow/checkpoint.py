@@ -24,6 +24,7 @@ from torch import Tensor
 
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.records import parse, read_text
 from eflow import shipped
 from eflow.config import TrainConfig
 from eflow.models import FlowModel, build_model, model_config
@@ -124,8 +125,12 @@ def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkp
 
 def newest(run: Path) -> Path | None:
     """Return the checkpoint with the highest step in ``run/checkpoints``, or None."""
-    found = [p for p in (run / "checkpoints").glob("*") if p.name.isdigit() and p.is_dir()]
-    return max(found, key=lambda p: int(p.name), default=None)
+    return max(_steps(run / "checkpoints"), key=lambda p: int(p.name), default=None)
+
+
+def _steps(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder, in order."""
+    return sorted(p for p in folder.glob("*") if re.fullmatch("[0-9]{1,18}", p.name) and p.is_dir())
 
 
 def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any = None) -> FlowModel:
@@ -138,14 +143,16 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
     try:
         if metadata["format"] != FORMAT:
             raise AssetError("checkpoint of another format", where=str(file), value=metadata["format"], accepted=FORMAT)
-        tree = json.loads(metadata["model"])
-    except (KeyError, ValueError, RecursionError):
+        tree = parse(metadata["model"])
+    except (KeyError, ValueError):
         raise AssetError(
             "safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train"
         ) from None
     config = model_config(tree)
     if expected is not None:
         require_same(config, expected, str(file))
+    with torch.device("meta"):  # shapes without memory: a small file may ask for a network of any size
+        _require_fit(build_model(config).state_dict(), tensors, str(file))
     model = build_model(config)
     load_weights(model, tensors, str(file))
     return model.eval()
@@ -169,7 +176,19 @@ def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> No
 
     Raises AssetError, and leaves the model unchanged: a name, a shape or a type does not fit, or a value is not
     finite."""
-    wanted = model.state_dict()
+    _require_fit(model.state_dict(), tensors, where)
+    for name, value in tensors.items():
+        if not torch.isfinite(value).all():
+            raise AssetError(
+                f"tensor '{name}' holds NaN or infinity",
+                where=where,
+                accepted="a checkpoint from before the training diverged",
+            )
+    model.load_state_dict(tensors)
+
+
+def _require_fit(wanted: dict[str, Tensor], tensors: dict[str, Tensor], where: str) -> None:
+    """Raise AssetError when a name, a shape or a type of ``tensors`` is not that of ``wanted``."""
     for name in sorted(set(wanted) | set(tensors)):
         if name not in tensors:
             raise AssetError(f"lacks the tensor '{name}' of this model", where=where)
@@ -189,13 +208,6 @@ def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> No
                 value=str(tensors[name].dtype),
                 accepted=str(wanted[name].dtype),
             )
-        if not torch.isfinite(tensors[name]).all():
-            raise AssetError(
-                f"tensor '{name}' holds NaN or infinity",
-                where=where,
-                accepted="a checkpoint from before the training diverged",
-            )
-    model.load_state_dict(tensors)
 
 
 def save_checkpoint(
@@ -235,7 +247,7 @@ def save_checkpoint(
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    for old in sorted(p for p in final.parent.glob("*") if p.name.isdigit())[:-keep]:
+    for old in _steps(final.parent)[:-keep]:
         shutil.rmtree(old, ignore_errors=True)
     return final
 
@@ -271,7 +283,7 @@ def read_state(folder: Path) -> dict[str, Any]:
     """Return the content of ``state.json``. Raises AssetError."""
     path = folder / "state.json"
     try:
-        state = json.loads(path.read_text(encoding="utf-8"))
+        state = parse(read_text(path))
         if state["format"] != FORMAT or type(state["step"]) is not int or state["step"] < 0:
             raise ValueError
         state["seconds"] = float(state.get("seconds", 0.0))  # of the whole training; old files lack it

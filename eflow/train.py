@@ -20,7 +20,7 @@ import importlib
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,8 +31,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from blinkgl.config.reader import to_yaml
 from blinkgl.errors import ConfigError
-from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.sequence_files.sequence_dir import refuse_existing
+from blinkgl.io.atomic import atomic_file, lock_folder, output_errors, refuse_existing
 from eflow import checkpoint as ckpt
 from eflow.checkpoint import resume_run, weights_of
 from eflow.config import OptimConfig, TrainConfig
@@ -99,8 +98,8 @@ class Training:
         self.config = config.model_copy(update={"run": config.run.model_copy(update={"precision": precision})})
         if self.lead:
             importlib.import_module("torch.utils.tensorboard")  # fail before anything is written
-        if self.lead and not resume:
-            refuse_existing(out)
+        if self.lead:
+            stack.enter_context(_held(out, resume))
         spent = self._make_network(resume)
         self.stop = config.optim.steps if stop_after is None else min(config.optim.steps, self.start + stop_after)
         self._make_data(stack)
@@ -364,6 +363,29 @@ def _picture(path: Path, batch: dict, flow: Tensor) -> None:
 def as_yaml(config: TrainConfig) -> str:
     """Return all keys with their values as YAML, the text of ``config.yaml`` in a run folder."""
     return to_yaml(json.loads(config.model_dump_json()))
+
+
+@contextlib.contextmanager
+def _held(out: Path, resume: bool) -> Iterator[None]:
+    """Hold the run folder, so that no other training writes into it. A new one that stays empty is removed. Raises
+    OutputError: it exists, another run uses it."""
+    if not resume:
+        refuse_existing(out)
+    made = not out.exists() and not resume
+    with output_errors(out):
+        if made:
+            out.mkdir(parents=True, exist_ok=True)
+        handle = lock_folder(out) if out.is_dir() else None
+    try:
+        if not resume:
+            refuse_existing(out)  # another one may have ended in between
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
+        if made:
+            with contextlib.suppress(OSError):
+                out.rmdir()
 
 
 def _write_config(out: Path, config: TrainConfig) -> None:

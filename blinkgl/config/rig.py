@@ -153,13 +153,6 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
 
     Raises ConfigError for an unknown rig, no list of sensors or an empty one, two sensors of one name, or sections that
     a sensor cannot have."""
-    given = tree.get("sensors")
-    own = [] if given is None else given
-    if not isinstance(own, list):
-        raise ConfigError("not a list", where="sensors", value=own, accepted="- {name: left, …}")
-    for k, one in enumerate(own):
-        if not isinstance(one, dict):
-            raise ConfigError("not a table of keys", where=f"sensors.{k}", value=one, accepted="{name: left, …}")
     for key in ("images", "imu", "tracks"):
         if tree.get(key) is not None:
             raise ConfigError(
@@ -167,11 +160,23 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
                 where=key,
                 accepted=f"{key} in one of `sensors`",
             )
-    base = [] if tree.get("rig") is None else load_rig(tree["rig"])
-    tables = _laid(own, base)
+    tables = with_preset(tree)["sensors"]
     if not tables:
-        raise ConfigError("the rig has no sensor", where="sensors", value=own, accepted="one or more")
+        raise ConfigError("the rig has no sensor", where="sensors", value=tables, accepted="one or more")
     return {**tree, "sensors": [_complete(one, k, tree, fills) for k, one in enumerate(tables)]}
+
+
+def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return ``tree`` with its own sensors laid over those of its preset. Repeating it changes nothing. Raises
+    ConfigError for an unknown rig, no list of sensors, or two of one name."""
+    given = tree.get("sensors")
+    own = [] if given is None else given
+    if not isinstance(own, list):
+        raise ConfigError("not a list", where="sensors", value=own, accepted="- {name: left, …}")
+    for k, one in enumerate(own):
+        if not isinstance(one, dict):
+            raise ConfigError("not a table of keys", where=f"sensors.{k}", value=one, accepted="{name: left, …}")
+    return {**tree, "sensors": _laid(own, [] if tree.get("rig") is None else load_rig(tree["rig"]))}
 
 
 def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from blinkgl.config.rig import (
     check_pairs,
     is_rig,
     spelled_out as with_whole_sensors,
+    with_preset,
 )
 from blinkgl.config.sensor import fill_sensor
 from blinkgl.config.sequence import SequenceConfig
@@ -55,7 +56,11 @@ class RunTemplate:
         several groups of sequences (:mod:`blinkgl.config.recipe` separates those)."""
         if "groups" in self.tree:
             raise ConfigError("the recipe has groups; only a group has numbered sequences", where="groups")
-        return _validated(draw(self.tree, self.seed, index))
+        tree = draw(self.tree, self.seed, index)
+        if isinstance(tree, dict) and tree.get("rig") is not None:
+            # A preset's sensors have names, too. Each sequence records the unit that it drew, as for a single camera.
+            tree = draw(expanded(with_preset(tree), self.base), self.seed, index)
+        return _validated(tree)
 
     @property
     def seed(self) -> int:

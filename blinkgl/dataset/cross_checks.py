@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -92,8 +93,8 @@ def strangers(root: Path, folders: list[Path]) -> list[str]:
         name = path.relative_to(root).as_posix()
         if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
             continue
-        left = ".blinkgl-tmp-" in path.name
-        problems.append(f"{shown(name)}: {'left by a run that was cut off' if left else 'belongs to no sequence'}")
+        why = "left by a run that was cut off" if ".blinkgl-tmp-" in path.name else "belongs to no sequence"
+        problems.append(f"{shown(name)}: {'a symbolic link, which is not followed' if path.is_symlink() else why}")
     return problems
 
 
@@ -159,19 +160,11 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     failed: dict[str, str] = {}
     problems = guarded(lambda: failed.update(RunFolder(root).read("failed.json") or {}) or [])
     here = {folder.relative_to(root).as_posix() for folder in folders}
-    missing = 0
-    for task in plan.tasks:
-        if task.name not in here:
-            missing += 1
-            if missing <= _MOST_MISSING:
-                result.add(
-                    task.name,
-                    [
-                        f"set aside: {shown(failed[task.name])}"
-                        if task.name in failed
-                        else "missing: the recipe asks for it"
-                    ],
-                )
+    # A record may ask for millions: the work grows with what is here.
+    missing = len(plan.tasks) - sum(plan.tasks.number(name) is not None for name in here)
+    for task in islice((task for task in plan.tasks if task.name not in here), min(missing, _MOST_MISSING)):
+        said = f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"
+        result.add(task.name, [said])
     if missing > _MOST_MISSING:
         problems.append(f"and {missing - _MOST_MISSING} more sequences that the recipe asks for are missing")
     if record.get("mixed"):
@@ -240,7 +233,7 @@ def plan_of(root: Path) -> Plan | None:
     known = RunFolder(root).read("run.json")
     if known is None:
         return None
-    recipe = root / RUN_FOLDER / "recipe.yaml"
+    recipe = RunFolder(root).record("recipe.yaml")
     with suppress(FileNotFoundError):
         open(open_regular(recipe), "rb").close()
         template = load_run(recipe)

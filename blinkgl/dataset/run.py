@@ -24,7 +24,7 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Message, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.machine.interrupts import interruptible
-from blinkgl.sequence_files.index import write_index
+from blinkgl.sequence_files.index import INDEX, write_index
 
 ATTEMPTS = 3
 """A sequence is set aside after this many temporary failures, or one permanent failure
@@ -85,7 +85,10 @@ def run_dataset(
     plan = Plan.of(template, num)
     assets = plan.check_assets()
     folder = RunFolder(out)
-    with interruptible(signal.SIGTERM), folder.locked():  # batch systems and `docker stop` end a run like Ctrl-C
+    with (
+        interruptible(signal.SIGTERM),
+        folder.locked(plan.tasks.splits),
+    ):  # batch systems and `docker stop` end a run like Ctrl-C
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
         missing = outcome.planned - outcome.found
@@ -108,6 +111,8 @@ def run_dataset(
             if missing:
                 _loop(plan, executor, folder, outcome, time_limit_s, listener)
             outcome.elapsed_s = time.monotonic() - started
+            if not missing and not (out / INDEX).is_file():  # the run was killed after its last sequence
+                write_index(out)
         except StartError:
             keep_logs = True
             raise

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -27,8 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
-from blinkgl.io.records import parse, read_text, shown
+from blinkgl.io.atomic import atomic_file, lock_folder, output_errors, remove_stale
+from blinkgl.io.records import entries_below, inside, parse, read_text, shown
 from blinkgl.machine.posix import fcntl
 from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
 
@@ -125,16 +126,14 @@ class RunFolder:
             )
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self, splits: Sequence[str] = ()) -> Iterator[None]:
         """Lock the folder for one run; the lock ends with the process. The folder is made, and removed if it is empty
-        in the end: a refused run leaves nothing."""
+        in the end: a refused run leaves nothing.   splits : the folders that it writes. Raises OutputError: in use, not
+        writable, or a symbolic link where the run writes."""
         made = self._make()
         self._handle = self._lock()
         try:
-            if self.path.is_symlink():
-                raise OutputError(
-                    "is a symbolic link", where=str(self.path), accepted="a folder (--out itself may be a link)"
-                )
+            self._refuse_links(splits)
             self._fresh = not self.path.exists()
             self._logs = set(self._worker_logs())
             yield
@@ -144,6 +143,22 @@ class RunFolder:
             with contextlib.suppress(OSError):  # non-empty folders stay
                 for folder in made:
                     folder.rmdir()
+
+    def _refuse_links(self, splits: Sequence[str]) -> None:
+        """Raise OutputError for a symbolic link where this run writes, which could lead out of ``out``."""
+        links = [path for path in (self.path, *(self.out / split for split in splits)) if path.is_symlink()]
+        for name, kind, _ in entries_below(self.path) if self.path.is_dir() and not links else ():
+            # What was found in a sequence's place is moved there as it is.
+            if kind == "symbolic link" and not re.match("damaged/[^/]+/", name):
+                links.append(self.path / name)
+        if links:
+            raise OutputError(
+                "is a symbolic link", where=str(links[0]), accepted="a folder (--out itself may be a link)"
+            )
+
+    def record(self, name: str) -> Path:
+        """Return the path of a record. Raises AssetError for a symbolic link."""
+        return inside(self.out, f"{RUN_FOLDER}/{name}")
 
     def _make(self) -> list[Path]:
         """Return the folders that were made, innermost first."""
@@ -157,29 +172,11 @@ class RunFolder:
         detected."""
         while fcntl is not None:
             with output_errors(self.out):
-                handle = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                if not os.access(self.out, os.W_OK | os.X_OK):
-                    raise OutputError(
-                        "cannot be written", where=str(self.out), accepted="a folder with write permission"
-                    )
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise OutputError(
-                        "another run uses this folder",
-                        where=str(self.out),
-                        accepted="another --out, or --resume after it has ended",
-                    ) from None
-                except OSError:  # a file system without locks
-                    pass
-                if _same(self.out, handle):
-                    return handle
-            except BaseException:
-                os.close(handle)
-                raise
+                handle = lock_folder(self.out)
+            if _same(self.out, handle):
+                return handle
             # Another run was refused and removed the folder between our opening and our locking it.
-            os.close(handle)
+            os.close(handle)  # type: ignore[arg-type]
             self._make()
         return None
 
@@ -286,9 +283,8 @@ class RunFolder:
     def altered(self) -> list[str]:
         """Return records that differ from what the run wrote, one line each. Runs of format_version 1 need no
         checksums, but existing ones count."""
-        path = self.path / CHECKSUMS
         try:
-            text = read_text(path)
+            text = read_text(self.record(CHECKSUMS))
         except FileNotFoundError:
             record = self.read("run.json")
             old = record is None or record["format_version"] == 1
@@ -300,9 +296,9 @@ class RunFolder:
         for name, digest in known.items():
             if name not in (*_BEGUN, *_ENDED):
                 lines.append(f"{CHECKSUMS}: names {shown(name)}, which is no record")
-            elif not (self.path / name).is_file():
+            elif not self.record(name).is_file():
                 lines.append(f"{name}: missing")
-            elif digest_of(self.path / name)["sha256"] != digest:
+            elif digest_of(self.record(name))["sha256"] != digest:
                 lines.append(f"{name}: checksum differs")
         return [f"{RUN_FOLDER}/{line}" for line in lines]
 
@@ -347,7 +343,7 @@ class RunFolder:
         """Return the last line of each sequence; a line cut by a crash is left out."""
         found: dict[str, dict[str, Any]] = {}
         with contextlib.suppress(FileNotFoundError, AssetError):
-            for line in read_text(self.path / "costs.jsonl").splitlines():
+            for line in read_text(self.record("costs.jsonl")).splitlines():
                 with contextlib.suppress(ValueError):
                     entry = parse(line, _COST)
                     found[entry["name"]] = entry
@@ -357,7 +353,7 @@ class RunFolder:
         """Return a JSON file of the folder, checked; None when there is none. Raises OutputError when it is damaged."""
         path = self.path / name
         try:
-            return parse(read_text(path), _RECORDS[name])
+            return parse(read_text(self.record(name)), _RECORDS[name])
         except FileNotFoundError:
             return None
         except (AssetError, ValueError) as error:

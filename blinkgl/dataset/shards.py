@@ -21,7 +21,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,9 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
-from blinkgl.io.images import NpzReader, numpy_errors
+from blinkgl.io.poses import POSES, read_poses
+from blinkgl.io.records import shown
+from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
@@ -44,11 +46,17 @@ _FLOW = LABELS["flow_forward"]
 
 
 def export_shards(
-    root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0
+    root: str | Path,
+    out: str | Path,
+    *,
+    shard_bytes: int = 512_000_000,
+    seed: int = 0,
+    note: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[int]]:
     """Write ``<out>/<split>-000000.tar`` …, each completely or not at all; return the samples per shard of each split.
 
-    Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially. Raises
+    Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially.
+    note : called with a line for each sequence that is left out. Raises
     AssetError (no labels, a damaged sequence), OutputError (existing shards, disk full)."""
     root, out = Path(root), Path(out)
     if out.is_dir() and any(out.glob("*-*.tar")):
@@ -65,7 +73,9 @@ def export_shards(
             )
         manifest = read_manifest(folder)
         count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
-        labels.setdefault(str(manifest.get("split", "all")), []).extend((folder, k) for k in range(count))
+        labels.setdefault(manifest.get("split") or "all", []).extend((folder, k) for k in range(count))
+        if not count:
+            note(f"{shown(folder.relative_to(root))}: no forward flow")
     if not any(labels.values()):
         raise AssetError("no flow labels found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
     written = {}
@@ -98,8 +108,8 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     manifest = read_manifest(folder)
     called = folder.name if "sensor" not in manifest else f"{folder.parent.name}-{folder.name}"
     key = f"{called}_{k:06d}"
-    lines = [line for line in (folder / _FLOW.stamps).read_text().splitlines() if not line.startswith("#")]
-    start, end = (int(v) for v in lines[k].split(","))
+    count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
+    start, end = read_label_times(folder / _FLOW.stamps, 2, count)[k]
     about: dict[str, Any] = {
         "sequence": called,
         "label": k,
@@ -114,7 +124,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     taken = _last_image(folder, manifest, start)
     if taken is not None:
         about["camera"] = {"image": taken[0], **asdict(taken[1])}
-    with DsecEventReader(folder / "events.h5") as reader:
+    with DsecEventReader(folder / "events.h5", size=(manifest["height"], manifest["width"])) as reader:
         windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
         if EVENT_LABELS in manifest["files"]:
             first = reader.number(2 * start - end), reader.number(start)
@@ -136,13 +146,11 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
 
 def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]:
     """Return intrinsics, and the camera's pose at a label's time; nothing where a sequence has no poses."""
-    path = folder / "poses.npz"
-    if "poses.npz" not in manifest["files"]:
+    if POSES not in manifest["files"]:
         return {}
-    with numpy_errors(path), NpzReader(path) as arrays:
-        times = arrays["t_ns"] // 1000
-        T_world_cam = arrays["T_world_cam"][int(np.argmin(np.abs(times - t_us)))]
-        return {"K": arrays["K"].tolist(), "near": float(arrays["near"]), "T_world_cam": T_world_cam.tolist()}
+    poses = read_poses(folder / POSES)
+    T_world_cam = poses["T_world_cam"][int(np.argmin(np.abs(poses["t_ns"] // 1000 - t_us)))]
+    return {"K": poses["K"].tolist(), "near": float(poses["near"]), "T_world_cam": T_world_cam.tolist()}
 
 
 def _last_image(folder: Path, manifest: dict[str, Any], t_us: int) -> tuple[int, ExposureLine] | None:

@@ -77,7 +77,7 @@ def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: b
         said.append(("events_by_cause", "that there are some" if told else None))
     problems = [*unlike(manifest, said), *misnamed(name, manifest, config)]
     if config.frames is None and not problems:
-        problems += not_asked_for(set(_files_of(config, events)), manifest)
+        problems += not_asked_for(set(files_of_sequence(config, events)), manifest)
     return problems
 
 
@@ -109,7 +109,7 @@ def files_of_rig(config: SequenceConfig) -> Iterator[str]:
     yield from ("config.yaml", RIG)
     for _, name, own, gives_events in config.cameras():
         yield f"{name}/{MANIFEST}"
-        yield from (f"{name}/{file}" for file in _files_of(own, gives_events))
+        yield from (f"{name}/{file}" for file in files_of_sequence(own, gives_events))
     for one in config.sensors or ():
         if one.imu is not None and not one.sees:
             yield from (f"{one.name}/{file}" for file in IMU_FILES)
@@ -117,7 +117,7 @@ def files_of_rig(config: SequenceConfig) -> Iterator[str]:
         yield "preview.mp4"
 
 
-def _files_of(config: SequenceConfig, events: bool = True) -> Iterator[str]:
+def files_of_sequence(config: SequenceConfig, events: bool = True) -> Iterator[str]:
     """Yield the names of the files of a generated sequence, without the manifest.   events : whether there are some."""
     yield from ("poses.npz", "config.yaml")
     if events:
@@ -165,8 +165,6 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
     found: list[Known] = []
 
     def check() -> list[str]:
-        if name != "." and folder.is_symlink():
-            return ["a symbolic link, not a folder"]
         if problems := verify_sequence(folder):
             return problems
         manifest = read_manifest(folder)

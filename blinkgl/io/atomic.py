@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from blinkgl.errors import BlinkGLError, OutputError
+from blinkgl.machine.posix import fcntl
 
 _serial = itertools.count()
 _PATTERN = re.compile(r"^\..+\.blinkgl-tmp-([0-9a-f]{12})-(\d+)-\d+(\..*)?$")
@@ -167,6 +168,32 @@ def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
         if (named := _named(error, temporary, final)) is not None:
             raise named from error
         raise
+
+
+def lock_folder(folder: Path) -> int | None:
+    """Return the open, locked folder for one run that writes into it; the lock ends when it is closed, or with the
+    process. None where the system has no locks. Raises OutputError: another run has it, not writable; OSError: no
+    folder."""
+    if fcntl is None:
+        return None
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise OutputError("cannot be written", where=str(folder), accepted="a folder with write permission")
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise OutputError(
+            "another run uses this folder",
+            where=str(folder),
+            accepted="another --out, or --resume after it has ended",
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle
 
 
 def refuse_existing(final: str | os.PathLike) -> None:

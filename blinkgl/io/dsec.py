@@ -254,8 +254,12 @@ class DsecEventReader:
     AssetError : not a readable HDF5 file (truncated, wrong type) or without the DSEC datasets.
     """
 
-    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        self.path = Path(path)
+    def __init__(
+        self, path: str | os.PathLike, reading: EventReading = AS_FILE, *, size: tuple[int, int] | None = None
+    ):
+        """size : (height, width) of the sensor as known from elsewhere, by which events are checked; None: only what the
+        file says counts."""
+        self.path, self._checked = Path(path), size is not None
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
             missing = [
@@ -281,6 +285,15 @@ class DsecEventReader:
             if "ms_to_idx" in self._file:
                 self._ms_to_idx = dataset(self._file, "ms_to_idx", self.path, shape=(None,))
             self.height, self.width = (self._declared(name) for name in ("height", "width"))
+            if size is not None:
+                if (self.height or size[0], self.width or size[1]) != size:
+                    raise AssetError(
+                        "another size than the sequence's",
+                        where=str(path),
+                        value=f"{self.width}x{self.height}",
+                        accepted=f"{size[1]}x{size[0]}",
+                    )
+                self.height, self.width = size
             check_size(self.height, self.width, str(path))
 
     def _declared(self, name: str) -> int | None:
@@ -340,9 +353,14 @@ class DsecEventReader:
             return self.count if otherwise else (int(table[-1]) if len(table) else 0)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """Yield all events in pieces of ``size``."""
+        """Yield all events in pieces of ``size``. Raises EventDataError as :meth:`slice` where the sensor's size is
+        known from elsewhere; else whoever opened the file checks them, or keeps what is whole."""
+        last = None
         for start in range(0, self.count, size):
-            yield self._read(start, min(self.count, start + size))
+            events = self._read(start, min(self.count, start + size))
+            if self._checked:
+                last = check_events(events, str(self.path), start, height=self.height, width=self.width, after=last)
+            yield events
 
     def _read(self, start: int, stop: int) -> Events:
         with hdf5_errors(self.path):

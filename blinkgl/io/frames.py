@@ -15,6 +15,7 @@ from blinkgl.io.alpha import background_of
 from blinkgl.io.clock import NANOSECONDS, checked_unit
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors
 from blinkgl.io.names import Series, series
+from blinkgl.io.records import inside
 from blinkgl.io.stamps import Stamps, read_timestamps, stamps_of_array
 from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills
 
@@ -218,7 +219,7 @@ def _folder(folder: Path, declared: Declared) -> FrameSource:
             list_file = None
     stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps)
     if not found.files and list_file is not None and stamps is not None and stamps.names:
-        found = Series([p for name in stamps.names if (p := list_file.parent / name).is_file()])
+        found = Series([p for name in stamps.names if (p := inside(list_file.parent, name)).is_file()])
     if not found.files:
         raise AssetError("no images in the folder", where=str(folder), accepted=" ".join(sorted(IMAGE)))
     source = _stacks(folder, found, declared)

@@ -154,6 +154,34 @@ class NpzReader:
             return np.lib.format.read_array(member, allow_pickle=False)
 
 
+def checked_arrays(
+    path: str | os.PathLike, shapes: dict[str, tuple[str, str]], optional: dict[str, tuple[str, str]] | None = None
+) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz by name, each of its shape and number type.
+
+    shapes : array -> its axes and NumPy's kinds of number. A digit is a length; a letter is one that all arrays share.
+    optional : the same; arrays that are there, all of them, or none. Raises AssetError: missing, damaged, another shape
+    or type, a number that is not finite."""
+    sizes: dict[str, int] = {}
+    with numpy_errors(path), NpzReader(path) as file:
+        wanted = {**shapes, **(optional or {})} if any(name in file for name in optional or ()) else shapes
+        arrays = {name: file[name] for name in wanted}
+    for name, (axes, kinds) in wanted.items():
+        shape, array = (), arrays[name]
+        for axis, length in zip(axes, array.shape):
+            shape += (int(axis) if axis.isdigit() else sizes.setdefault(axis, length),)
+        if array.ndim != len(axes) or array.shape != shape or array.dtype.kind not in kinds:
+            raise AssetError(
+                f"'{name}' has the wrong shape or type",
+                where=str(path),
+                value=f"{array.dtype} {array.shape}",
+                accepted=f"({', '.join(axes)})" + "".join(f", {k} = {n}" for k, n in sizes.items()),
+            )
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise AssetError(f"'{name}' holds NaN or infinity", where=str(path))
+    return arrays
+
+
 def memory_limit() -> int:
     """Return the bytes that one file may use: half of the machine's memory."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2

@@ -12,6 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
@@ -58,15 +59,18 @@ def parse(text: str, model: TypeAdapter | None = None) -> Any:
             model.validate_python(data)
         return data
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(shown(part) for part in first["loc"])
-        raise ValueError(
-            f"{place}: {first['msg'].removeprefix('Value error, ').lower()}" if place else first["msg"].lower()
-        ) from None
+        raise ValueError(first_problem(error)) from None
     except RecursionError:
         raise ValueError("nested too deeply") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"not JSON: {error.msg.lower()} at line {error.lineno}") from None
+
+
+def first_problem(error: ValidationError) -> str:
+    """Return the first place where data are not in the form of a model, and why."""
+    first = error.errors(include_url=False)[0]
+    place, said = ".".join(shown(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ").lower()
+    return f"{place}: {said}" if place else said
 
 
 SEAL = "record_sha256"
@@ -117,10 +121,35 @@ def _inside(name: str) -> str:
     return name
 
 
+def _plain(name: str) -> str:
+    """Return ``name``. Raises ValueError unless it is the plain name of one folder, which can be printed."""
+    if "/" in _inside(name) or "\\" in name or name.startswith(".") or not name.isprintable():
+        raise ValueError("not the plain name of a folder")
+    return name
+
+
 InsidePath = Annotated[str, AfterValidator(_inside)]
 """A relative path that neither leaves its folder nor names the folder itself."""
+PlainName = Annotated[str, AfterValidator(_plain)]
+"""The name of one folder: no separators, not hidden, printable."""
 HereOrInside = Annotated[str, AfterValidator(lambda name: name if name == "." else _inside(name))]
 """As InsidePath, or "." for the folder itself."""
+
+
+def inside(folder: str | os.PathLike, name: str) -> Path:
+    """Return the path of what a file names inside ``folder``, which itself may be a link. Every name of a record that
+    becomes a path passes here. Raises AssetError: no plain relative path, or a symbolic link on the way, which could
+    lead out of the folder."""
+    path = Path(folder)
+    try:
+        parts = _inside(name).split("/")
+    except ValueError as error:
+        raise AssetError(f"names {error}", where=str(path), value=name, accepted="a plain relative path") from None
+    for part in parts:
+        path /= part
+        if path.is_symlink():
+            raise AssetError("a symbolic link, which is not followed", where=str(path), accepted="the file itself")
+    return path
 
 
 def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
+from blinkgl.io.records import read_text
 from blinkgl.io.rows import is_number, read_rows, titles_of
 
 
@@ -67,6 +68,34 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
         return Stamps([round(Fraction(text) * 10**9 / Fraction(fps)) for text in texts], names)
     found = _unit(unit, titles, columns, heading, path, texts)
     return Stamps(nanoseconds(texts, found), names, None if found.line is None else f"{path.name}: {found.line}")
+
+
+_MICROSECONDS = re.compile(r"[-+]?\d{1,16}")
+
+
+def read_label_times(path: Path, columns: int, count: int | None = None) -> list[tuple[int, ...]]:
+    """Return the rows of a list of times, µs, separated by commas, without ``#`` comments: one column for labels of one
+    time, two for the start and the end of flow.   count : the number of files that they belong to; None: not compared.
+
+    Raises AssetError: missing, not such a row (with its line), another number of rows."""
+    try:
+        lines = read_text(path).splitlines()
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        fields = [part.strip() for part in line.split(",")]
+        if not line.strip() or line.startswith("#"):
+            continue
+        if len(fields) != columns or not all(map(_MICROSECONDS.fullmatch, fields)):
+            accepted = "from_us, to_us" if columns == 2 else "a time in µs"
+            raise AssetError(f"line {number} is no time", where=str(path), value=line, accepted=accepted)
+        rows.append(tuple(map(int, fields)))
+        if columns == 2 and rows[-1][0] == rows[-1][1]:
+            raise AssetError(f"line {number} is not an interval", where=str(path), value=line, accepted="two times")
+    if count is not None and len(rows) != count:
+        raise AssetError("files and time stamps differ in number", where=str(path), value=(count, len(rows)))
+    return rows
 
 
 def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str) -> Stamps:

@@ -4,12 +4,11 @@ arrays)."""
 from __future__ import annotations
 
 import os
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
-from blinkgl.errors import AssetError
+from blinkgl.io.images import checked_arrays
 
 TRACKS = "tracks.npz"
 _SHAPES: dict[str, tuple[str, str]] = {
@@ -32,19 +31,4 @@ def read_tracks(path: str | os.PathLike) -> dict[str, np.ndarray]:
     Raises AssetError: missing, damaged, another shape or number type."""
     path = Path(path)
     path = path / TRACKS if path.is_dir() else path
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in _SHAPES}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise AssetError(f"no tracks: {' '.join(str(error).split())[:120]}", where=str(path)) from None
-    sizes = {"N": len(arrays["query_points"]), "T": len(arrays["t_us"])}
-    for name, (axes, kind) in _SHAPES.items():
-        shape = tuple(sizes[a] if a in sizes else int(a) for a in axes)
-        if arrays[name].shape != shape or arrays[name].dtype.kind != kind:
-            raise AssetError(
-                f"'{name}' has the wrong shape or type",
-                where=str(path),
-                value=f"{arrays[name].dtype} {arrays[name].shape}",
-                accepted=str(shape),
-            )
-    return arrays
+    return checked_arrays(path, _SHAPES)

@@ -32,7 +32,7 @@ def _times(source: Source) -> Missing | None:
         return None
     if len(times) < TIMES or abs(times[TIMES - 1] - times[0] - SECONDS * 1e6) > 1000:
         return Missing(f"{TIMES} images over {SECONDS:g} s", _TIME)
-    if not source.has(TRACKS) or list(read_tracks(source.folder)["t_us"][:TIMES]) != times[:TIMES]:
+    if not source.has(TRACKS) or source.track_times[:TIMES] != times[:TIMES]:
         return Missing("point tracks at the images' times", "tracks: {points: 2048}, without a rate")
     return None
 

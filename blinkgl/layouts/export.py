@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from blinkgl.config.run import RunTemplate
+from blinkgl.dataset.plan import Plan
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.atomic import atomic_folder
+from blinkgl.io.records import inside
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
 from blinkgl.layouts.event_kubric import EventKubric
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
+from blinkgl.layouts.planned import Planned
 from blinkgl.layouts.rosbag import RosBag
 from blinkgl.layouts.source import Source, sources_of
 from blinkgl.layouts.tapvid import TapVid
@@ -68,6 +72,17 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
     return Exported(len(sources), tuple(said), row.opened_by(out))
 
 
+def refuse_plan(template: RunTemplate, num: int | None, layout: str) -> None:
+    """Raise AssetError when no sequence of a run can have what a layout of the table takes, before it is generated."""
+    row = layout_of(layout)
+    for group in Plan.of(template, num).used:
+        configs = [one for one in group.template.corners() if any(camera.gives_events for camera in one.cameras())]
+        planned = [Planned.of(one, Path(group.name or "the recipe")) for one in configs if one.frames is None]
+        if len(planned) == len(configs) and all(row.missing(one) for one in planned):
+            for one in planned[:1]:
+                _refuse_what_lacks(row, one)
+
+
 def _refuse_what_lacks(row: Layout, source: Source) -> None:
     if missing := row.missing(source):
         raise AssetError(
@@ -78,10 +93,10 @@ def _refuse_what_lacks(row: Layout, source: Source) -> None:
 
 
 def _places(row: Layout, sources: list[Source]) -> list[str]:
-    places = [f"{row.folder(source)}/{source.name}" for source in sources]
+    places = [inside("", f"{row.folder(source)}/{source.name}") for source in sources]
     if twice := [place for place in places if places.count(place) > 1]:
         raise OutputError(
-            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=twice[0]
+            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=str(twice[0])
         )
     return [row.folder(source) for source in sources]
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.intervals import intervals_in
 from blinkgl.layouts.layout import Layout, Missing, append, copy, growing, images
 from blinkgl.layouts.source import Source
 
@@ -92,7 +91,7 @@ def labels_of(source: Source) -> list[int]:
 
 def _leads(source: Source, k: int) -> bool:
     """Return whether label ``k`` leads to the end of a sample."""
-    return TARGET_US in _clock_us(intervals_in(source.file("flow_intervals", k)))
+    return TARGET_US in _clock_us(source.interval_ns(k))
 
 
 def _clock_us(interval_ns: np.ndarray) -> list[int | None]:

@@ -16,9 +16,13 @@ from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.images import NpzReader, numpy_errors, read_image
+from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU
-from blinkgl.io.records import read_text
+from blinkgl.io.intervals import intervals_in
+from blinkgl.io.poses import POSES, read_poses
+from blinkgl.io.records import inside
+from blinkgl.io.stamps import read_label_times
+from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
@@ -87,20 +91,26 @@ class Source:
 
     def flow_times(self, towards: str) -> list[tuple[int, int]]:
         """Return (from, to) of every flow label; empty: there is none."""
-        stamps = _stamps(f"flow_{towards}")
-        return self._pairs(stamps) if self.has(stamps) else []
+        return [(start, end) for start, end in self._times(f"flow_{towards}", 2)]
 
     @functools.cached_property
     def interval_times(self) -> list[int]:
         """Return the times of the labels that lead to several times (``flow_intervals``); empty: there are none."""
-        stamps = _stamps("flow_intervals")
-        return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
+        return [time for (time,) in self._times("flow_intervals")]
 
     @functools.cached_property
     def image_times(self) -> list[int]:
         """Return the times of the sRGB images; empty: there are none."""
-        stamps = _stamps("images")
-        return [int(line) for line in self._lines(stamps)] if self.has(stamps) else []
+        return [time for (time,) in self._times("images")]
+
+    @functools.cached_property
+    def track_times(self) -> list[int]:
+        """Return the times of the point tracks; empty: there are none. Raises AssetError."""
+        return read_tracks(self.folder)["t_us"].tolist() if self.has(TRACKS) else []
+
+    def interval_ns(self, k: int) -> np.ndarray:
+        """Return the intervals over which label ``k`` leads, (n,) int64 ns. Raises AssetError."""
+        return intervals_in(self.file("flow_intervals", k))
 
     def file(self, label: str, k: int) -> Path:
         """Return the ``k``-th file of a label, in its first format."""
@@ -111,13 +121,18 @@ class Source:
         forms = {form.ending: form for form in LABELS[f"flow_{towards}"].forms}
         for form in (forms["npy"], forms["flo"], forms["png"]):
             if self.has(form.file(k)):
-                value = _read(form, self.folder / form.file(k))
+                value = self._read(f"flow_{towards}", k, form)
                 return value.flow, value.valid
         raise AssetError("no flow of this number", where=str(self.folder), value=k)
 
     def image(self, k: int) -> np.ndarray:
         """Return an image, (H, W, 3) uint8 sRGB."""
-        image = read_image(self.file("images", k))
+        path = self.file("images", k)
+        image = read_image(path)
+        if image.shape[:2] != (self.height, self.width) or image.dtype != np.uint8:
+            raise AssetError(
+                f"not {self.width}x{self.height} px of 8 bits: {image.shape} {image.dtype}", where=str(path)
+            )
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
     def grey(self, k: int) -> np.ndarray:
@@ -127,25 +142,21 @@ class Source:
     def value(self, label: str, k: int) -> np.ndarray:
         """Return the ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is hit.
         Raises AssetError."""
-        return _read(LABELS[label].forms[0], self.file(label, k))
+        return self._read(label, k)
 
     def flows(self, k: int) -> Flows:
         """Return the flow from label ``k`` to several times. Raises AssetError."""
-        return _read(LABELS["flow_intervals"].forms[0], self.file("flow_intervals", k))
+        return self._read("flow_intervals", k)
 
     def events(self, chunk: int = 1 << 20) -> Iterator[Events]:
         """Yield all events, in order, in pieces."""
-        with DsecEventReader(self.folder / "events.h5") as reader:
+        with DsecEventReader(self.folder / "events.h5", size=(self.height, self.width)) as reader:
             yield from reader.chunks(chunk)
 
     @functools.cached_property
     def poses(self) -> dict[str, np.ndarray]:
         """Return the arrays of ``poses.npz``; none where a recording has no poses."""
-        path = self.folder / "poses.npz"
-        if not self.has("poses.npz"):
-            return {}
-        with numpy_errors(path), NpzReader(path) as arrays:
-            return {name: arrays[name] for name in arrays.names}
+        return read_poses(self.folder / POSES) if self.has(POSES) else {}
 
     @functools.cached_property
     def camera(self) -> CameraModel | None:
@@ -175,26 +186,20 @@ class Source:
     def _configured(self, section: str, key: str) -> Any:
         return (read_table(self.folder / "config.yaml").get(section) or {}).get(key)
 
-    def _lines(self, name: str) -> list[str]:
-        lines = read_text(self.folder / name).splitlines()
-        return [line for line in lines if line.strip() and not line.startswith("#")]
+    def _times(self, label: str, columns: int = 1) -> list[tuple[int, ...]]:
+        stamps = LABELS[label].stamps
+        assert stamps is not None, label
+        return read_label_times(self.folder / stamps, columns, self.count(label)) if self.has(stamps) else []
 
-    def _pairs(self, name: str) -> list[tuple[int, int]]:
-        try:
-            return [(int(a), int(b)) for a, b in (line.split(",") for line in self._lines(name))]
-        except ValueError:
-            raise AssetError("not pairs of times, µs", where=str(self.folder / name)) from None
-
-
-def _stamps(label: str) -> str:
-    stamps = LABELS[label].stamps
-    assert stamps is not None, label
-    return stamps
-
-
-def _read(form: Form, path: Path) -> Any:
-    assert form.read is not None, form.folder
-    return form.read(path)
+    def _read(self, label: str, k: int, form: Form | None = None) -> Any:
+        row = LABELS[label]
+        form = form or row.forms[0]
+        path = self.folder / form.file(k)
+        assert form.read is not None, form.folder
+        value = form.read(path)
+        if (wrong := row.wrong(value, self.height, self.width)) is not None:
+            raise AssetError(f"not of this sequence: {wrong}", where=str(path))
+        return value
 
 
 def sources_of(root: Path) -> list[Source]:
@@ -208,9 +213,9 @@ def _of_rig(folder: Path) -> Source:
     cameras = [name for name, one in tables.items() if "events" in one["records"]]
     if not cameras:
         raise AssetError("a rig without an event camera", where=str(folder))
-    unit = next((folder / name for name, one in tables.items() if "imu" in one["records"]), None)
-    one, other = cameras[0], tables[cameras[0]].get("pair")
+    unit = next((inside(folder, name) for name, one in tables.items() if "imu" in one["records"]), None)
+    one, other = cameras[0], tables[cameras[0]]["pair"]
     if other not in cameras:
-        return Source.open(folder / one, folder.name, unit=unit)
+        return Source.open(inside(folder, one), folder.name, unit=unit)
     left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
-    return Source.open(folder / left, folder.name, folder / right, unit)
+    return Source.open(inside(folder, left), folder.name, inside(folder, right), unit)

@@ -24,7 +24,7 @@ def _tracks(source: Source) -> Missing | None:
 def _at_images(source: Source) -> Missing | None:
     if not source.has(TRACKS) or not source.image_times:
         return None
-    if len(_common(source, read_tracks(source.folder)["t_us"])[0]) > 1:
+    if len(_common(source, np.array(source.track_times))[0]) > 1:
         return None
     return Missing("tracks at the images' times", "tracks: {points: 256}, without a rate")
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import typer
 
-from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.errors import BlinkGLError, ConfigError, printable
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
@@ -66,7 +66,7 @@ def _report(error: Exception, debug: bool, project: str) -> int:
     if line is None:
         print(f"this is a bug in {project}; please report the lines above and the command", file=sys.stderr)
         return 1
-    print(f"error: {line}", file=sys.stderr)
+    print(f"error: {printable(line)}", file=sys.stderr)
     if not isinstance(error, BlinkGLError):
         return BlinkGLError.exit_status
     if getattr(error, "detail", ""):  # a shader's messages with the source around them

@@ -12,16 +12,26 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import TextColumn
+from rich.text import Text
+
+from blinkgl.errors import printable
 
 _NO_END = 10_000
 """Columns of a file."""
 
 
+class _Console(Console):
+    """A console that shows text of files as text: it escapes what a terminal would obey."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text, "\n\t"), **options)
+
+
 def plain_console(**options: Any) -> Console:
-    """Return a ``rich.console.Console`` that interprets no markup and no names of emoji (``a:bug:b`` is a folder), in
-    tables too. For style pass a ``rich.text.Text`` or ``style=``. In a pipe or a file, lines are not wrapped, so that
-    words can be searched."""
-    console = Console(markup=False, emoji=False, **options)
+    """Return a ``rich.console.Console`` that interprets no markup, no names of emoji (``a:bug:b`` is a folder) and no
+    control characters, in tables too. For style pass a ``rich.text.Text`` or ``style=``. In a pipe or a file, lines are
+    not wrapped, so that words can be searched."""
+    console = _Console(markup=False, emoji=False, **options)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _NO_END
     return console

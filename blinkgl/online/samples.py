@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.io.images import NpzReader
 from blinkgl.types.events import Events
 
 _COLUMNS = ("x", "y", "t", "p")
@@ -81,9 +82,10 @@ class StreamSample:
 
 
 def read_sample(path: Path) -> WindowSample | StreamSample:
-    """Return a written sample of either kind. Raises FileNotFoundError; ValueError, KeyError: another file."""
-    with np.load(path, allow_pickle=False) as z:
-        arrays = {key: z[key] for key in z.files}
+    """Return a written sample of either kind. Raises FileNotFoundError; AssetError, ValueError, KeyError: another
+    file."""
+    with NpzReader(path) as z:
+        arrays = {key: z[key] for key in z.names}
     name = str(arrays["name"])
     if "times" in arrays:
         events = _events(arrays, "all")

@@ -23,6 +23,7 @@ from blinkgl.io.images import read_image
 from blinkgl.io.overlays import TrackLines, with_tracks
 from blinkgl.io.pictures import picture
 from blinkgl.io.records import shown
+from blinkgl.io.stamps import read_label_times
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import entry, sequence_folders
@@ -150,7 +151,7 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
             flows = sorted((folder / _FLOW.forms[0].folder).glob("*.png"))
             if not flows:
                 continue
-            pairs = _pairs(folder / _FLOW.stamps)
+            pairs = read_label_times(folder / _FLOW.stamps, 2, len(flows))
             picks = sorted(rng.permutation(len(flows))[:LABELS_EACH])
             for k in picks:
                 flow, valid = read_flow_png(flows[k])
@@ -199,7 +200,7 @@ def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> li
 def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: int) -> Example:
     flow, valid = read_flow_png(flows[k])
     start, end = pairs[k]
-    with DsecEventReader(folder / "events.h5") as reader:
+    with DsecEventReader(folder / "events.h5", size=(line["height"], line["width"])) as reader:
         # A whole label interval is too dense to see: show the first part of it, about one event in five pixels.
         window = end - start
         events = reader.slice(start, end)
@@ -280,11 +281,6 @@ def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[st
     return pictures
 
 
-def _pairs(path: Path) -> list[tuple[int, int]]:
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
-    return [(int(start), int(end)) for start, end in (line.split(",") for line in lines)]
-
-
 # ---- parameters ------------------------------------------------------------------------------------------------------
 
 
@@ -293,8 +289,8 @@ def _parameters(found: Collected, rng: np.random.Generator) -> None:
     if found.plan is None:
         return
     here = {task_of(s) for s in found.sequences if s["path"] not in found.damaged}
-    tasks = [task for task in found.plan.tasks if task.name in here]
-    tasks = [tasks[i] for i in sorted(rng.permutation(len(tasks))[:MAX_CONFIGS])]
+    numbers = sorted(n for name in here if (n := found.plan.tasks.number(name)) is not None)
+    tasks = [found.plan.tasks[numbers[i]] for i in sorted(rng.permutation(len(numbers))[:MAX_CONFIGS])]
     configs: dict[str, list[dict]] = {}
     for task in tasks:
         try:

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.report.charts import histogram, number, png, render, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
@@ -18,12 +19,19 @@ _MAX_PICTURE_PX = 360
 _MAX_LISTED = 50
 
 
-def write_report(root: str | Path, out: str | Path | None = None, *, examples: int = 6) -> Path:
-    """Write the page (default ``<root>/report.html``) and ``index.jsonl``; return the page's path. Raises
-    BlinkGLError."""
+def write_report(
+    root: str | Path, out: str | Path | None = None, *, examples: int = 6, overwrite: bool = False
+) -> Path:
+    """Write the page, ``out``, or ``<root>/report.html`` and with it ``index.jsonl``; return the page's path.
+
+    overwrite : replace an existing ``out``. Raises BlinkGLError."""
+    own = out is None
+    out = Path(root) / "report.html" if out is None else Path(out)
+    if not own and not overwrite and out.exists():  # before the work, not after it
+        raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
     found = collect(root, examples=examples)
-    out = Path(out) if out is not None else Path(root) / "report.html"
-    write_index(root)
+    if own:
+        write_index(root)
     with atomic_file(out) as path, output_errors(path):
         path.write_text(build_report(found), encoding="utf-8")
     return out
@@ -78,9 +86,9 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
     if found.plan is None:
         return []
     paths = {task_of(x) for x in found.sequences}
-    planned = Counter(task.group for task in found.plan.tasks)
-    here = Counter(task.group for task in found.plan.tasks if task.name in paths)
-    return [(name or "all", here[name], planned[name]) for name in planned]
+    numbers = [number for path in paths if (number := found.plan.tasks.number(path)) is not None]
+    here = Counter(found.plan.tasks[number].group for number in numbers)
+    return [(name or "all", here[name], count) for name, count in found.plan.counts.items()]
 
 
 def _example(e: Example) -> dict[str, Any]:

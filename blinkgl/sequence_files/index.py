@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.records import HereOrInside, parse, read_text, shown
+from blinkgl.io.records import HereOrInside, inside, parse, read_text, shown
 from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
 
 INDEX = "index.jsonl"
@@ -51,21 +51,24 @@ def sequence_folders(root: str | Path) -> Iterator[Path]:
 def _of_cameras(folder: Path) -> Iterator[Path]:
     """Yield the folder itself, or for a rig those of its cameras."""
     if is_rig_folder(folder):
-        yield from (manifest.parent for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
+        yield from (inside(folder, manifest.parent.name) for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
     else:
         yield folder
 
 
 def made_folders(root: str | Path) -> Iterator[Path]:
-    """Yield the same, but for a rig its own folder: what a run makes, one per task."""
+    """Yield the same, but for a rig its own folder: what a run makes, one per task. Symbolic links below ``root`` are
+    not followed: they could lead out of it; 'blinkgl verify' names them."""
     root = Path(root)
     if (root / MANIFEST).is_file():
         yield root
         return
     for pattern in ("*", "*/*"):
         for manifest in sorted(root.glob(f"{pattern}/{MANIFEST}")):
-            inside = pattern == "*/*" and is_rig_folder(manifest.parent.parent)
-            if not inside and not any(part.startswith(".") for part in manifest.relative_to(root).parts):
+            of_rig = pattern == "*/*" and is_rig_folder(manifest.parent.parent)
+            hidden = any(part.startswith(".") for part in manifest.relative_to(root).parts)
+            linked = manifest.parent.is_symlink() or (pattern == "*/*" and manifest.parent.parent.is_symlink())
+            if not (of_rig or hidden or linked):
                 yield manifest.parent
 
 

@@ -15,17 +15,20 @@ import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
 from blinkgl.camera import CameraModel
 from blinkgl.camera.pinhole import rectify_map
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.rig import RigSensorConfig, baseline_of
+from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.dsec import write_rectify_map
+from blinkgl.io.records import PlainName, first_problem
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
 
 
@@ -101,12 +104,48 @@ def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
     )
 
 
+_Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class _Sensor(BaseModel):
+    """What ``rig.yaml`` says of a sensor."""
+
+    model_config = ConfigDict(extra="allow")
+    records: list[Literal["events", "images", "imu"]]
+    T_rig_sensor: tuple[_Row, _Row, _Row, _Row]
+    pair: PlainName | None = None
+    baseline: FiniteFloat | None = None
+
+
+class _Rig(BaseModel):
+    """``rig.yaml``."""
+
+    sensors: dict[PlainName, _Sensor] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _pairs(self) -> _Rig:
+        for name, one in self.sensors.items():
+            if one.pair is not None and (one.pair not in self.sensors or one.baseline is None):
+                raise ValueError(f"'{name}' is paired with no sensor of the rig, or has no baseline")
+        return self
+
+
+_MODEL = TypeAdapter(_Rig)
+
+
 def read_rig(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
     """Return the sensors of a rig's folder, by name, as in ``rig.yaml``, with ``T_rig_sensor`` as (4, 4) float64.
 
     Raises AssetError, ConfigError: no such file, or damaged."""
-    tables = read_table(Path(folder) / RIG)["sensors"]
-    return {name: {**one, "T_rig_sensor": np.array(one["T_rig_sensor"], np.float64)} for name, one in tables.items()}
+    path = Path(folder) / RIG
+    try:
+        sensors = _MODEL.validate_python(read_table(path)).sensors
+    except ValidationError as error:
+        raise AssetError(f"damaged: {first_problem(error)}", where=str(path)) from None
+    return {
+        name: {**one.model_dump(), "T_rig_sensor": np.array(one.T_rig_sensor, np.float64)}
+        for name, one in sensors.items()
+    }
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -28,10 +28,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.over_time import ImuConfig
@@ -51,7 +50,6 @@ from blinkgl.io.frame_camera import (
 )
 from blinkgl.io.records import (
     SEAL,
-    InsidePath,
     entries_below,
     open_regular,
     parse,
@@ -61,13 +59,13 @@ from blinkgl.io.records import (
     shown,
 )
 from blinkgl.labels import Form, Label, label_of
+from blinkgl.sequence_files.manifest import MODEL, RIG_MODEL
 from blinkgl.types.events import Events
 
 Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
 """File in the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
-_LARGEST = 2**62
 _IN_FLIGHT = 8
 """Labels that wait for the encoder thread: limits memory to a few tens of MB."""
 
@@ -374,54 +372,6 @@ def is_rig_folder(folder: str | os.PathLike) -> bool:
     return (Path(folder) / RIG).is_file()
 
 
-class _File(BaseModel):
-    """A line of the manifest's ``files``."""
-
-    model_config = ConfigDict(strict=True)
-    bytes: int = Field(ge=0, le=_LARGEST)
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
-
-
-class _Common(BaseModel):
-    """The schema of any manifest. Further keys are allowed; missing keys are None."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-    format_version: Literal[1, 2]
-    """1: without a hash of itself"""
-    events: int = Field(ge=0, le=_LARGEST)
-    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
-    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
-    seed: int | None = Field(None, ge=0, lt=2**63)
-    sequence: int | None = Field(None, ge=0, le=_LARGEST)
-    split: str | None = Field(None, max_length=255)
-    blinkgl: str | None = Field(None, max_length=255)
-    labels: int | None = Field(None, ge=0, le=_LARGEST)
-    frames: int | None = Field(None, ge=0, le=_LARGEST)
-    opengl: dict[str, str] | None = None
-    versions: dict[str, str] | None = None
-    files: dict[InsidePath, _File]
-
-
-class Manifest(_Common):
-    """The manifest of one camera's sequence."""
-
-    format: Literal["blinkgl-sequence"]
-    height: int = Field(ge=1, le=65536)
-    width: int = Field(ge=1, le=65536)
-    emulator: str | None = Field(None, max_length=255)
-
-
-class RigManifest(_Common):
-    """The manifest of a rig's sequence (rig_dir.py), whose ``files`` are those of all sensors."""
-
-    format: Literal["blinkgl-rig"]
-    sensors: list[InsidePath]
-    cameras: list[InsidePath]
-
-
-_MODEL, _RIG_MODEL = TypeAdapter(Manifest), TypeAdapter(RigManifest)
-
-
 def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
     """Return the problems of a sequence directory against its manifest, one line each; empty when complete.
 
@@ -458,14 +408,14 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
 
 
 def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
-    """Return the manifest, in the form of :class:`Manifest` or :class:`RigManifest`. Raises AssetError when there is
-    none or it is damaged."""
+    """Return the manifest, in the form of :mod:`blinkgl.sequence_files.manifest`. Raises AssetError: there is none, or
+    it is damaged."""
     path = Path(folder) / MANIFEST
     try:
         text = read_text(path)
         data = parse(text)
         rig = isinstance(data, dict) and data.get("format") == "blinkgl-rig"
-        return parse(text, _RIG_MODEL if rig else _MODEL)
+        return parse(text, RIG_MODEL if rig else MODEL)
     except FileNotFoundError:
         raise AssetError("no manifest", where=str(path)) from None
     except ValueError as error:

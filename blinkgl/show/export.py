@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from blinkgl.dataset.cross_checks import strangers
 from blinkgl.dataset.shards import export_shards
 from blinkgl.errors import ConfigError
 from blinkgl.io.atomic import refuse_existing
 from blinkgl.layouts import export_layout, layout_of
 from blinkgl.machine.terminal import plain_console, say
+from blinkgl.sequence_files.index import made_folders
+from blinkgl.sequence_files.sequence_dir import MANIFEST
 
 SHARDS = "webdataset"
 
@@ -33,9 +38,15 @@ def run(
     :func:`~blinkgl.dataset.shards.export_shards`. Raises ConfigError and as the two do."""
     console = plain_console(quiet=quiet)
     layout = layout or SHARDS
+    left_out = lambda line: say(console, f"left out: {line}")
+    if Path(root).is_dir() and not (Path(root) / MANIFEST).is_file():
+        for line in strangers(Path(root), list(made_folders(root))):
+            left_out(line)
     if layout == SHARDS:
         with console.status("writing shards"):
-            written = export_shards(root, out, shard_bytes=int((shard_mb or 512.0) * 1e6), seed=seed or 0)
+            written = export_shards(
+                root, out, shard_bytes=int((shard_mb or 512.0) * 1e6), seed=seed or 0, note=left_out
+            )
         for split, counts in written.items():
             shards = f"{len(counts)} shard{'s' * (len(counts) != 1)}"
             say(console, f"{out}/{split}-*.tar: {sum(counts):,} samples in {shards}")

@@ -19,6 +19,7 @@ from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 from blinkgl.errors import ConfigError
+from blinkgl.layouts.export import refuse_plan
 from blinkgl.machine.compiling import compiling_line
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 from blinkgl.show import export
@@ -52,6 +53,8 @@ def run(
     if layout is not None:
         export.refuse_early(exported, layout)
     template = load_run(config, overrides, seed=seed)
+    if layout not in (None, export.SHARDS):
+        refuse_plan(template, num, layout)
     console = plain_console(quiet=quiet)
     display = None if quiet else Display(console, Path(out))
     with _shown(view, Path(out), display) as listener:

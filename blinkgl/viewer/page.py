@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.errors import BlinkGLError
+from blinkgl.errors import BlinkGLError, printable
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.viewer.server import LocalServer
 from blinkgl.viewer.stage import FOV, LAYERS, Stage
@@ -45,7 +46,8 @@ class Page:
 
     def add(self, folder: Path) -> None:
         """Add a sequence to choose; the first is shown."""
-        name = folder.name if folder.name not in self.folders else str(folder)
+        name = printable(folder.name)
+        name = name if name not in self.folders else printable(str(folder))
         self.folders[name] = folder
         self._chosen = self._chosen or name
         self._stale = True
@@ -82,7 +84,7 @@ class Page:
                     self._show()
         except BlinkGLError as error:
             self.problem, self._playing = error, False
-            self.server.gui.add_markdown(f"**cannot be shown**: {error}")
+            self.server.gui.add_markdown(f"**cannot be shown**: {as_text(str(error))}")
 
     def _advance(self, seconds: float) -> None:
         later = self._time.value + 1000 * seconds * _speed(self._speed.value)
@@ -235,13 +237,21 @@ def _speed(said: str) -> float:
     return float(whole) / float(part or 1)
 
 
+def as_text(text: str) -> str:
+    """Return Markdown that shows text of a file as text: each character but letters and digits as a reference, which
+    is never syntax. viser would show HTML as it is, and read and send the file of ``![](file)``. A word joiner, which
+    has no width, keeps addresses from becoming links."""
+    joined = re.sub("(?=[:.@])", "\u2060", printable(text))
+    return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in joined)
+
+
 def _about(sequence: SequenceView) -> str:
-    lines = [f"**{sequence.name}**, {(sequence.end_us - sequence.start_us) / 1e6:g} s"]
+    lines = [f"**{as_text(sequence.name)}**, {(sequence.end_us - sequence.start_us) / 1e6:g} s"]
     for sensor in sequence.sensors:
         source = sensor.source
         events = f", {sensor.event_count:,} events" if sensor.event_count else ""
-        emulator = f", {source.manifest['emulator']}" if source.manifest.get("emulator") else ""
-        lines.append(f"{sensor.name}: {source.width}x{source.height} px{events}{emulator}")
+        emulator = f", {as_text(source.manifest['emulator'])}" if source.manifest.get("emulator") else ""
+        lines.append(f"{as_text(sensor.name)}: {source.width}x{source.height} px{events}{emulator}")
     return "  \n".join(lines)
 
 

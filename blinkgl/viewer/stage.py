@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from blinkgl.errors import printable
 from blinkgl.viewer.views import Body, CameraView, Cloud, Picture, SequenceView
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ class Stage:
             segments = ((_EDGES - 0.5) * body.size).astype(np.float32)
             known = self._shown.get(f"box {body.name}")
             if known is None or not np.array_equal(known[1], segments):
-                node = self._lines(f"/world/boxes/{body.name.replace('/', ' ')}", segments, body.colour)
+                node = self._lines(f"/world/boxes/{printable(body.name).replace('/', ' ')}", segments, body.colour)
                 known = self._shown[f"box {body.name}"] = (node, segments)
             known[0].position, known[0].wxyz = body.pose[:3, 3], _wxyz(body.pose)
             known[0].visible = visible

@@ -15,13 +15,13 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
 from blinkgl.errors import AssetError
-from blinkgl.io.boxes import read_boxes
 from blinkgl.io.colour import count_events, event_colour
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.imu import H5 as IMU, read_imu
 from blinkgl.io.overlays import TrackLines, with_boxes, with_tracks
 from blinkgl.io.pictures import id_colours, picture
+from blinkgl.io.records import inside
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Label
 from blinkgl.layouts.source import Source
@@ -75,7 +75,8 @@ class CameraView:
         self._poses_us = poses_us
         flows = [[a for a, _ in source.flow_times(way)] for way in ("forward", "backward")]
         self._label_us = np.array(poses_us[1:] if len(poses_us) else source.image_times or flows[0] or flows[1])
-        self._events = DsecEventReader(source.folder / "events.h5") if source.has("events.h5") else None
+        size = (source.height, source.width)
+        self._events = DsecEventReader(source.folder / "events.h5", size=size) if source.has("events.h5") else None
         self._exposures = read_exposures(source.folder) if source.has(EXPOSURES) else []
         self.tracks = read_tracks(source.folder) if source.has(TRACKS) else None
         self._known: dict[int, list[Picture]] = {}
@@ -145,7 +146,7 @@ class CameraView:
             form = label.forms[0]
             if form.read is None or not self.source.has(form.file(k)):
                 continue
-            value = form.read(self.source.folder / form.file(k))
+            value = self.source.value(label.name, k)
             views = [view for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]
             for view in views:
                 image, legend = picture(view.kind, view.of(value))
@@ -160,7 +161,7 @@ class CameraView:
 
     def _boxes(self, k: int) -> Boxes | None:
         file = LABELS["boxes"].forms[0].file(k)
-        return read_boxes(self.source.folder / file) if self.source.has(file) else None
+        return self.source.value("boxes", k) if self.source.has(file) else None
 
     # ---- events --------------------------------------------------------------------------------------------------
 
@@ -293,7 +294,7 @@ class SequenceView:
         """Open a sequence. Raises AssetError: damaged, or it has nothing to show."""
         self.folder, self.name = folder, folder.name
         rig = is_rig_folder(folder)
-        places = {name: folder / name for name in read_rig(folder)} if rig else {"camera": folder}
+        places = {name: inside(folder, name) for name in read_rig(folder)} if rig else {"camera": folder}
         cameras = {name: place for name, place in places.items() if (place / MANIFEST).is_file()}
         self.sensors = [CameraView(Source.open(place), name) for name, place in cameras.items()]
         units = {name if rig else "imu": place for name, place in places.items() if (place / IMU).is_file()}

@@ -12,11 +12,17 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from blinkgl.errors import AssetError, EventDataError
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_folder, output_errors
-from blinkgl.online.samples import read_sample
+from blinkgl.io.columns import check_events
+from blinkgl.io.images import numpy_errors
+from blinkgl.io.records import parse, read_text
+from blinkgl.online.samples import WindowSample, read_sample
 from eflow.data.window import RawSample, raw_sample
 
 if TYPE_CHECKING:
@@ -24,6 +30,18 @@ if TYPE_CHECKING:
 
 ABOUT = "windows.json"
 _VERSION = 1
+
+
+class _About(BaseModel):
+    """``windows.json``."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    version: Literal[1]
+    samples: int = Field(ge=1, le=10_000_000)
+    backward: bool
+
+
+_MODEL = TypeAdapter(_About)
 
 
 class PoolSource:
@@ -35,7 +53,7 @@ class PoolSource:
         self.root = root
         about = _about(root)
         self.count, self.has_backward = about["samples"], about["backward"]
-        there = sum(1 for _ in root.glob("*.npz"))
+        there = sum(1 for _ in root.glob("[!.]*.npz"))
         if there != self.count:
             raise AssetError(
                 "some windows are missing", where=str(root), value=there, accepted=f"{self.count} .npz files"
@@ -46,31 +64,35 @@ class PoolSource:
 
     def __getitem__(self, index: int) -> RawSample:
         path = self.root / f"{index:07d}.npz"
-        try:
-            return raw_sample(read_sample(path))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, EventDataError) as error:
-            raise AssetError(f"not a window of eflow render: {error}", where=str(path)) from None
-        except Exception as error:  # zipfile and zlib raise their own errors
-            if type(error).__module__ not in ("zipfile", "zlib"):
-                raise
-            raise AssetError(f"a damaged window: {error}", where=str(path)) from None
+        with numpy_errors(path):
+            sample = read_sample(path)
+            if not isinstance(sample, WindowSample):
+                raise AssetError("not a window of eflow render, but a stream", where=str(path))
+            for flow, valid in ((sample.flow, sample.valid), (sample.backward, sample.backward_valid)):
+                if flow is not None or valid is not None:
+                    fits = np.shape(flow) == (sample.height, sample.width, 2) and np.shape(valid) == sample.valid.shape
+                    if (
+                        not fits
+                        or flow.dtype != np.float32
+                        or valid.dtype != bool
+                        or not np.isfinite(flow[valid]).all()
+                    ):
+                        raise AssetError("flow of another shape or type, or not finite", where=str(path))
+            for events in (sample.old, sample.new):
+                check_events(events, str(path), height=sample.height, width=sample.width)
+            return raw_sample(sample)
 
 
 def _about(root: Path) -> dict[str, Any]:
     path = root / ABOUT
-    wanted = "samples and backward"
     try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise AssetError(f"cannot be read: {error}", where=str(path)) from None
-    if not isinstance(about, dict) or about.get("version") != _VERSION:
-        raise AssetError("unknown version", where=str(path), accepted=f"version {_VERSION}")
-    samples, backward = about.get("samples"), about.get("backward")
-    if not isinstance(samples, int) or isinstance(samples, bool) or samples < 1 or not isinstance(backward, bool):
+        return parse(read_text(path), _MODEL)
+    except (FileNotFoundError, ValueError) as error:
         raise AssetError(
-            "not the description of a folder of windows", where=str(path), value=(samples, backward), accepted=wanted
-        )
-    return about
+            f"not the description of a folder of windows: {error}",
+            where=str(path),
+            accepted=f"version {_VERSION}, samples and backward, as eflow render writes them",
+        ) from None
 
 
 def render_pool(

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from dataclasses import dataclass
 from fnmatch import filter as matching
 from pathlib import Path
@@ -28,6 +29,8 @@ from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_npy, read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.records import inside
+from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
 from eflow.data.pool import ABOUT, PoolSource
@@ -214,7 +217,7 @@ def find_blinkgl(root: Path) -> list[Sequence]:
     found = []
     indexed = (root / INDEX).is_file()
     folders = (
-        [root / line["path"] for line in read_index(root)]
+        [root if line["path"] == "." else inside(root, line["path"]) for line in read_index(root)]
         if indexed
         else [m.parent for m in sorted(below(root, "manifest.json"))]
     )
@@ -232,8 +235,8 @@ def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
     if not (folder / "events.h5").is_file():
         return None
     there, back = LABELS["flow_forward"], LABELS["flow_backward"]
-    stamps = folder / there.stamps
-    forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
+    stamps = inside(folder, there.stamps)
+    forward, backward = (numbered(inside(folder, label.forms[0].folder), "png") for label in (there, back))
     # Generated without flow: nothing to learn from, but not an error.
     if not forward and not stamps.exists():
         return None
@@ -242,10 +245,9 @@ def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
     if backward:
         _same_count(folder / back.forms[0].folder, backward, times)
     entries = tuple(
-        Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
-        for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True))
+        Entry(k, t0, t1, f, backward.get(k)) for (k, f), (t0, t1) in zip(forward.items(), times, strict=True)
     )
-    return Sequence(name, name, folder / "events.h5", entries)
+    return Sequence(name, name, inside(folder, "events.h5"), entries)
 
 
 def find_dsec(root: Path) -> list[Sequence]:
@@ -279,10 +281,10 @@ def find_dsec(root: Path) -> list[Sequence]:
         if flow_folder is not None:
             times, files = (
                 read_times(flow_folder / "forward_timestamps.txt"),
-                sorted((flow_folder / "forward").glob("*.png")),
+                numbered(flow_folder / "forward", "png"),
             )
             _same_count(flow_folder / "forward", files, times)
-            entries = tuple(Entry(int(f.stem), t0, t1, f) for f, (t0, t1) in zip(files, times, strict=True))
+            entries = tuple(Entry(k, t0, t1, f) for (k, f), (t0, t1) in zip(files.items(), times, strict=True))
         elif test is not None:
             entries = tuple(Entry(i, t0, t1) for t0, t1, i in read_submission_times(test))
         else:
@@ -301,18 +303,29 @@ def find_blinkflow(root: Path) -> list[Sequence]:
     found = []
     for folder in sorted(p.parent for p in below(root, "forward_flow") if p.is_dir()):
         fps = _fps(folder / "config.yaml")
-        files = sorted((folder / "forward_flow").glob("*.npy"))
-        backward = {int(f.stem): f for f in (folder / "backward_flow").glob("*.npy")}
+        files, backward = (numbered(folder / name, "npy") for name in ("forward_flow", "backward_flow"))
         at = lambda i, fps=fps: round(i * 1e6 / fps)
         # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i
         # - 1.
-        entries = tuple(
-            Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0
-        )
+        entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in files.items() if i > 0)
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
         name = "/".join(parts[-2:])
         found.append(Sequence(name, parts[-2] if len(parts) > 1 else name, folder / "events_left/events.h5", entries))
     return found
+
+
+def numbered(folder: Path, ending: str) -> dict[int, Path]:
+    """Return the files of a folder by their numbers, in order; none without the folder. Hidden files, such as those
+    that some systems write beside each file (``._000001.png``), are no labels. Raises AssetError: a name without a
+    number, or a number twice."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.glob(f"[!.]*.{ending}")):
+        if not re.fullmatch("[0-9]{1,9}", path.stem) or int(path.stem) in found:
+            raise AssetError(
+                "not the number of a label", where=str(path), value=path.stem, accepted=f"000000.{ending}, each once"
+            )
+        found[int(path.stem)] = path
+    return dict(sorted(found.items()))
 
 
 def _fps(path: Path) -> float:
@@ -330,15 +343,9 @@ def _fps(path: Path) -> float:
 def read_times(path: Path) -> list[tuple[int, int]]:
     """Return the lines ``from_us, to_us`` of a file, without ``#`` headers. Raises AssetError: not a list of
     intervals."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        times = [tuple(int(v) for v in line.split(",")) for line in lines if line.strip() and not line.startswith("#")]
-    except FileNotFoundError:
-        raise AssetError("no such file", where=str(path)) from None
-    except (OSError, ValueError):
-        raise AssetError("not a list of 'from_us, to_us'", where=str(path)) from None
+    times = [(start, end) for start, end in read_label_times(path, 2)]
     for line in times:
-        if len(line) != 2 or line[0] >= line[1]:
+        if line[0] >= line[1]:
             raise AssetError("not an interval", where=str(path), value=line, accepted="from_us, to_us with from < to")
     return times
 
@@ -356,14 +363,14 @@ def read_submission_times(path: Path) -> list[tuple[int, int, int]]:
         raise AssetError(
             "not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index"
         ) from None
-    if not rows or any(len(r) != 3 for r in rows):
+    if not rows or any(len(r) != 3 or not 0 <= r[0] < r[1] < 10**16 or not 0 <= r[2] < 10**9 for r in rows):
         raise AssetError(
             "not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index"
         )
     return rows
 
 
-def _same_count(folder: Path, files: list, times: list) -> None:
+def _same_count(folder: Path, files: Sized, times: Sized) -> None:
     if len(files) != len(times):
         raise AssetError(
             "flow files and time stamps differ in number", where=str(folder), value=(len(files), len(times))

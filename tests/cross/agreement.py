@@ -56,7 +56,7 @@ def of_data_set(out: Path, made: dict[str, SequenceReport], scratch: Path) -> Fi
     found.same(
         "sequences", run=sorted(made), verify=sorted(verified.deep), index=[line["path"] for line in read_index(out)]
     )
-    page = write_report(out, scratch / "report.html")
+    page = write_report(out, scratch / "report.html", overwrite=True)
     told = collect(out)
     found.expect(
         page.stat().st_size > 1000 and not told.unreadable and not told.failed,

@@ -178,7 +178,7 @@ def test_damage_inside_a_sequence(data, damage, message):
         ),
         (
             lambda d: ((d / NAMES[1]).rename(d / "x"), (d / NAMES[1]).symlink_to(d / "x")),
-            f"{NAMES[1]}: a symbolic link, not a folder",
+            f"{NAMES[1]}: a symbolic link, which is not followed",
         ),
         (
             lambda d: renumber(shutil.copytree(d / NAMES[0], d / "train/fly_000002"), 2),

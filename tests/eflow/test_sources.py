@@ -195,7 +195,7 @@ def rewrite(name, change):
             rewrite(TIMES, lambda text: text.replace(b"100000, 200000", b"200000, 100000")),
             "forward_timestamps.txt: not an interval",
         ),
-        (rewrite(TIMES, lambda text: b"# header\nnonsense\n"), "forward_timestamps.txt: not a list"),
+        (rewrite(TIMES, lambda text: b"# header\nnonsense\n"), "forward_timestamps.txt: line 2 is no time"),
         (rewrite(TIMES, lambda text: text + b"400000, 500000\n"), "differ in number"),
     ],
 )

@@ -20,6 +20,8 @@ from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
 from blinkgl.io.tracks import read_tracks
 from blinkgl.layouts import LAYOUTS, dsec, event_kubric, export as exporting, export_layout
+from blinkgl.layouts.planned import Planned
+from blinkgl.layouts.source import sources_of
 from loaders import (
     blinkflow_sequence,
     dsec_disparity,
@@ -477,3 +479,20 @@ def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
         assert file.notes == ["2 topics of events: /cam0/events is read (--stream for another)"]
         same([getattr(file.read(), k) for k in "xytp"], read_events(stereo / "left/events.h5"))
     assert export_layout(bare, tmp_path / "bare", "rosbag").said == ()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_plan_lacks_what_its_sequence_lacks(data, bare, layout):
+    for made in (data, bare):
+        recipe = load_run(made / ".run/recipe.yaml")
+        source = sources_of(made)[0]
+        planned = Planned.of(recipe.sequence(0), made)
+        assert LAYOUTS[layout].missing(planned) == LAYOUTS[layout].missing(source)
+
+
+def test_a_layout_that_a_recipe_cannot_give_is_refused_before_it_is_generated(tmp_path, capsys):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in RECIPE.items() if key != "tracks"}))
+    assert run(["generate", str(path), "--out", str(tmp_path / "out"), "--layout", "tapvid", "--quiet"]) == 2
+    assert "layout 'tapvid' takes point tracks" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -55,7 +55,7 @@ class Planned(Source):
     def _times(self, label: str, columns: int = 1) -> list[tuple[int, ...]]:
         if not self.has(LABELS[label].stamps or ""):
             return []
-        rows = list(zip(self._label_us, self._label_us[1:])) if columns == 2 else [(t,) for t in self._label_us]
+        rows: list[tuple[int, ...]] = list(zip(*(self._label_us[k:] for k in range(columns))))
         return rows[: self.count(label)]
 
     def _configured(self, section: str, key: str) -> Any:

@@ -139,8 +139,8 @@ class Source:
         """Return a grey image, (H, W) uint8."""
         return cv2.cvtColor(self.image(k), cv2.COLOR_RGB2GRAY)
 
-    def value(self, label: str, k: int) -> np.ndarray:
-        """Return the ``k``-th value of a label that is one array, (H, W[, C]); depth is inf where nothing is hit.
+    def value(self, label: str, k: int) -> Any:
+        """Return the ``k``-th value of a label: most are one array, (H, W[, C]); depth is inf where nothing is hit.
         Raises AssetError."""
         return self._read(label, k)
 

@@ -10,6 +10,7 @@ from blinkgl.io.frame_camera import EXPOSURES
 from blinkgl.io.records import InsidePath, PlainName
 
 _LARGEST = 2**62
+_PIXELS = 2**28
 _Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -71,6 +72,8 @@ class Manifest(_Common):
 
     @model_validator(mode="after")
     def _says_what_its_files_need(self) -> Manifest:
+        if self.height * self.width > _PIXELS:
+            raise ValueError(f"{self.width}x{self.height} px, more than {_PIXELS}")
         if EXPOSURES in self.files and self.frame_camera is None:
             raise ValueError(f"{EXPOSURES}, but no 'frame_camera'")
         return self

@@ -291,6 +291,7 @@ def test_a_damaged_file_is_one_line(one, tmp_path, file, damage, message):
         {"objects": [{"id": "x"}]},
         {"objects": [{"id": 1, "box": [1, 2]}]},
         {"height": "32"},
+        {"height": 65536, "width": 65536},
         {"events_by_cause": {"noise": "many"}},
     ],
 )

@@ -257,8 +257,8 @@ class DsecEventReader:
     def __init__(
         self, path: str | os.PathLike, reading: EventReading = AS_FILE, *, size: tuple[int, int] | None = None
     ):
-        """size : (height, width) of the sensor as known from elsewhere, by which events are checked; None: only what the
-        file says counts."""
+        """size : (height, width) of the sensor as known from elsewhere, by which events are checked; None: only what
+        the file says counts."""
         self.path, self._checked = Path(path), size is not None
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):

@@ -240,6 +240,7 @@ class RecordedSequence(Simulation):
         self._report = SimulationReport()
         self.folder = folder_of(frames, request.index, request.base)
         self.files = used_images(frames, self.folder)
+        self._report.notes += series(self.folder / frames.images, IMAGE).notes  # what is left out of the folder
         self.flows, self.masks = flow_files(self.folder, frames, self.files)
         self._kept: dict[int, np.ndarray] = {
             0: read_frame(self.files[0])

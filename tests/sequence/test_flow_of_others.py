@@ -148,6 +148,9 @@ def test_frames_and_flow_are_in_the_order_of_their_numbers(tmp_path):
     """Frames 0 to 11 without padding: by text 10 would follow 1, and the flow would contradict the images."""
     made = recorded(tmp_path, flo, field(), "flo")
     assert [file.name for file in made.files] == [f"frame{k}.png" for k in range(COUNT)]
+    cv2.imwrite(str(tmp_path / "clip/images/mask.png"), picture(0))
+    list(made := recorded(tmp_path, flo, field(), "flo"))
+    assert any("mask.png: left out" in note for note in made.facts()["source"]["notes"])
 
 
 def test_missing_frames_and_other_clocks_are_named(tmp_path):

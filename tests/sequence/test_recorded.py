@@ -84,7 +84,9 @@ def test_a_label_is_of_the_frame_after_its_interval(clip, first, count, used):
         assert (truth.frame.forward.flow == (number, -number)).all()
         assert np.flatnonzero(truth.frame.forward.occluded).tolist() == list(range(number))
     facts = sequence.facts()
-    assert facts["source"].pop("notes")[0] == "integer codes taken as sRGB (--gamma linear for a camera's raw frames)"
+    notes = facts["source"].pop("notes")
+    assert notes[0] == ".hidden.png: hidden, so left out"
+    assert notes[1] == "integer codes taken as sRGB (--gamma linear for a camera's raw frames)"
     assert facts == {
         "source": {
             "folder": "clip",

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.records import inside
 from blinkgl.machine.terminal import plain_console
 from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow.data.dataset import FlowDataset, collate
@@ -94,9 +95,8 @@ def evaluate(
             progress(done, len(indices), sum_aee / max(scored, 1))
         if out is not None and i in shown:
             name = batch["name"][0].replace("/", "_")
-            write_picture(
-                out / "pictures" / f"{name}.png", comparison(events_of(batch["new"][0].numpy()), flow, truth, valid)
-            )
+            picture = comparison(events_of(batch["new"][0].numpy()), flow, truth, valid)
+            write_picture(inside(out / "pictures", f"{name}.png"), picture)
     if not scored:
         raise AssetError("no sample has a valid ground-truth pixel", accepted="a labelled data set")
     result = {

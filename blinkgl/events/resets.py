@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from blinkgl.config.readout import FrameResetsConfig
+from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.emulator import Emulator
 
 RISE_NS = 300_000
@@ -67,11 +68,13 @@ class FrameResets:
         self._last = _Seen(t_ns, np.array(luminance, np.float32))
 
     def _lit(self, luminance: np.ndarray, share: float) -> np.ndarray:
-        """Return the light with this share of the jump."""
+        """Return the light with this share of the jump, at most the brightest that emulators take."""
         if share == 0:
             return luminance
         push = self._emulator.push(luminance, self._jump, 1e-9 * RISE_NS)
-        return luminance * np.exp(np.float32(share) * (np.float32(self._jump) if push is None else push))
+        factor = np.exp(np.float32(share) * (np.float32(self._jump) if push is None else push))
+        # The frame itself is checked later, so light that is too bright without the jump stays so.
+        return np.minimum(luminance * factor, np.maximum(luminance, np.float32(LOG_MAX_INPUT)))
 
     def _at(self, t_ns: int) -> float:
         """Return the share of the jump at a time."""

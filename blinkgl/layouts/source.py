@@ -27,7 +27,7 @@ from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
 from blinkgl.sequence_files.rig_dir import CAM_TO_CAM, read_rig
-from blinkgl.sequence_files.sequence_dir import is_rig_folder, read_manifest, verify_sequence
+from blinkgl.sequence_files.sequence_dir import is_rig_folder, whole
 from blinkgl.types.events import Events
 
 
@@ -50,13 +50,7 @@ class Source:
         cls, folder: Path, name: str | None = None, beside: Path | None = None, unit: Path | None = None
     ) -> Source:
         """Open a sequence. Raises AssetError: no sequence, or files are missing or cut."""
-        if problems := verify_sequence(folder, checksums=False):
-            raise AssetError(
-                f"damaged sequence: {problems[0]}",
-                where=str(folder),
-                accepted="a data set that 'blinkgl verify' passes",
-            )
-        manifest = read_manifest(folder)
+        manifest = whole(folder)
         return cls(folder, manifest, name or folder.name, beside, folder if IMU in manifest["files"] else unit)
 
     @property
@@ -209,6 +203,7 @@ def sources_of(root: Path) -> list[Source]:
 
 
 def _of_rig(folder: Path) -> Source:
+    whole(folder)
     tables = read_rig(folder)
     cameras = [name for name, one in tables.items() if "events" in one["records"]]
     if not cameras:

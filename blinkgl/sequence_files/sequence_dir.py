@@ -422,6 +422,16 @@ def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
         raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
 
 
+def whole(folder: str | os.PathLike) -> dict[str, Any]:
+    """Return the manifest of a sequence whose files are those that it lists, as far as their sizes tell. Raises
+    AssetError: none, or damaged."""
+    if problems := verify_sequence(folder, checksums=False):
+        raise AssetError(
+            f"damaged sequence: {problems[0]}", where=str(folder), accepted="a data set that 'blinkgl verify' passes"
+        )
+    return read_manifest(folder)
+
+
 def manifest_problems(folder: str | os.PathLike) -> list[str]:
     """Return whether a manifest is what was written, by its hash of itself. Those of format_version 1 have none."""
     text = read_text(Path(folder) / MANIFEST)

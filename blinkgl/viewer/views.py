@@ -27,7 +27,7 @@ from blinkgl.labels import LABELS, Label
 from blinkgl.layouts.source import Source
 from blinkgl.sequence_files.index import made_folders
 from blinkgl.sequence_files.rig_dir import read_rig
-from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder
+from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, whole
 from blinkgl.types.boxes import Boxes
 from blinkgl.types.events import Events
 
@@ -293,6 +293,7 @@ class SequenceView:
     def __init__(self, folder: Path):
         """Open a sequence. Raises AssetError: damaged, or it has nothing to show."""
         self.folder, self.name = folder, folder.name
+        whole(folder)
         rig = is_rig_folder(folder)
         places = {name: inside(folder, name) for name in read_rig(folder)} if rig else {"camera": folder}
         cameras = {name: place for name, place in places.items() if (place / MANIFEST).is_file()}

@@ -21,7 +21,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_folder, output_errors
 from blinkgl.io.columns import check_events
 from blinkgl.io.images import numpy_errors
-from blinkgl.io.records import parse, read_text
+from blinkgl.io.records import inside, parse, read_text
 from blinkgl.online.samples import WindowSample, read_sample
 from eflow.data.window import RawSample, raw_sample
 
@@ -78,6 +78,7 @@ class PoolSource:
                         or not np.isfinite(flow[valid]).all()
                     ):
                         raise AssetError("flow of another shape or type, or not finite", where=str(path))
+            inside(self.root, sample.name.replace("/", "_"))  # it becomes the name of a picture
             for events in (sample.old, sample.new):
                 check_events(events, str(path), height=sample.height, width=sample.width)
             return raw_sample(sample)

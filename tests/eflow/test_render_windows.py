@@ -68,6 +68,13 @@ def test_an_interruption_keeps_what_is_there(recipe, tmp_path):
         render_pool(source, 10, tmp_path / "some")
 
 
+def renamed(path, **changes):
+    """Replace some arrays of a window."""
+    with np.load(path) as file:
+        arrays = {**{name: file[name] for name in file.files}, **changes}
+    np.savez(path, **arrays)
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -84,6 +91,10 @@ def test_an_interruption_keeps_what_is_there(recipe, tmp_path):
         (lambda f: (f / "0000000.npz").write_bytes((f / "0000000.npz").read_bytes()[:900]), "0000000.npz"),
         (lambda f: (f / "0000000.npz").write_bytes(b"no zip"), "0000000.npz"),
         (lambda f: np.savez(f / "0000000.npz", t=3), "0000000.npz"),
+        (lambda f: renamed(f / "0000000.npz", name=".."), "names not a path inside the folder"),
+        (lambda f: renamed(f / "0000000.npz", name="x" * 300), "names not a file name: too long"),
+        (lambda f: renamed(f / "0000000.npz", valid=np.ones((3, 3), bool)), "flow of another shape"),
+        (lambda f: renamed(f / "0000000.npz", new_x=np.full(5, 60000, np.uint16)), "0000000.npz"),
     ],
 )
 def test_a_damaged_folder_is_one_line(folder, tmp_path, spoil, message):

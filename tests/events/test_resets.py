@@ -95,6 +95,15 @@ def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(config, kick, ex
     assert not expected or np.ptp(events.window(10_000, 10_400).t) < 305
 
 
+def test_the_highest_jump_stays_within_the_emulators_range():
+    light = [(t * MS, np.full((H, W), 1e9, np.float32)) for t in range(20)]
+    resets = FrameResetsConfig(interval_ms=100, kick=5, length_ms=2, first_ms=5)
+    config = EsimConfig(contrast_threshold=0.05, contrast_threshold_off=5.0)
+    assert len(events_of(light, resets, config)) > 0
+    high = EsimConfig(contrast_threshold=5.0)
+    assert len(events_of([(t, one / 1e9) for t, one in light], resets, high)) > 0
+
+
 def test_a_jump_that_lasts_into_the_next_is_refused():
     with pytest.raises(ConfigError, match="length_ms: the jump does not end before the next one .*at most 9,"):
         validate(ReadoutConfig, {"frame_resets": {"interval_ms": 10, "kick": 0.1, "length_ms": 10}})

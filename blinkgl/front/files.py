@@ -111,17 +111,6 @@ def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarra
     trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
 
 
-class DeclaredFrames(TypedDict, total=False):
-    """What a file of frames does not say; :func:`blinkgl.simulate_file` describes them."""
-
-    fps: float | None
-    timestamps: str | os.PathLike | None
-    time_unit: str | None
-    white_level: float | None
-    range: str | None
-    background: str | None
-
-
 class DeclaredBoth(EventOptions, total=False):
     """What event files do not say (:func:`blinkgl.open_events`), nor frames beside them."""
 

@@ -182,7 +182,8 @@ def calibrated(camera: Any, base: Path) -> Any:
                 value=own[key],
                 accepted=f"{getattr(seen, key)}, or nothing",
             )
-    return {**own, **camera_keys(seen)}
+    # Whole, so that nothing of a lens that it is laid over remains.
+    return {**own, "lens": "pinhole", "distortion": [], **camera_keys(seen)}
 
 
 def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:

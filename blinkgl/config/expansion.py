@@ -31,6 +31,7 @@ from blinkgl.config.reader import (
     with_groups,
     with_sections,
 )
+from blinkgl.config.rig import check_one_lens
 from blinkgl.config.sensor import sensor_file_or_name
 from blinkgl.errors import ConfigError
 
@@ -68,7 +69,11 @@ def expanded(tree: Table, base: Path) -> Table:
     def placed(table: Table) -> Table:
         return {**spelled_out(table), **placed_by_calibration(table, base)}
 
-    return with_groups(tree, lambda table: with_sections(spelled_out(table), placed))
+    def whole(table: Table) -> Table:
+        check_one_lens(table)
+        return with_sections(spelled_out(table), placed)
+
+    return with_groups(tree, whole)
 
 
 def _recipe(events: Any) -> Any:

@@ -34,6 +34,11 @@ class FramesConfig(Config):
         description="of the flow files: dsec, kitti, vkitti2, tartanair2, flo, pfm, flo5, npy; auto: by ending, and "
         "16-bit PNGs by their values",
     )
+    flow_direction: Literal["auto", "forward", "backward"] = Field(
+        "auto",
+        description="forward: each flow file leads to the next frame, backward: to the one before, as "
+        "`labels.flow: [backward]`; auto: backward where the names say so",
+    )
     check_flow: bool = Field(
         True, description="refuse flow that explains its images worse than its double, its half, its negative or none"
     )

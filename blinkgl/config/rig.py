@@ -147,6 +147,22 @@ def is_rig(tree: Any) -> bool:
     return isinstance(tree, dict) and (tree.get("rig") is not None or tree.get("sensors") is not None)
 
 
+def check_one_lens(tree: dict[str, Any]) -> None:
+    """Raise ConfigError where the top level has a calibration and a sensor has a camera of its own: keys of both would
+    be one lens."""
+    camera = tree.get("camera")
+    if isinstance(camera, dict) and camera.get("calibration") is not None and is_rig(tree):
+        for one in with_preset(tree)["sensors"]:
+            own = one.get("camera")
+            if isinstance(own, dict) and own.get("calibration") is None and set(own) - {"near"}:
+                raise ConfigError(
+                    f"sensor '{one.get('name')}' has a camera of its own",
+                    where="camera.calibration",
+                    value=camera["calibration"],
+                    accepted="one for each: sensors: [{name: …, camera: {calibration: …, calibration_name: …}}]",
+                )
+
+
 def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
     """Return ``tree`` with every sensor of its rig complete: the sensor's own keys over the preset's, both over the top
     level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes nothing.
@@ -195,9 +211,19 @@ def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[st
         said[low] = one
     under = {one["name"]: one for one in base}
     return [
-        *(merge(one, said[name]) if name in said else one for name, one in under.items()),
+        *(_over_preset(one, said[name]) if name in said else one for name, one in under.items()),
         *(copy.deepcopy(one) for name, one in said.items() if name not in under),
     ]
+
+
+def _over_preset(preset: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return a preset's sensor with its own keys laid over it: another way to give the focal length or the place, as a
+    calibration does, takes the place of the preset's."""
+    preset, place = copy.deepcopy(preset), own.get("place")
+    _drop_other_focal(preset.get("camera"), own.get("camera"))
+    if isinstance(place, dict) and place.get("matrix") is not None:
+        preset.pop("place", None)
+    return merge(preset, own)
 
 
 def _complete(

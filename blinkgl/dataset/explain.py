@@ -157,7 +157,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     """Explain a sequence of recorded frames: nothing is rendered; the first few frames are converted and timed."""
     frames = config.frames
     probe = simulate_sequence(SequenceRequest(config, index, base, labels=False))
-    files, flows, masks = probe.files, probe.flows, probe.masks
+    files, flows, masks, way = probe.files, probe.flow.files, probe.flow.masks, probe.flow.direction
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
     between = {
@@ -184,11 +184,11 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     request = asked_for(config.labels)
     for name, on, why in (
         ("images", "images" in request, "labels.images: false"),
-        ("forward flow", flows and "flow_forward" in request, "frames.flow: null, or not in labels.flow"),
+        (f"{way} flow", flows and f"flow_{way}" in request, "frames.flow: null, or not in labels.flow"),
         (
             "occlusion masks",
-            masks and "occlusion_forward" in request,
-            "no mask files, labels.occlusion: false, or no forward flow",
+            masks and f"occlusion_{way}" in request,
+            "no mask files, labels.occlusion: false, or no flow",
         ),
         ("preview", config.preview.enabled, "preview.enabled: false"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),

@@ -40,8 +40,8 @@ class SequenceReport:
     """time to compile kernels; 0 except for a machine's first sequence of a kind"""
     causes: dict[str, int] = field(default_factory=dict)
     """events by cause; empty unless ``events.causes`` is on"""
-    omissions: tuple[str, ...] = ()
-    """undrawn features of the scene's files, a line per file"""
+    notes: tuple[str, ...] = ()
+    """what was guessed, left out or not drawn of the files, a line each"""
 
     def count(self, sequence: RigSequence) -> None:
         """Count the items so far."""
@@ -51,14 +51,14 @@ class SequenceReport:
             sequence.labels,
             sequence.seconds,
         )
-        self.causes = sequence.causes
+        self.causes, self.notes = sequence.causes, tuple(sequence.notes)
 
     def finish(self, sequence: RigSequence, flushed_s: float) -> None:
         """Complete the report when the files exist. flushed_s : time to close them."""
         self.count(sequence)
         self.seconds["write"] += flushed_s
         self.simulated_s = (sequence.t1_ns - sequence.t0_ns) * 1e-9
-        self.triangles, self.omissions = sequence.triangles, sequence.omissions
+        self.triangles = sequence.triangles
         self.total_s, self.compile_s = sequence.clock.total, sequence.clock.compile_s
 
 

@@ -6,7 +6,7 @@ messages (dicts that JSON can carry):
 
     {"kind": "hello", "pid", "environment", "assets"}          ready
     {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
-     "omissions": what is not drawn}
+     "notes": what was guessed or is not drawn}
     {"kind": "said", "task", "text": a line for the user, about compiling}
     {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use
@@ -158,7 +158,7 @@ class Maker:
                         "events": report.events,
                         "fraction": fraction,
                         "seconds": dict(report.seconds),
-                        "omissions": list(report.omissions),
+                        "notes": list(report.notes),
                     }
                 )
 

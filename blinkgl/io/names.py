@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -63,13 +63,13 @@ def natural_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(paths, key=lambda path: (_key(path.stem, pattern), path.name))
 
 
-def series(folder: Path, suffixes: Iterable[str]) -> Series:
-    """Return the files of ``folder`` with one of the suffixes, as one series.
+def series(folder: Path, suffixes: Iterable[str], wanted: Callable[[Path], bool] = lambda path: True) -> Series:
+    """Return the files of ``folder`` with one of the suffixes that are ``wanted``, as one series.
 
     Hidden files, a second file of the same name stem, and few names unlike all others are left out, with a line each.
     Raises EventDataError: two series in one folder."""
-    wanted = {suffix.lower() for suffix in suffixes}
-    files = [path for path in folder.iterdir() if path.suffix.lower() in wanted and path.is_file()]
+    endings = {suffix.lower() for suffix in suffixes}
+    files = [path for path in folder.iterdir() if path.suffix.lower() in endings and wanted(path) and path.is_file()]
     notes: list[str] = []
     hidden = [path for path in files if path.name.startswith(".")]
     if hidden:

@@ -7,7 +7,7 @@ import glob
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from blinkgl.events.camera import EventCamera
 from blinkgl.io.flow import READ_ENDINGS, flow_form, read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
-from blinkgl.io.names import natural_order, series
+from blinkgl.io.names import series
 from blinkgl.io.stamps import read_timestamps
 from blinkgl.io.stills import open_stills
 from blinkgl.labels import Flow, LabelFrame, asked_for
@@ -43,6 +43,7 @@ from blinkgl.types.events import Events
 # one file per pair of frames, too.
 
 _FLOW = READ_ENDINGS
+_BACKWARD = re.compile(r"backward|bwd|into_?past|flow_?bw", re.IGNORECASE)
 _UNEQUAL = 0.05
 """Part of a frame's interval by which times beside the images may differ from ``frames.fps``."""
 _CHECKED_PAIRS = 3
@@ -134,46 +135,66 @@ def _check_stamps(folder: Path, files: list[Path], fps: float, used: slice) -> N
         )
 
 
-def _listed(folder: Path, suffixes) -> list[Path]:
-    if not folder.is_dir():
-        raise AssetError("no such folder", where=str(folder))
-    return natural_order(
-        p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
-    )
-
-
-def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[list[Path], list[Path]]:
-    """Return (flow, masks) of the frames ``images`` of :func:`used_images`; the k-th goes from frame k to frame k + 1.
-    Raises
-    AssetError: no folder, too few, or, by the numbers in their names, one missing in between."""
-    if frames.flow is None:
-        return [], []
+def _folder_of_flow(folder: Path, flow: str) -> Path:
     # {0} is the folder's own name, {1} its parent's, …: other sets keep the flow of a scene in a tree of its own.
     parts = folder.absolute().parts[::-1]
-    named = re.sub(r"\{(\d)\}", lambda found: parts[min(int(found[1]), len(parts) - 1)], frames.flow)
-    return _flow_and_masks(Path(os.path.normpath(folder / named)), frames.first, images)
+    named = re.sub(r"\{(\d)\}", lambda found: parts[min(int(found[1]), len(parts) - 1)], flow)
+    found = Path(os.path.normpath(folder / named))
+    if not found.is_dir():
+        raise AssetError("no such folder", where=str(found))
+    return found
 
 
-def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[Path], list[Path]]:
-    everything, pairs = _listed(folder, _FLOW), len(images) - 1
-    names = f"{folder.name}/{everything[0].name if everything else ''}"
-    if re.search(r"backward|bwd|into_?past|flow_?bw", names, re.I):
-        accepted = "the flow from each frame to the next"
-        raise AssetError("the names say that this flow leads to the frame before", where=str(folder), accepted=accepted)
-    masks = [p for p in everything if p.stem.endswith("_mask")]
-    flows = [p for p in everything if p not in set(masks)]
-    if len(flows) < first + pairs or (masks and len(masks) < first + pairs):
+@dataclass(frozen=True)
+class GivenFlow:
+    """Flow files of frames 0, 1, …; the k-th leads from frame k to k + 1 or, ``backward``, from frame k + 1 to k.
+
+    masks : files of pixels that are hidden at the flow's end, or none.   notes : what was guessed or left out."""
+
+    files: list[Path]
+    masks: list[Path]
+    backward: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def direction(self) -> str:
+        """Return "forward" or "backward"."""
+        return "backward" if self.backward else "forward"
+
+    def of_frame(self, number: int) -> int:
+        """Return which file begins at frame ``number``."""
+        return number - self.backward
+
+
+def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> GivenFlow:
+    """Return the flow of the frames ``images`` of :func:`used_images`. Raises AssetError: no folder, too few, or, by
+    the numbers in their names, one missing in between."""
+    if frames.flow is None:
+        return GivenFlow([], [])
+    where, pairs = _folder_of_flow(folder, frames.flow), len(images) - 1
+    is_mask = lambda path: path.stem.endswith("_mask")
+    flows, masks = series(where, _FLOW, lambda path: not is_mask(path)), series(where, _FLOW, is_mask)
+    notes = flows.notes + masks.notes
+    backward = frames.flow_direction == "backward"
+    if frames.flow_direction == "auto" and flows.files:
+        backward = _BACKWARD.search(f"{where.name}/{flows.files[0].name}") is not None
+        if backward:
+            notes.append(f"{where.name}: flow to the frame before, as the names say (frames.flow_direction: forward)")
+    recorded = len(series(images[0].parent, IMAGE).files)
+    # With one a frame, the first frame's leads out of the sequence.
+    first = frames.first + (backward and len(flows.files) == recorded)
+    if len(flows.files) < first + pairs or (masks.files and len(masks.files) < first + pairs):
         raise AssetError(
             "not one flow file per pair of frames",
-            where=str(folder),
-            value=f"{max(len(flows) - first, 0)} flow files, {len(masks)} masks",
+            where=str(where),
+            value=f"{max(len(flows.files) - first, 0)} flow files, {len(masks.files)} masks",
             accepted=f"at least {pairs} for {len(images)} frames",
         )
+    used = slice(first, first + pairs)
     # Files are used in the order of their names; a missing one would shift all later pairs.
-    one_each = len(_listed(images[0].parent, IMAGE)) - 1
-    for files in (flows, masks):
-        _check_in_step(files[first : first + pairs], images, shifted=len(files) == one_each)
-    return flows[first : first + pairs], masks[first : first + pairs]
+    for files in (flows.files, masks.files):
+        _check_in_step(files[used], images[1:] if backward else images, shifted=len(files) == recorded - 1)
+    return GivenFlow(flows.files[used], masks.files[used], backward, tuple(notes))
 
 
 def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None:
@@ -221,7 +242,7 @@ def read_frame(path: Path) -> np.ndarray:
     return read_any_image(path)
 
 
-RECORDED = ("images", "flow_forward", "occlusion_forward")
+RECORDED = ("images", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 """Labels that recorded frames may have."""
 
 
@@ -229,8 +250,8 @@ class RecordedSequence(Simulation):
     """A sequence of the ``index``-th folder of frames; see :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
     Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval
-    of events before it, as in rendered sequences. Its ``config`` names the folder.   files : the images.   flows, masks
-    : files of labels, or none.
+    of events before it, as in rendered sequences. Its ``config`` names the folder.   files : the images.   flow : the
+    files of labels.
     Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them, frames too far apart."""
 
     def __init__(self, request: SequenceRequest):
@@ -241,18 +262,27 @@ class RecordedSequence(Simulation):
         self.folder = folder_of(frames, request.index, request.base)
         self.files = used_images(frames, self.folder)
         self._report.notes += series(self.folder / frames.images, IMAGE).notes  # what is left out of the folder
-        self.flows, self.masks = flow_files(self.folder, frames, self.files)
+        self.flow = flow_files(self.folder, frames, self.files)
+        self._report.notes += self.flow.notes
+        asked = config.labels.flow
+        if request.labels and self.flow.files and asked and self.flow.direction not in asked:
+            raise ConfigError(
+                f"the flow of these frames leads {self.flow.direction}",
+                where="labels.flow",
+                value=list(asked),
+                accepted=f"[{self.flow.direction}], or frames.flow: null",
+            )
         self._kept: dict[int, np.ndarray] = {
             0: read_frame(self.files[0])
         }  # read already, together with an image of a later label
         size = self._kept[0].shape[:2]
         self._form = None if frames.flow_format == "auto" else frames.flow_format
-        if self.flows and self._form is None:
-            self._form, note = flow_form(self.flows[0])
+        if self.flow.files and self._form is None:
+            self._form, note = flow_form(self.flow.files[0])
             self._report.notes += [note] if note else []
         with clock("scene"):
             if frames.max_displacement is not None:
-                for first, flow in zip(self.files, self.flows):
+                for first, flow in zip(self.files, self.flow.files):
                     _refuse_far_apart(first, *read_flow_of(flow, size, self._form), frames.max_displacement)
             if frames.check_flow:
                 self._check_flow(size)
@@ -285,26 +315,26 @@ class RecordedSequence(Simulation):
 
     def _check_flow(self, size: tuple[int, int]) -> None:
         """Raise AssetError for flow that contradicts the images, on a few pairs spread over the sequence."""
-        chosen = np.unique(np.linspace(0, len(self.flows) - 1, _CHECKED_PAIRS).astype(int)) if self.flows else ()
-        pairs = [
-            (read_frame(self.files[k]), read_frame(self.files[k + 1]), *read_flow_of(self.flows[k], size, self._form))
-            for k in chosen
-        ]
+        files, back = self.flow.files, self.flow.backward
+        chosen = np.unique(np.linspace(0, len(files) - 1, _CHECKED_PAIRS).astype(int)) if files else ()
+        ends = {k: [read_frame(self.files[n]) for n in ((k + 1, k) if back else (k, k + 1))] for k in chosen}
+        pairs = [(one, other, *read_flow_of(files[k], size, self._form)) for k, (one, other) in ends.items()]
         if pairs and not any(valid.any() for _, _, _, valid in pairs):
             raise AssetError(
                 "no pixel of the flow is valid",
-                where=str(self.flows[int(chosen[0])]),
+                where=str(files[int(chosen[0])]),
                 value=f"read as {self._form}",
                 accepted="a third channel that is not 0 where flow is valid, or frames.check_flow: false",
             )
         if (found := factor_that_fits([pair for pair in pairs if pair[0].shape == pair[1].shape])) is not None:
             factor, error, own = found
-            what = {0.0: "no motion at all", -1.0: "its negative (flow to the frame before?)"}
+            other_way = f"frames.flow_direction: {'forward' if back else 'backward'}"
+            what = {0.0: "no motion at all", -1.0: f"its negative ({other_way}?)"}
             raise AssetError(
                 f"the flow contradicts its images: {what.get(factor, f'its {factor:g}-fold')} explains them better",
-                where=str(self.flows[int(chosen[0])]),
+                where=str(files[int(chosen[0])]),
                 value=f"error {error:.2g} for {own:.2g} of the contrast, flow read as {self._form}",
-                accepted="frames.flow_format, frames.flow with the flow to the next frame, or frames.check_flow: false",
+                accepted="frames.flow_format, frames.flow_direction, or frames.check_flow: false",
             )
 
     @staticmethod
@@ -348,19 +378,25 @@ class RecordedSequence(Simulation):
         number, request, values = k + 1, asked_for(self.config.labels), {}  # number: of the frame
         if "images" in request:
             values["images"] = self._kept.pop(number) if number in self._kept else read_frame(self.files[number])
-        if number == len(self.files) - 1 or not self.flows or "flow_forward" not in request:
+        way, file = self.flow.direction, self.flow.of_frame(number)
+        if number == len(self.files) - 1 or not self.flow.files or f"flow_{way}" not in request:
             return GroundTruth(k, t_ns, LabelFrame(t_ns, values))
-        size = (self.height, self.width)
-        values["flow_forward"] = Flow(*read_flow_of(self.flows[number], size, self._form))
-        if self.masks and "occlusion_forward" in request:
-            values["occlusion_forward"] = read_mask_of(self.masks[number], size)
-        return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self._recorded.fps))
+        size, frames = (self.height, self.width), self._recorded
+        values[f"flow_{way}"] = Flow(*read_flow_of(self.flow.files[file], size, self._form))
+        if self.flow.masks and f"occlusion_{way}" in request:
+            values[f"occlusion_{way}"] = read_mask_of(self.flow.masks[file], size)
+        before_ns = self._time_of(number - 1, frames.fps) if self.flow.backward else None
+        return GroundTruth(k, t_ns, LabelFrame(t_ns, values), self._time_of(number + 1, frames.fps), before_ns)
 
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
         raise ConfigError("recorded frames have ground truth only at their own times", where="frames")
 
     def _picture(self, t_ns: int) -> Picture:
         return Picture(t_ns, self._step.luminance())
+
+    @property
+    def notes(self) -> list[str]:
+        return [*self._report.notes, *self._report.caveats]
 
     def poses(self) -> dict[str, np.ndarray]:
         return {}
@@ -372,7 +408,7 @@ class RecordedSequence(Simulation):
                 "images": len(self.files),
                 "first": self.files[0].name,
                 "last": self.files[-1].name,
-                **({"notes": notes} if (notes := [*self._report.notes, *self._report.caveats]) else {}),
+                **({"notes": self.notes} if self.notes else {}),
             },
         }
 

@@ -99,7 +99,9 @@ class RenderedSequence(Simulation):
                 gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
                 renderer = stack.enter_context(Renderer(gl, scene, config.render))
             size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
-            self.scene, self.renderer, self.omissions = scene, renderer, scene.omissions
+            self.scene, self.renderer = scene, renderer
+            # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
+            self.notes = scene.omissions + (() if config.scene.kind == "random" else scene.log)
             if scene.dynamics is not None:
                 self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]

@@ -74,7 +74,7 @@ class RigSequence:
     config : of the rig, every value as drawn.   members : of its cameras, in their order; ``member.name`` is the
     sensor's, "" of a single camera.   scene : with all sensors; None of a single camera.
     t0_ns, t1_ns : first and last time, ns.   clock : wall seconds per stage, without those of the members.
-    omissions : undrawn features of the scene's files, a line per file."""
+    """
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class RigSequence:
     ):
         self.config, self.index, self.clock, self.members = config, index, clock, members
         self.scene = whole if isinstance(whole, Scene) else None
-        self.t0_ns, self.t1_ns, self.omissions = whole.t0_ns, whole.t1_ns, whole.omissions
+        self.t0_ns, self.t1_ns = whole.t0_ns, whole.t1_ns
         self._stack = stack
 
     def __enter__(self) -> RigSequence:
@@ -135,6 +135,10 @@ class RigSequence:
     @property
     def triangles(self) -> int:
         return max((member.triangles for member in self.members), default=0)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(line for member in self.members for line in member.notes))
 
     @property
     def causes(self) -> dict[str, int]:

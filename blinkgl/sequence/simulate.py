@@ -15,7 +15,7 @@ events and the flow over it needs to store only that window, never the whole seq
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from types import MappingProxyType
 from typing import Any
@@ -89,14 +89,14 @@ class Simulation(ABC):
     events, labels : numbers so far.   triangles : of everything drawn; 0 for recorded frames.
     frame_camera : the :class:`~blinkgl.imaging.FrameCamera` of its images; None: there is none.
     timeline : the :class:`Timeline` of event frames; None for recorded frames, and without events.
-    omissions : undrawn features of the scene's files, a line per file.
+    notes : what was guessed, left out or not drawn of the files so far, a line each.
     libraries : versions of those that affect this sequence but not every one."""
 
     name = ""
     triangles = 0
     timeline: Timeline | None = None
     frame_camera: FrameCamera | None = None
-    omissions: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
     libraries: Mapping[str, str] = MappingProxyType({})
 
     def __init__(

@@ -123,7 +123,7 @@ class Display:
                 self._notes.add(message["text"])
                 self._say(message["text"])
             return
-        self._note(message.get("omissions") or message.get("report", {}).get("omissions") or ())
+        self._note(message.get("notes") or message.get("report", {}).get("notes") or ())
         if kind == "progress":
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])
             if name not in self._tasks:
@@ -183,7 +183,7 @@ class Display:
         return ", ".join(parts)
 
     def _note(self, lines: Iterable[str]) -> None:
-        """Print what is not drawn, once per file, for all sequences and workers."""
+        """Print what was guessed or is not drawn, once per file, for all sequences and workers."""
         for line in lines:
             if line in self._notes:
                 continue
@@ -191,7 +191,7 @@ class Display:
             if len(self._notes) <= MAX_NOTES:
                 self._say(f"note: {line}")
             elif len(self._notes) == MAX_NOTES + 1:
-                self._say("note: more files ask for what is not drawn; the manifests name them under not_drawn")
+                self._say("note: there are more; the manifests have them under not_drawn and scene_log")
 
     def _say(self, text: str) -> None:
         say(self._console, text)

@@ -141,6 +141,27 @@ def test_two_ways_of_its_own_are_still_refused():
     assert said == "sensors.0.camera: give fov or focal, not both"
 
 
+def test_a_calibration_takes_the_place_of_a_presets_camera(tmp_path):
+    """Whole: no focal length, principal point, distortion or place of `rig: mvsec` remains."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("y", 1.0, degrees=True).as_matrix(), (-0.1, 0.001, 0)
+    lens = {"camera_model": "pinhole", "intrinsics": [226.0, 225.0, 173.0, 133.0], "resolution": [346, 260]}
+    bent = {"distortion_model": "equidistant", "distortion_coeffs": [-0.05, 0.01, 0.0, 0.0]}
+    chain = {"cam0": lens | bent, "cam1": lens | {"distortion_model": "none", "T_cn_cnm1": T.tolist()}}
+    (tmp_path / "k.yaml").write_text(yaml.safe_dump(chain), encoding="utf-8")
+    cameras = [{"calibration": "k.yaml", "calibration_name": name} for name in chain]
+    sensors = [{"name": n, "pair": None, "camera": c} for n, c in zip(("left", "right"), cameras)]
+    (tmp_path / "run.yaml").write_text(yaml.safe_dump({"rig": "mvsec", "sensors": sensors}), encoding="utf-8")
+    left, right = load_run(tmp_path / "run.yaml").sequence(0).sensors
+    assert (left.camera.model.kind, right.camera.model.kind) == ("equidistant", "pinhole")
+    assert left.camera.model.intrinsics == right.camera.model.intrinsics == (226.0, 225.0, 173.0, 133.0)
+    np.testing.assert_allclose(right.place.T, np.linalg.inv(T), atol=1e-12)
+    assert left.events is not None
+    (tmp_path / "run.yaml").write_text("rig: mvsec\ncamera: {calibration: k.yaml}", encoding="utf-8")
+    with pytest.raises(ConfigError, match="camera.calibration: sensor 'left' has a camera of its own .got 'k.yaml'"):
+        load_run(tmp_path / "run.yaml")
+
+
 def test_a_calibration_places_its_cameras(tmp_path):
     """Kalibr's T_cn_cnm1 leads from camera n - 1 to n; the rig's origin is the first camera."""
     turned = np.eye(4)

@@ -190,6 +190,17 @@ def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
     assert explain(load_run(path)).scene["not drawn"] == LINE
 
 
+def test_what_is_guessed_of_a_trajectory_is_said(tmp_path, capsys):
+    """TUM's columns with milliseconds: on the screen as in the manifest."""
+    (tmp_path / "path.txt").write_text("".join(f"{20 * k} {k / 100} 0 0 0 0 0 1\n" for k in range(60)))
+    scene = {**EXPLICIT, "camera": {"trajectory": {"file": "path.txt"}}}
+    assert run(str(recipe(tmp_path, scene)), str(tmp_path / "out")) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "path.txt" in line]
+    assert any("time_unit" in line for line in said) and all(line.startswith("note: path.txt") for line in said)
+    (manifest, *_) = sorted((tmp_path / "out").glob("*/*/manifest.json"))
+    assert {line.removeprefix("note: ") for line in said} <= set(json.loads(manifest.read_text())["scene_log"])
+
+
 def test_many_files_are_not_a_screenful(tmp_path, capsys):
     """Messages of any number of workers arrive in any order; a line is printed once, and not more than so many."""
     display = Display(Console(width=200), tmp_path)
@@ -198,4 +209,4 @@ def test_many_files_are_not_a_screenful(tmp_path, capsys):
             display._note([f"{k}.glb asks for what is not drawn: lights"])
     said = capsys.readouterr().out.splitlines()
     assert len(said) == MAX_NOTES + 1 and len(set(said)) == len(said)
-    assert said[-1] == "note: more files ask for what is not drawn; the manifests name them under not_drawn"
+    assert said[-1] == "note: there are more; the manifests have them under not_drawn and scene_log"

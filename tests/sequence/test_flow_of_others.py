@@ -174,14 +174,42 @@ def test_forms_are_guessed_by_their_values(tmp_path):
         assert np.abs(flow - MOTION).max() < 0.02 and valid.all()
 
 
-def test_backward_flow_by_its_name_and_flow_without_a_valid_pixel(tmp_path):
+@pytest.mark.parametrize("one_each", [False, True], ids=["a pair", "a frame"])
+def test_flow_to_the_frame_before(tmp_path, one_each):
+    """By the names (said), or as declared: the label of frame n is the flow that begins there."""
     recorded(tmp_path, flo, field(), "flo")
-    (tmp_path / "clip/flow").rename(tmp_path / "clip/flow_backward")
-    tree = yaml.safe_load((tmp_path / "run.yaml").read_text())
-    tree["frames"]["flow"] = "flow_backward"
-    (tmp_path / "run.yaml").write_text(yaml.safe_dump(tree))
-    with pytest.raises(AssetError, match="flow_backward: the names say that this flow leads to the frame before"):
-        simulate_sequence(SequenceRequest(load_run(tmp_path / "run.yaml").sequence(0), 0, base=tmp_path))
+    folder = (tmp_path / "clip/flow").rename(tmp_path / "clip/flow_backward")
+    numbers = range(COUNT) if one_each else range(1, COUNT)
+    for path in folder.iterdir():
+        path.unlink()
+    for n in numbers:
+        flo(folder / f"frame{n}.flo", field(-1) * np.float32(1 + n / 100))
+
+    def sequence(labels=("backward",), **frames):
+        tree = yaml.safe_load((tmp_path / "run.yaml").read_text())
+        tree = {"frames": tree["frames"] | {"flow": "flow_backward", **frames}, "labels": {"flow": list(labels)}}
+        (tmp_path / "run.yaml").write_text(yaml.safe_dump(tree))
+        return simulate_sequence(SequenceRequest(load_run(tmp_path / "run.yaml").sequence(0), 0, base=tmp_path))
+
+    made = sequence()
+    labels = [item for item in made if isinstance(item, GroundTruth)]
+    assert any("flow to the frame before, as the names say" in note for note in made.facts()["source"]["notes"])
+    for k, label in enumerate(labels[:-1]):
+        expected = -np.float32(MOTION) * np.float32(1 + (k + 1) / 100)
+        assert np.abs(label.frame.backward.flow - expected).max() < 1e-5 and label.frame.forward is None
+        assert (label.backward_ns, label.t_ns) == (k * 50_000_000, (k + 1) * 50_000_000)
+    assert len(labels) == COUNT - 1 and made.labels == COUNT - 2
+    with pytest.raises(AssetError, match=r"its negative \(frames.flow_direction: backward\?\)"):
+        sequence(["forward"], flow_direction="forward")
+    with pytest.raises(ConfigError, match=r"labels.flow: the flow of these frames leads backward \(got \['forward'\]"):
+        sequence(["forward"], flow_direction="backward")
+    if not one_each:
+        (folder / "frame5.flo").unlink()
+        with pytest.raises(AssetError, match="flow_backward: not one flow file per pair of frames"):
+            sequence(flow_direction="auto")
+
+
+def test_flow_without_a_valid_pixel(tmp_path):
     invalid = lambda path, flow: np.save(path, np.dstack([flow, np.zeros((H, W), np.float32)]))
     with pytest.raises(AssetError, match="frame0.npy: no pixel of the flow is valid"):
         recorded(tmp_path / "b", invalid, field(), "npy")

@@ -1,4 +1,5 @@
-"""Damaged files: each mutant of a small whole file is read, or refused with one line.
+"""Damaged files: each mutant of a small whole file, or of a data set with one file damaged, is read, or refused with
+one line.
 
     python -m blinkgl.tools.fuzz [NAME …] [--mutants 200] [--seed 0] [--only K] [--keep FILE]
 
@@ -14,11 +15,13 @@ import argparse
 import contextlib
 import faulthandler
 import gzip
+import json
 import os
 import re
 import resource
 import select
 import shlex
+import shutil
 import signal
 import struct
 import sys
@@ -27,6 +30,7 @@ import traceback
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,14 +43,23 @@ import trimesh
 from scipy.io import savemat
 
 from blinkgl.config.run import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.shards import export_shards
+from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.flow import read_flo, read_flow_png, write_flo, write_flow_png
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import Declared, open_frames
 from blinkgl.io.images import write_pfm
 from blinkgl.io.reading import EventReading
+from blinkgl.io.records import sealed
+from blinkgl.layouts import export_layout
+from blinkgl.report.page import write_report
 from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.sequence_files.sequence_dir import digest_of
 from blinkgl.types.events import Events
+from blinkgl.viewer.views import SequenceView, sequences_in
+from eflow.data.sources import open_source
 
 HEIGHT, WIDTH = 24, 32
 CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048
@@ -55,10 +68,11 @@ CONFIG = resources.files("blinkgl.configs") / "demo.yaml"
 
 
 class Format(NamedTuple):
-    """make(path) writes a whole file; read(path) reads it as the commands do."""
+    """make(path) writes a whole file; read(path) reads it as the commands do.   files : those that may be damaged."""
 
     make: Callable[[Path], object]
     read: Callable[[Path], object]
+    files: Callable[[Path], list[Path]] = lambda path: [path]
 
 
 def _events() -> Events:
@@ -181,6 +195,84 @@ def _read_frames(path: Path) -> None:
     list(open_frames(path if path.suffix in (".npy", ".npz") else path.parent, Declared(fps=100.0)))
 
 
+SMALL = (
+    "camera.width=32 camera.height=24 time.duration=0.1 time.label_rate=20 output.sequences=1 preview.enabled=false "
+    "labels={flow: [forward, backward], depth: true, boxes: true, ids: true}"
+)
+
+
+def _set_of(layouts: tuple[str, ...], *changes: str) -> Format:
+    """A data set of the shipped demo with ``changes``; everything that opens data sets of others reads it."""
+    exports = [partial(_laid_out, name=name) for name in layouts]
+
+    def make(path: Path) -> None:
+        run_dataset(load_run(CONFIG, re.split(r" (?=\w+[.=])", SMALL) + list(changes)), path)
+
+    def files(path: Path) -> list[Path]:
+        later = re.compile(r"(?!0+\.)\d+\.")  # of the numbered files of a folder, the first stands for all
+        return sorted(file for file in path.rglob("*") if file.is_file() and not later.match(file.name))
+
+    def read(path: Path) -> None:
+        with tempfile.TemporaryDirectory(prefix="blinkgl-fuzz-") as folder:
+            copy = shutil.copytree(path, Path(folder) / "set")
+            _sealed_again(copy)
+            refused = []
+            for number, reader in enumerate((*_SET_READERS, *exports)):
+                with collected(refused):
+                    reader(copy, Path(folder) / str(number))
+        if refused:
+            raise max(refused, key=lambda error: str(error).count("\n"))
+
+    return Format(make, read, files)
+
+
+@contextlib.contextmanager
+def collected(refused: list[BlinkGLError]):
+    """Append a refusal instead of raising it."""
+    try:
+        yield
+    except BlinkGLError as error:
+        refused.append(error)
+
+
+def _sealed_again(folder: Path) -> None:
+    """Bring manifests in line with their files, from the inside out, so that not only checksums find the damage."""
+    for path in sorted(folder.rglob("manifest.json"), key=lambda path: -len(path.parts)):
+        with contextlib.suppress(Exception):  # damaged itself
+            manifest = json.loads(path.read_text())
+            manifest["files"] = {name: digest_of(path.parent / name) for name in manifest["files"]}
+            path.write_text(sealed(manifest))
+
+
+def _views(folder: Path, _: Path) -> None:
+    for sequence in sequences_in(folder):
+        with contextlib.closing(SequenceView(sequence)) as view:
+            view.extent()
+            for t_us in (view.start_us, (view.start_us + view.end_us) // 2, view.end_us):
+                for sensor in view.sensors:
+                    sensor.pictures(t_us, 1000), sensor.bodies(t_us), sensor.depth_cloud(t_us), sensor.camera_pose(t_us)
+                    if sensor.event_count:
+                        sensor.event_points(t_us, 1000)
+
+
+def _samples(folder: Path, _: Path) -> None:
+    source = open_source(folder)
+    for k in range(len(source)):
+        source[k]
+
+
+def _laid_out(folder: Path, out: Path, name: str) -> None:
+    export_layout(folder, out, name)
+
+
+_SET_READERS: tuple[Callable[[Path, Path], object], ...] = (
+    export_shards,
+    lambda folder, out: verify_dataset(folder),
+    lambda folder, out: write_report(folder, out.with_suffix(".html")),
+    _views,
+    _samples,
+)
+
 FRAMES = Format(_write_picture, _read_frames)
 MESH = Format(lambda path: trimesh.creation.box().export(path), load_asset)
 FORMATS = {
@@ -200,6 +292,12 @@ FORMATS = {
     **{f"0.{ending}": FRAMES for ending in ("png", "jpg", "tiff", "pfm", "hdr")},
     "frames.npy": Format(lambda path: np.save(path, np.stack([_picture()] * 2)), _read_frames),
     **{f"mesh.{ending}": MESH for ending in ("obj", "ply", "stl", "glb")},
+    "camera": _set_of(("dsec", "blinkflow", "mvsec", "tapvid"), "tracks={points: 20}"),
+    "exposures": _set_of(("dsec", "blinkflow"), "images={exposure_us: 5000}"),
+    "rig": _set_of(
+        ("dsec", "blinkflow", "mvsec"),
+        "sensors=[{name: left, imu: {rate: 200}, events: {}}, {name: right, place: {position: [0.1, 0, 0]}}]",
+    ),
     "run.yaml": Format(lambda path: path.write_text(CONFIG.read_text()), lambda path: load_run(path).sequence(0)),
 }
 
@@ -311,18 +409,21 @@ def fuzz(name: str, indices: range | list[int], seed: int, keep: Path | None) ->
         path = Path(folder) / name
         format_ = FORMATS[name]
         format_.make(path)
-        whole = path.read_bytes()
+        files = format_.files(path)
         if (first := judge(format_.read, path)) != READ:  # it also compiles what the children need
             raise RuntimeError(f"{name}: the whole file is not read: {first}")
         for index in indices:
-            path.write_bytes(mutant(name, whole, seed, index))
+            file = files[index % len(files)]
+            whole = file.read_bytes()
+            file.write_bytes(mutant(name, whole, seed, index))
             outcome = in_a_process(format_.read, path)
             outcomes[outcome] += 1
             if outcome not in (READ, REFUSED):
                 again = f"python -m blinkgl.tools.fuzz {shlex.quote(name)} --seed {seed} --only {index}"
-                print(f"{outcome}\n    {again}", flush=True)
+                print(f"{file.name}: {outcome}\n    {again}", flush=True)
                 if keep is not None:
-                    keep.write_bytes(path.read_bytes())
+                    keep.write_bytes(file.read_bytes())
+            file.write_bytes(whole)
     return outcomes
 
 

@@ -178,7 +178,11 @@ class Source:
         return str(self._configured("output", "compression") or "zstd")
 
     def _configured(self, section: str, key: str) -> Any:
-        return (read_table(self.folder / "config.yaml").get(section) or {}).get(key)
+        path = self.folder / "config.yaml"
+        table = read_table(path).get(section) or {}
+        if not isinstance(table, dict):
+            raise AssetError("not a table of keys", where=f"{path}: {section}", value=table)
+        return table.get(key)
 
     def _times(self, label: str, columns: int = 1) -> list[tuple[int, ...]]:
         stamps = LABELS[label].stamps

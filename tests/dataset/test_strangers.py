@@ -21,10 +21,11 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset import plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import encode_png
 from blinkgl.io.records import inside, sealed
+from blinkgl.layouts import export_layout
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.report import page
 from blinkgl.sequence_files.sequence_dir import digest_of
@@ -367,3 +368,13 @@ def test_a_record_of_millions_costs_what_is_there(one, monkeypatch):
     assert "and 9998999 more sequences that the recipe asks for are missing" in problems
     page.write_report(data)
     assert len(made) < 2000
+
+
+@pytest.mark.parametrize("section", ["text", [1]])
+def test_a_configuration_of_another_shape_is_a_line(one, tmp_path, section):
+    path = one / "config.yaml"
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "output": section}))
+    forge(one, "config.yaml")
+    with pytest.raises(BlinkGLError) as raised:
+        export_layout(one.parents[1], tmp_path / "dsec", "dsec")
+    assert "\n" not in str(raised.value) and not (tmp_path / "dsec").exists()

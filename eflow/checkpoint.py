@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from blinkgl.errors import AssetError, ConfigError, OutputError
-from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.atomic import atomic_file, fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.records import parse, read_text
 from eflow import shipped
 from eflow.config import TrainConfig
@@ -250,6 +250,17 @@ def save_checkpoint(
     for old in _steps(final.parent)[:-keep]:
         shutil.rmtree(old, ignore_errors=True)
     return final
+
+
+def keep_best(run: Path, model: FlowModel, ema: dict[str, Tensor] | None, step: int, score: float) -> None:
+    """Write the weights, averaged if they are, to ``run/best.safetensors`` if ``score``, the mean over validation sets
+    of the AEE as a share of zero flow's, is lower than that of the file there."""
+    path = run / "best.safetensors"
+    if path.is_file() and not score < float(read_tensors(path)[1].get("score", "inf")):
+        return
+    with atomic_file(path) as temporary:
+        about = {**metadata_of(model), "step": str(step), "score": repr(score)}
+        write_tensors(Path(temporary), model.state_dict() if ema is None else ema, about)
 
 
 def optimizer_tensors(model: FlowModel, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

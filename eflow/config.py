@@ -264,7 +264,9 @@ class DataConfig(Config):
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
     workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0: load in the training process")
-    empty: Literal["error", "skip"] = Field("error", description="a sample without events: an error, or the next one")
+    empty: Literal["error", "skip"] = Field(
+        "error", description="a sample with an empty window: an error, or left out (training takes the next one)"
+    )
     augment: AugmentConfig | None = Field(
         AugmentConfig(), description="random changes of the training samples; null: none"
     )
@@ -311,6 +313,9 @@ class OptimConfig(Config):
     """AdamW and its schedule: the learning rate rises, stays, and falls, by steps or by time."""
 
     steps: int = Field(200_000, ge=1, le=10**9, description="number of weight updates")
+    accumulate: int = Field(
+        1, ge=1, le=4096, description="parts in which a step's batch is processed: less memory, the same gradient"
+    )
     minutes: float | None = Field(
         None,
         gt=0,

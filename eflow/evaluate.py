@@ -55,8 +55,9 @@ def evaluate(
     sharpen : scale the flow of a network to the length that makes the events of its windows sharpest, as `eflow
     predict` does.
     progress : called with (samples done, samples in all, AEE so far).
-    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics
-    as in :mod:`eflow.metrics`.
+    empty : samples with an empty window: "error", or "skip" leaves them out, for every network the same ones.
+    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped" (no valid pixel), "left_out"
+    (empty windows), "model", "parameters"}; metrics as in :mod:`eflow.metrics`.
 
     Raises AssetError: no ground truth, unreadable files. EventDataError: a window has no events (unless
     ``empty="skip"``)."""
@@ -66,14 +67,17 @@ def evaluate(
     method = None if isinstance(model, FlowModel) else model
     representation = model.representation if method is None else PICTURED
     reads = model.reads if method is None and not sharpen else ("old", "new")
-    dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads)
+    dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads, option="--empty skip")
     indices = _evenly(len(dataset), limit or len(dataset))
     shown = {indices[k] for k in _evenly(len(indices), pictures)}
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
-    spent, sum_aee, scored = 0.0, 0.0, 0
+    spent, sum_aee, scored, left_out = 0.0, 0.0, 0, 0
     for done, i in enumerate(indices, 1):
-        batch = collate([dataset[i]])
+        if (sample := dataset[i]) is None:
+            left_out += 1
+            continue
+        batch = collate([sample])
         raw = batch["raw"][0]
         began = time.perf_counter()
         if method is None:
@@ -98,12 +102,13 @@ def evaluate(
             picture = comparison(events_of(batch["new"][0].numpy()), flow, truth, valid)
             write_picture(inside(out / "pictures", f"{name}.png"), picture)
     if not scored:
-        raise AssetError("no sample has a valid ground-truth pixel", accepted="a labelled data set")
+        raise AssetError("no sample has events and a valid ground-truth pixel", accepted="a labelled data set")
     result = {
         **_of_the_model(model),
-        "samples": len(indices),
+        "samples": len(indices) - left_out,
         "skipped": tallies["network"].skipped,
-        "ms": 1000 * spent / len(indices),
+        "left_out": left_out,
+        "ms": 1000 * spent / (len(indices) - left_out),
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
     }
     if out is not None:
@@ -141,12 +146,13 @@ def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
     """Return the component-wise median of the ground truth over at most 64 samples and every 8th pixel."""
     rows = []
     for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]:
-        sample = dataset[i]
+        if (sample := dataset[i]) is None:
+            continue
         if "flow" not in sample:
             raise AssetError("no ground truth", where=sample["name"], accepted="a labelled data set")
         keep = (sample["valid"] & sample["mask"])[::8, ::8]
         rows.append(sample["flow"][:, ::8, ::8][:, keep].numpy())
-    values = np.concatenate(rows, axis=1)
+    values = np.concatenate(rows, axis=1) if rows else np.zeros((2, 0))
     return np.median(values, axis=1) if values.size else np.zeros(2)
 
 
@@ -182,5 +188,6 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
         for scene, scores in scenes.items():
             table.add_row(scene, str(scores["frames"]), *(f"{scores[c]:.3f}" for c in columns))
         console.print(table)
-    if result["skipped"]:
-        console.print(f"{result['skipped']} samples without a valid pixel were skipped")
+    for key, what in (("skipped", "without a valid pixel"), ("left_out", "with an empty window")):
+        if result[key]:
+            console.print(f"{result[key]} samples {what} are left out")

@@ -6,7 +6,8 @@ It runs on the CPU or a GPU (``run.device``; auto uses a GPU if there is one), o
     eflow train configs/eflow/smoke.yaml --out out/smoke --resume
     torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
 
-A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and
+A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/, pictures/ and the
+weights of the best validation, best.safetensors. SIGINT and
 SIGTERM end the current step, write a checkpoint and exit 0. ``--resume`` continues from the newest checkpoint. On the
 CPU the result is bit for bit that of an uninterrupted run: data order and augmentation depend on (seed, step) alone,
 and the learning rate on the step. With ``optim.minutes`` the learning rate depends on the time, which checkpoints
@@ -18,7 +19,9 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import multiprocessing
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -44,7 +47,7 @@ from eflow.pictures import comparison, events_of, write_picture
 from eflow.precision import precision_on
 from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, told
 from eflow.schedule import Course, learning_rate
-from eflow.training_data import check_sizes, training_sets, validate, validation_sets
+from eflow.training_data import check_sizes, check_truth, training_sets, validate, validation_sets
 
 
 @dataclass
@@ -72,6 +75,10 @@ def train(
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        # A loader process imports a script without `if __name__ == "__main__":`, which would train again. The first
+        # process says so.
+        raise SystemExit(2)
     with contextlib.ExitStack() as stack:  # ends the rendering processes
         training = Training(config, Path(out), stack, resume=resume, stop_after=stop_after, clock=clock, quiet=quiet)
         return training.run()
@@ -98,11 +105,13 @@ class Training:
         self.config = config.model_copy(update={"run": config.run.model_copy(update={"precision": precision})})
         if self.lead:
             importlib.import_module("torch.utils.tensorboard")  # fail before anything is written
-        if self.lead:
-            stack.enter_context(_held(out, resume))
+        if self.lead and not resume:
+            refuse_existing(out)
         spent = self._make_network(resume)
         self.stop = config.optim.steps if stop_after is None else min(config.optim.steps, self.start + stop_after)
         self._make_data(stack)
+        if self.lead:  # now that nothing is wrong with the data
+            stack.enter_context(_held(out, resume, lambda: self.step > self.start))
         self.net = self._parallel()
         self.net.train()
         if self.lead:
@@ -133,12 +142,12 @@ class Training:
     def _make_data(self, stack: contextlib.ExitStack) -> None:
         """Open the training and validation sets, and check that they fit the network before anything is written."""
         config = self.config
-        if config.data.batch % self.world:
+        if config.data.batch % (parts := self.world * config.optim.accumulate):
             raise ConfigError(
-                "not a multiple of the number of processes",
+                "not a multiple of the number of processes times optim.accumulate",
                 where="data.batch",
                 value=config.data.batch,
-                accepted=f"a multiple of {self.world}",
+                accepted=f"a multiple of {parts}",
             )
         self.mixture, self.sources = training_sets(config, self.start, self.rank, self.world, stack)
         self.dataset = FlowDataset(
@@ -152,6 +161,7 @@ class Training:
         )
         check_sizes(self.dataset, self.model, config.data.crop)
         self.validation = validation_sets(config, self.model) if self.lead else []
+        check_truth(self.dataset, self.mixture, self.validation)
 
     def _parallel(self) -> torch.nn.Module:
         """Return the network, compiled or wrapped to average gradients over processes if the configuration asks for
@@ -221,8 +231,7 @@ class Training:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        loss, epe, flow = _forward(self.net, batch, self.config, self.world)
-        loss.backward()
+        loss, epe, flow = self._backward(batch)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), optim.clip)
         self.read.add(self.step, batch["name"], loss, epe, norm)
         self.optimizer.step()
@@ -231,6 +240,24 @@ class Training:
             # The first steps average over few weights, so that the random initial weights lose their influence.
             _average(self.ema, self.model, min(optim.ema, self.step / (self.step + 10)))
         return rate, flow
+
+    def _backward(self, batch: dict) -> tuple[Tensor, Tensor, Tensor]:
+        """Add up the gradients of the batch's parts; return loss, end-point error, px, and the first part's flow."""
+        size, own = len(batch["name"]) // self.config.optim.accumulate, batch["valid"].sum()
+        count = own.float()
+        # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels.
+        if self.world > 1:
+            dist.all_reduce(count)
+            count = count / self.world
+        done = []
+        for first in range(0, len(batch["name"]), size):
+            part = {k: v[first : first + size] for k, v in batch.items()}
+            later = self.world > 1 and first + size < len(batch["name"])
+            with self.net.no_sync() if later else contextlib.nullcontext():
+                done.append(_forward(self.net, part, self.config, count))
+                done[-1][0].backward()
+        losses, errors, flows = zip(*((loss.detach(), error, flow) for loss, error, flow in done), strict=True)
+        return sum(losses[1:], losses[0]), sum(errors[1:], errors[0]) / own.clamp(min=1), flows[0]
 
     def _every(self, *whats: str) -> bool:
         """Whether one of these actions is due at this step."""
@@ -276,6 +303,8 @@ class Training:
         size = -(-self.config.data.batch // self.world)
         scores = validate(self.model, self.ema, self.validation, self.config.run.precision, size)
         log.write(self.step, "validation", **scores)
+        shares = [scores[f"{name}/AEE"] / max(scores[f"{name}/zero"], 1e-9) for name, *_ in self.validation]
+        ckpt.keep_best(self.out, self.model, self.ema, self.step, sum(shares) / len(shares))
         progress.note(self.step, scores)
 
     def _save(self) -> Path:
@@ -297,20 +326,15 @@ def _optimizer(model: FlowModel, optim: OptimConfig, device: torch.device) -> to
     )
 
 
-def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return loss, end-point error of the last field, and that field, all still on the device."""
+def _forward(net, batch: dict, config: TrainConfig, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the loss (its sum over valid pixels divided by ``count``), the sum of the end-point errors of the last
+    field, px, and that field, all still on the device."""
     kind = batch["new"].device.type
     with (
         compile_errors(config.run.compile),
         torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"),
     ):
         prediction = net({k: batch[k] for k in ("old", "new") if k in batch})
-    count = None
-    # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels.
-    if world > 1:
-        count = batch["valid"].sum().float()
-        dist.all_reduce(count)
-        count = count / world
     loss = sequence_loss(
         prediction,
         batch["flow"],
@@ -323,8 +347,8 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
     with torch.no_grad():
         valid = batch["valid"]
         error = (prediction.flow - torch.where(valid[:, None], batch["flow"], 0)).square().sum(1).sqrt()
-        epe = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
-    return loss, epe, prediction.flow.detach()
+        total = torch.where(valid, error, 0).sum()
+    return loss, total, prediction.flow.detach()
 
 
 def _rendering(sources: list[Source]) -> dict[str, float]:
@@ -366,9 +390,9 @@ def as_yaml(config: TrainConfig) -> str:
 
 
 @contextlib.contextmanager
-def _held(out: Path, resume: bool) -> Iterator[None]:
-    """Hold the run folder, so that no other training writes into it. A new one that stays empty is removed. Raises
-    OutputError: it exists, another run uses it."""
+def _held(out: Path, resume: bool, begun: Callable[[], bool]) -> Iterator[None]:
+    """Hold the run folder, so that no other training writes into it. A new one is removed if the training ends before
+    its first step. Raises OutputError: it exists, another run uses it."""
     if not resume:
         refuse_existing(out)
     made = not out.exists() and not resume
@@ -383,9 +407,8 @@ def _held(out: Path, resume: bool) -> Iterator[None]:
     finally:
         if handle is not None:
             os.close(handle)
-        if made:
-            with contextlib.suppress(OSError):
-                out.rmdir()
+        if made and not begun():
+            shutil.rmtree(out, ignore_errors=True)
 
 
 def _write_config(out: Path, config: TrainConfig) -> None:

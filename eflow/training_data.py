@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from blinkgl.config.recipe import derived_seed
-from blinkgl.errors import ConfigError
+from blinkgl.errors import AssetError, ConfigError
 from eflow.config import SourceConfig, TrainConfig
-from eflow.data.dataset import FlowDataset, Mixture, collate, is_endless
+from eflow.data.dataset import FlowDataset, Key, Mixture, collate, is_endless
 from eflow.data.sources import Source, open_source
 from eflow.infer import predict
 from eflow.metrics import frame_metrics
@@ -75,6 +75,18 @@ def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, Fl
     return sets
 
 
+def check_truth(dataset: FlowDataset, mixture: Mixture, validation: list[tuple[str, FlowDataset, list[int]]]) -> None:
+    """Raise EventDataError or AssetError, before anything is written, if the first sample of a training set cannot be
+    trained on, or no sample of a validation set be scored."""
+    for k, endless in enumerate(mixture.endless):
+        if not endless:
+            dataset[Key(0, 0, k, 0)]
+    for name, scored, indices in validation:
+        samples = (sample for i in indices if (sample := scored[i]) is not None)
+        if not any("flow" in s and (s["valid"] & s["mask"]).any() for s in samples):
+            raise AssetError("no sample has events and a valid ground-truth pixel", where=f"data.validate_on: {name}")
+
+
 def _title(s: SourceConfig) -> str:
     return Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
 
@@ -97,7 +109,7 @@ def validate(
         scores = {}
         for name, dataset, indices in validation:
             rows = []
-            for batch in _alike((dataset[i] for i in indices), size):
+            for batch in _alike(filter(None, (dataset[i] for i in indices)), size):
                 flows = predict(model, batch, precision=precision).flow.permute(0, 2, 3, 1).cpu().numpy()
                 truths, valids = batch["flow"].permute(0, 2, 3, 1).numpy(), (batch["valid"] & batch["mask"]).numpy()
                 for flow, truth, valid in zip(flows, truths, valids, strict=True):

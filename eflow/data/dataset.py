@@ -23,6 +23,8 @@ from eflow.data.window import RawSample
 
 ENDLESS = 4096
 """Number of samples of an endless source in an epoch."""
+MOST_TRIES = 1000
+"""Samples in a row that may have no events, or no valid pixel."""
 MAX_FLOW = 400.0
 """Ground truth of this length or more, px, is neither trained on nor scored (BlinkFlow's rule)."""
 
@@ -118,7 +120,11 @@ class FlowDataset(Dataset):
 
     raw : also return the RawSample, as "raw".
     reads : windows to convert to tensors (:attr:`eflow.models.FlowModel.reads`).
-    empty : "error" raises for a sample with an empty window among these; "skip" takes the next one with events.
+    empty : "error" raises for a sample with an empty window among these. "skip" leaves out samples of which either
+    window is empty, whichever are read, so that all networks are scored on the same ones: ``dataset[i]`` is None then,
+    and training takes the next sample. The option that says so is called ``option`` in messages.
+
+    Training takes the next sample for one without a valid pixel, too.
     """
 
     def __init__(
@@ -132,9 +138,10 @@ class FlowDataset(Dataset):
         empty: str = "error",
         raw: bool = False,
         reads: tuple[str, ...] = ("old", "new"),
+        option: str = "data.empty=skip",
     ):
         self.sources, self.representation, self.seed, self.raw = sources, representation, seed, raw
-        self.reads = reads
+        self.reads, self.option = reads, option
         self.augment, self.crop, self.empty = augment, crop, empty
         self._starts = np.cumsum([0, *(0 if is_endless(s) else len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
@@ -148,35 +155,49 @@ class FlowDataset(Dataset):
     def __len__(self) -> int:
         return int(self._starts[-1])
 
-    def __getitem__(self, key: Key | int) -> dict:
+    def __getitem__(self, key: Key | int) -> dict | None:
         if isinstance(key, Key):
-            rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(2, key.epoch, key.position)))
-            sample = self._raw(key.source, key.index)
+            return self._drawn(key)
+        source = int(np.searchsorted(self._starts, key, side="right")) - 1
+        sample = self._with_events(self.sources[source][int(key - self._starts[source])])
+        return None if sample is None else self._tensors(sample, None)
+
+    def _drawn(self, key: Key) -> dict:
+        """Return the sample of a draw, or the next one of its source that can be trained on."""
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(2, key.epoch, key.position)))
+        source = self.sources[key.source]
+        tries = 1 if is_endless(source) else min(len(source), MOST_TRIES)
+        for step in range(tries):
+            sample = source[key.index if is_endless(source) else (key.index + step) % len(source)]
+            name, sample = sample.name, self._with_events(sample)
+            if sample is None:
+                continue
             if sample.flow is None:
-                raise EventDataError("no ground truth to train on", where=sample.name, accepted="a labelled data set")
+                raise EventDataError("no ground truth to train on", where=name, accepted="a labelled data set")
             if self.augment is not None:
                 sample = augmented(sample, self.augment, rng)
-            return self._tensors(sample, rng)
-        source = int(np.searchsorted(self._starts, key, side="right")) - 1
-        return self._tensors(self._raw(source, int(key - self._starts[source])), None)
+            tensors = self._tensors(sample, rng)
+            # Without one the loss would be 0, as if the network knew.
+            if is_endless(source) or tensors["valid"].any():
+                return tensors
+        raise EventDataError(
+            f"no events, or no valid pixel, in {tries} samples up to this one",
+            where=name,
+            accepted=f"labels with valid pixels of less than {MAX_FLOW:g} px",
+        )
 
-    def _raw(self, source: int, index: int) -> RawSample:
-        if is_endless(self.sources[source]):
-            return self.sources[source][index]
-        for step in range(len(self.sources[source])):
-            sample = self.sources[source][(index + step) % len(self.sources[source])]
-            empty = [side for side in self.reads if not len(getattr(sample, side))]
-            if not empty:
-                return sample
-            if self.empty == "error":
-                which = empty[0]
-                w = getattr(sample, which)
-                raise EventDataError(
-                    f"no events in the {which} window [{w.t0}, {w.t1}) µs",
-                    where=sample.name,
-                    accepted="use data.empty=skip to skip such samples",
-                )
-        raise EventDataError("no sample has events", where=sample.name)
+    def _with_events(self, sample: RawSample) -> RawSample | None:
+        """Return the sample, or None if it is to be left out."""
+        sides = ("old", "new") if self.empty == "skip" else self.reads
+        side = next((side for side in sides if not len(getattr(sample, side))), None)
+        if side is None or self.empty == "skip":
+            return sample if side is None else None
+        window = getattr(sample, side)
+        raise EventDataError(
+            f"no events in the {side} window [{window.t0}, {window.t1}) µs",
+            where=sample.name,
+            accepted=f"use {self.option} to leave such samples out",
+        )
 
     def _tensors(self, s: RawSample, rng: np.random.Generator | None) -> dict:
         try:
@@ -351,7 +372,17 @@ def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool 
         generator=torch.Generator(),  # otherwise it would draw from torch's global generator
         multiprocessing_context="forkserver" if workers else None,
     )
-    for batch in loader:
-        if isinstance(batch, BlinkGLError):
-            raise batch
-        yield batch
+    try:
+        for batch in loader:
+            if isinstance(batch, BlinkGLError):
+                raise batch
+            yield batch
+    except RuntimeError as error:
+        if "DataLoader worker" not in str(error):
+            raise
+        raise ConfigError(
+            "a loader process ended: it ran out of memory, or it ran a script that trains without a guard",
+            where="data.workers",
+            value=workers,
+            accepted="0, or the script's call of train() below `if __name__ == '__main__':`",
+        ) from None

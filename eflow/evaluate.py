@@ -83,7 +83,7 @@ def evaluate(
         if method is None:
             flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
             if sharpen:
-                flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow))
+                flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow)[0])
         else:
             flow = method(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began

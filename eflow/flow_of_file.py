@@ -102,6 +102,8 @@ def show_flows(
                 where=str(file.path),
                 accepted="a smaller --window-ms, or --whole",
             )
+    for why, windows in getattr(predictor, "unsharpened", {}).items():
+        say(f"  {windows} of {count} flows have the network's own length: {why} (--no-sharpen for all)")
     for path in filter(None, (outputs.folder, outputs.video)):
         say(f"written: {path}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -246,7 +247,7 @@ class Predictor:
     warm_start : start from the previous flow, moved along itself (networks with an iterated low-resolution flow only).
     empty : "error", or "zero" flow for a window without events.
     sharpen : multiply each flow by the factor that makes the events of its windows sharpest
-    (:func:`eflow.methods.contrast.sharpest_length`)."""
+    (:func:`eflow.methods.contrast.sharpest_length`).   unsharpened : windows whose flow kept its length, by reason."""
 
     def __init__(
         self,
@@ -262,6 +263,7 @@ class Predictor:
         self.model, self.height, self.width = model, height, width
         self.warm_start, self.precision, self.empty, self.sharpen = warm_start, precision, empty, sharpen
         self._low: torch.Tensor | None = None
+        self.unsharpened: Counter[str] = Counter()
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
         """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's event tensor (C, H, W).
@@ -288,7 +290,10 @@ class Predictor:
         if self.sharpen:
             follows = len(window.old) and window.old.t1 == window.new.t0
             seen = [window.old, window.new] if follows else [window.new]
-            flow = flow * np.float32(sharpest_length(seen, flow))
+            factor, why = sharpest_length(seen, flow)
+            flow = flow * np.float32(factor)
+            if why:
+                self.unsharpened[why] += 1
         return flow, new
 
 

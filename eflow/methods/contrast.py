@@ -146,32 +146,47 @@ LENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
 short flow; and with independent motion a longer flow is always a little sharper (event collapse)."""
 LENGTH_PRIOR = 0.03
 """Weight of (ln factor)^2, subtracted from the logarithm of the sharpness: it favours the network's own length."""
+DENSE = 0.09
+"""Events per pixel, of blocks of ``BLOCK`` px with events, from which a shorter flow is believed. Of fewer events the
+sharpest image is often that of hardly any flow (docs/results_eflow.md has the bursts by their share of events)."""
+BLOCK = 16
 
 
-def sharpest_length(windows: list[Window], flow: np.ndarray) -> float:
-    """Return the factor of a flow with which the warped events are sharpest. Networks estimate the direction of motion
-    better than its length.
+def sharpest_length(windows: list[Window], flow: np.ndarray) -> tuple[float, str]:
+    """Return (factor of a flow with which the warped events are sharpest, "" or why it stays 1). Networks estimate the
+    direction of motion better than its length.
 
-    windows : one, or two successive ones.   flow : (H, W, 2) px over the last of them.
-    The factor is 1.0 if there are fewer than :data:`LEAST_EVENTS` events, or nothing moves."""
+    windows : one, or two successive ones.   flow : (H, W, 2) px over the last of them. Events outside it (rectified
+    ones may be) are left out.
+    The factor is 1.0 if there are fewer than :data:`LEAST_EVENTS` events, nothing moves, sharpness grows down to the
+    smallest factor, or events are too sparse (:data:`DENSE`) for a shorter flow to be believed."""
     height, width = flow.shape[:2]
+    x, y = (np.rint(np.concatenate([getattr(w, k) for w in windows])).astype(np.int64) for k in "xy")
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    sizes = np.cumsum([len(w) for w in windows])[:-1]
+    windows = [w.take(keep) for w, keep in zip(windows, np.split(inside, sizes), strict=True)]
     try:
         cloud = _Cloud.of(windows, height, width)
     except EventDataError:
-        return 1.0
+        return 1.0, "too few events"
     spans = (windows[-1].t1 - windows[0].t0) / (windows[-1].t1 - windows[-1].t0)
     at = flow[np.rint(cloud.y).astype(np.intp), np.rint(cloud.x).astype(np.intp)].astype(np.float64) * spans
     values = np.array([sharpness(cloud, (f * at[:, 0], f * at[:, 1]), BLURS_PX[-1])[0] for f in LENGTHS])
     if not np.isfinite(values).all() or not values.min() > 0:
-        return 1.0
+        return 1.0, "nothing to sharpen"
     scores = np.log(values) - LENGTH_PRIOR * np.log(LENGTHS) ** 2
     best = int(scores.argmax())
-    if best in (0, len(LENGTHS) - 1):
-        return LENGTHS[best]
+    if best == 0:
+        return 1.0, "no length is sharpest"
+    blocks = np.unique(y[inside] // BLOCK * width + x[inside] // BLOCK).size
+    if LENGTHS[best] < 1 and np.count_nonzero(inside) < DENSE * BLOCK**2 * blocks:
+        return 1.0, "too few events"
+    if best == len(LENGTHS) - 1:
+        return LENGTHS[best], ""
     # Maximum of the parabola through three equally spaced factors.
     low, middle, high = scores[best - 1 : best + 2]
     step = LENGTHS[best + 1] - LENGTHS[best]
-    return LENGTHS[best] + 0.5 * step * (low - high) / (low - 2 * middle + high)
+    return LENGTHS[best] + 0.5 * step * (low - high) / (low - 2 * middle + high), ""
 
 
 def _climb(

@@ -12,7 +12,7 @@ from torch import nn
 from eflow.config import EvFlowNetConfig
 from eflow.data.representation import CountsAndTimes, VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.models.unets import Consensus, Residual, ScaledTanh, double, encoder_widths, to_size
+from eflow.models.unets import Consensus, Residual, ScaledTanh, double, encoder_widths, seen_cells, to_size
 
 
 class EvFlowNet(FlowModel):
@@ -54,7 +54,7 @@ class EvFlowNet(FlowModel):
             skips.append(x)
         x, flows = self.residuals[0](x), []
         if self.consensus is not None:
-            x = self.consensus(x)
+            x = self.consensus(x, seen_cells(batch["new"], self.divisor))
         x = self.residuals[1](x)
         # From coarse to fine; skips are used from the last encoder to the first.
         for decoder, head in zip(self.decoders, self.heads, strict=True):

@@ -75,6 +75,15 @@ class Residual(nn.Module):
         return F.relu(x + self.conv2(F.relu(self.conv1(x))))
 
 
+def seen_cells(events: Tensor, stride: int) -> Tensor:
+    """Return 1 for the cells of ``stride`` px of event tensors (N, C, H, W) that have events within two cells, else 0:
+    (N, 1, h, w). A few stray events do not count: such a cell has .6 of the pixels with events that the cell of a
+    mean event has, or more."""
+    share = F.avg_pool2d((events != 0).any(1, keepdim=True).float(), stride)
+    usual = (share**2).sum((2, 3), keepdim=True) / share.sum((2, 3), keepdim=True).clamp(min=1e-9)
+    return F.max_pool2d((share >= 0.6 * usual).float(), 5, stride=1, padding=2)
+
+
 class Consensus(nn.Module):
     """x + a linear layer of the affine field nearest to x over the image.
 
@@ -95,9 +104,9 @@ class Consensus(nn.Module):
         self.groups, self.stride = groups, stride
         self.weight, self.mix = nn.Conv2d(channels, groups, 1), nn.Conv2d(channels, channels, 1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        # The weight of each cell, 0 to 1.
-        weight = torch.sigmoid(self.weight(x).float())
+    def forward(self, x: Tensor, seen: Tensor | float = 1.0) -> Tensor:
+        # The weight of each cell, 0 to 1; none where the sensor is silent, whose features say only that.
+        weight = torch.sigmoid(self.weight(x).float()) * seen
         with torch.autocast(x.device.type, enabled=False):
             field = self.fitted(x.float(), weight)
         return F.relu(x + self.mix(field.to(x.dtype)))

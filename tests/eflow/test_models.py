@@ -14,7 +14,7 @@ from eflow.config import LossConfig  # noqa: E402
 from eflow.infer import predict  # noqa: E402
 from eflow.metrics import pixel_error, sequence_loss  # noqa: E402
 from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of, preset  # noqa: E402
-from eflow.models.unets import Consensus  # noqa: E402
+from eflow.models.unets import Consensus, seen_cells  # noqa: E402
 
 
 def count(config) -> tuple[int, float]:
@@ -247,6 +247,25 @@ def test_consensus_gives_an_affine_field_back_wherever_it_is_seen():
     with torch.autocast("cpu", torch.bfloat16):
         x = torch.randn(1, 8, 8, 8, dtype=torch.bfloat16)
         assert Consensus(8)(x).dtype == torch.bfloat16
+
+
+def test_a_silent_surround_has_no_say():
+    """A view in the middle of a larger sensor, with stray events around: cells far from it get no weight, so what they
+    hold is the same to the network."""
+    torch.manual_seed(0)
+    events = torch.zeros(1, 2, 256, 320)
+    events[..., 64:192, 64:192] = (torch.rand(1, 2, 128, 128) < 0.1).float()
+    events[0, 0, torch.randint(256, (60,)), torch.randint(320, (60,))] = 1
+    seen = seen_cells(events, 16)
+    inside = torch.zeros(1, 1, 16, 20)
+    inside[..., 4:12, 4:12] = 1
+    assert (seen[inside > 0] == 1).all() and seen.sum() <= 12 * 12
+    layer, x = Consensus(8, groups=2), torch.randn(1, 8, 16, 20)
+    other = torch.where(seen > 0, x, 99 * torch.randn_like(x))
+    weight = torch.rand(1, 2, 16, 20) * seen
+    fields = [layer.fitted(one, weight)[..., 4:12, 4:12] for one in (x, other)]
+    assert (fields[0] - fields[1]).abs().max() < 1  # 1e-4 of the weight remains, so that silence is not 0 / 0
+    assert seen_cells(torch.zeros(1, 2, 64, 64), 16).isfinite().all()
 
 
 def test_length_is_priced_either_way_and_whatever_the_direction():

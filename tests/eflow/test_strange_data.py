@@ -97,7 +97,10 @@ def test_a_checkpoint_is_compared_before_its_network_is_made(tmp_path, model, mo
 def test_two_trainings_do_not_share_a_folder(tmp_path):
     with _held(tmp_path / "run", False, bool):
         for resume in (False, True):
-            with pytest.raises(OutputError, match="another run uses this folder"), _held(tmp_path / "run", resume, bool):
+            with (
+                pytest.raises(OutputError, match="another run uses this folder"),
+                _held(tmp_path / "run", resume, bool),
+            ):
                 pass
     assert not (tmp_path / "run").exists()
     with _held(tmp_path / "run", False, lambda: True):

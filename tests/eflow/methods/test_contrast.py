@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,6 @@ from blinkgl.errors import EventDataError
 from eflow.data.window import Window
 from eflow.methods import make_method
 from eflow.methods.contrast import (
-    LENGTHS,
     MOST_EVENTS,
     _Cloud,
     affine_field,
@@ -101,16 +102,36 @@ def test_a_rotating_camera():
 def test_the_length_of_a_right_direction_is_found(motion, windows):
     seen = pictured(MOTIONS[motion])[-windows:]
     for wrong in (0.95, 1.25, 2.2):
-        factor = sharpest_length(list(seen), wrong * truth(MOTIONS[motion]))
-        assert factor * wrong == pytest.approx(1, abs=0.06)
+        factor, why = sharpest_length(list(seen), wrong * truth(MOTIONS[motion]))
+        assert not why and factor * wrong == pytest.approx(1, abs=0.06)
 
 
 def test_a_length_that_events_do_not_tell_stays():
     old, new = pictured(MOTIONS["translation"])
-    assert sharpest_length([old, new], np.zeros((H, W, 2))) == pytest.approx(1.0, abs=0.01)
+    assert sharpest_length([old, new], np.zeros((H, W, 2)))[0] == pytest.approx(1.0, abs=0.01)
     few = Window(new.x[:20], new.y[:20], new.t[:20], new.p[:20], new.t0, new.t1)
-    assert sharpest_length([few], truth(MOTIONS["translation"])) == 1.0
-    assert sharpest_length([new], 9 * truth(MOTIONS["translation"])) == LENGTHS[0]  # no shorter than it looks
+    assert sharpest_length([few], truth(MOTIONS["translation"])) == (1.0, "too few events")
+    # It would be shorter than any that is tried.
+    assert sharpest_length([new], 9 * truth(MOTIONS["translation"])) == (1.0, "no length is sharpest")
+
+
+def test_a_shorter_flow_of_sparse_events_is_not_believed():
+    """Of a tenth of the events in as much of the picture, whichever are drawn, the right flow is not shortened."""
+    right = truth(MOTIONS["translation"])
+    for draw in range(10):
+        kept = [w.take(np.random.default_rng(draw).random(len(w)) < 0.1) for w in pictured(MOTIONS["translation"])]
+        assert sharpest_length(kept, right)[0] > 0.95
+
+
+def test_events_outside_the_sensor_say_nothing():
+    """Rectified ones may lie there: they neither wrap to the other side nor end it."""
+    seen, wrong = pictured(MOTIONS["zoom"]), 1.25 * truth(MOTIONS["zoom"])
+    floats = [replace(w, x=w.x.astype(np.float32), y=w.y.astype(np.float32)) for w in seen]
+    stray = np.tile(np.float32([-30.4, -0.6, W + 3, 5000]), 40)
+    with_stray = [
+        w.with_events(stray, stray[::-1], np.full(len(stray), w.t0 + 9), np.ones(len(stray), np.uint8)) for w in floats
+    ]
+    assert sharpest_length(with_stray, wrong) == sharpest_length(floats, wrong)
 
 
 def test_the_derivative_of_the_sharpness():

@@ -134,6 +134,7 @@ _TYPICAL_DURATION_S, _TYPICAL_RATE_HZ = 3.0, 1e5
 """Of recordings: the middle, as ratios, of what people have."""
 
 
+@np.errstate(invalid="ignore", divide="ignore")  # of numbers that are no times, which their readers refuse
 def guessed_event_unit(values: np.ndarray, count: int, span: tuple[float, float] | None = None) -> TimeUnit:
     """Return the unit in which the times of a whole file of events make sense together.
 

@@ -122,8 +122,9 @@ class TextReader:
             total = max(os.fstat(file.fileno()).st_size - self._start - len(head), 0)
             file.seek(max(file.seek(0, os.SEEK_END) - min(size, total), 0))
             tail = file.read()
-        lines = head.split(b"\n")
-        lines = (lines if not total else lines[:-1]) + tail.split(b"\n")[len(tail) < total :]
+        # Cut lines are left out: the end of the head and the beginning of the tail, unless one continues the other.
+        whole = (head + tail).split(b"\n") if len(tail) == total else None
+        lines = whole or head.split(b"\n")[:-1] + tail.split(b"\n")[1:]
         rows = [row for row in map(_row, lines) if row]
         wide = max(map(len, rows), key=[len(row) for row in rows].count, default=4)
         rows = [row for row in rows if len(row) == wide]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 from decimal import ROUND_HALF_UP, Decimal
 
 import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError
+from blinkgl.io.clock import TimeUnit
 from blinkgl.io.reading import EventReading
 from blinkgl.io.text import TextReader, TextWriter
 from blinkgl.types.events import Events
@@ -167,3 +169,15 @@ def test_what_is_written_is_what_python_would_print(tmp_path, separator, unit):
     reading = EventReading(time_unit=None if separator == "," and unit == "us" else unit)
     back = Events.concatenate(list(TextReader(tmp_path / "e.txt", reading).chunks(64)))
     assert all(np.array_equal(getattr(back, k), getattr(events, k)) for k in "xytp")
+
+
+@pytest.mark.parametrize("ending", ["txt", "txt.gz"])
+@pytest.mark.parametrize("lines", [1500, 4500])
+def test_a_unit_is_guessed_from_whole_lines(tmp_path, ending, lines):
+    """The first and last 32 KiB are looked at; wherever in a line they end, half a number is no time."""
+    body = "".join(f"{13.582595999 + 9e-6 * k:.9f} {k % 240} {k % 180} {k % 2}\n" for k in range(1, lines))
+    path = tmp_path / f"e.{ending}"
+    for blanks in range(24):
+        with gzip.open(path, "wb") if ending.endswith("gz") else open(path, "wb") as file:
+            file.write(f"13.582595999 0 0 0{' ' * blanks}\n{body}".encode())
+        assert TextReader(path).unit == TimeUnit("s", "guessed", (13.582595999, 13.582595999 + 9e-6 * (lines - 1)))

@@ -217,8 +217,15 @@ def evaluate(
 
 @app.command()
 def predict(
-    checkpoint: Answer,
-    events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[NETWORK] EVENTS",
+            help="A network or method, as evaluate has them, and an event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, "
+            "npz … Without a network (or with auto) the events choose: real_small where only the camera moves, "
+            "real_bodies where bodies move their own ways.",
+        ),
+    ],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
     window_ms: Span = "100",
     start_ms: Annotated[
@@ -236,6 +243,9 @@ def predict(
     damaged: of_events.Damaged = "refuse",
     sort: of_events.Sort = False,
     npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False,
+    at_events: Annotated[
+        bool, typer.Option("--at-events", help="Flow of pixels without events nearby is written as not valid.")
+    ] = False,
     video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None,
     warm_start: WarmStart = False,
     sharpen: Sharpen = True,
@@ -253,26 +263,35 @@ def predict(
     from blinkgl.io.reading import EventReading
     from blinkgl.types.events import Events
     from eflow import infer
+    from eflow.choice import AUTO, chosen
     from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
     from eflow.infer import doubts
 
     one_of("--empty", empty, ("error", "zero"))
     asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
+    if len(names) > 2:
+        raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
+    checkpoint, events = [AUTO, *names][-2:]
     method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
-    model = None if method is not None else network_of(checkpoint, device, raw, precision, iterations)
     reading = EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort)
     file = infer.open_sized(events, reading)
     for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
         typer.echo(f"{events}: {line}", err=True)
-    outputs = Outputs(out, video, npy, infer.read_truth(truth, file.height, file.width) if truth else None)
     shape = (file.height, file.width)
-    if model is None:
-        predictor = infer.MethodPredictor(method, *shape, empty=empty)
+    outputs = Outputs(out, video, npy, infer.read_truth(truth, *shape) if truth else None, at_events)
+
+    def predictor_of(name: str, **options) -> infer.Predictor:
+        model = network_of(name, device, raw, precision, iterations)
+        return infer.Predictor(model, *shape, precision=precision_for(model, precision), empty=empty, **options)
+
+    if checkpoint == AUTO and not Path(AUTO).exists():
+        checkpoint, why = chosen(file, asked, predictor_of)
+        typer.echo(f"network: {why}")
+    if method is not None:
+        predictor, reads = infer.MethodPredictor(method, *shape, empty=empty), ("old", "new")
     else:
-        precision = precision_for(model, precision)
-        options = {"warm_start": warm_start, "precision": precision, "empty": empty, "sharpen": sharpen}
-        predictor = infer.Predictor(model, *shape, **options)
-    reads = ("old", "new") if model is None else model.reads
+        predictor = predictor_of(checkpoint, warm_start=warm_start, sharpen=sharpen)
+        reads = predictor.model.reads
     show_flows(file, predictor, reads, asked, outputs, typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)

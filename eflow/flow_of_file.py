@@ -11,12 +11,12 @@ import numpy as np
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.formats import EventFile
 from eflow import infer
-from eflow.data.window import Window
+from eflow.data.window import Window, hit_pixels
 from eflow.infer import StreamWindow
 from eflow.methods.contrast import LEAST_EVENTS, ContrastMaximisation
 from eflow.methods.iwe import flow_warp_loss
 from eflow.metrics import frame_metrics
-from eflow.pictures import FlowVideo, events_of
+from eflow.pictures import FlowVideo, events_of, near_events
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,14 @@ class WindowsAsked:
 class Outputs:
     """What to write: a new folder of flow and pictures, a video; None: not written.
 
-    npy : also write float32 arrays to the folder.   truth : (H, W, 2) px, ground truth to score each flow with."""
+    npy : also write float32 arrays to the folder.   truth : (H, W, 2) px, ground truth to score each flow with.
+    at_events : flow of pixels without events nearby is not valid."""
 
     folder: str | None = None
     video: str | None = None
     npy: bool = False
     truth: np.ndarray | None = None
+    at_events: bool = False
 
 
 def milliseconds(text: str) -> float | None:
@@ -90,12 +92,12 @@ def show_flows(
                 line += _beside_truth(flow, outputs.truth, window)
             say(line)
             if writer:
-                writer.add(window, flow, tensor, outputs.truth)
+                writer.add(window, flow, tensor, outputs.truth, at_events=outputs.at_events)
             if shown:
                 began = window.new.t0 if count == 1 else began
                 # Times may be Unix times; captions count from the first window.
                 caption = f"{(window.new.t1 - window.new.t0) / 1000:g} ms at {(window.t_us - began) / 1e6:.3f} s"
-                shown.add(caption, events_of(tensor), flow)
+                shown.add(caption, events_of(tensor), flow, near_events(tensor))
         if not count:
             raise BlinkGLError(
                 f"shorter than {'two windows' if 'old' in reads else 'a window'} of {span / 1000:g} ms",
@@ -153,9 +155,7 @@ def _second_opinion(file, predictor, span: int, start: int, reads: Sequence[str]
 
 def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:
     """Return two lines: errors over all pixels with truth, and over those with events."""
-    valid, hit, lines = np.isfinite(truth).all(-1), np.zeros(truth.shape[:2], bool), ""
-    for part in (window.new, window.old):
-        hit[part.y, part.x] = True
+    valid, hit, lines = np.isfinite(truth).all(-1), hit_pixels((window.old, window.new), *truth.shape[:2]), ""
     for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
         m, zero = frame_metrics(flow, truth, mask), frame_metrics(np.zeros_like(flow), truth, mask)
         if m:

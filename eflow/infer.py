@@ -27,7 +27,7 @@ from eflow.methods import Method
 from eflow.methods.contrast import sharpest_length
 from eflow.models import FlowModel, FlowPrediction
 from eflow.ops.warp import forward_warp
-from eflow.pictures import comparison, events_of, write_picture
+from eflow.pictures import comparison, events_of, near_events, write_picture
 
 PICTURED = VoxelGrid(bins=2, normalise="none")
 """Grid for the pictures of a method, which reads events and no grid."""
@@ -357,16 +357,22 @@ class FlowWriter:
         flow: np.ndarray,
         tensor: np.ndarray,
         truth: np.ndarray | None = None,
+        at_events: bool = False,
     ) -> None:
-        """Write one window.   flow : (H, W, 2) px.   tensor : the new window's events, as a predictor returns them."""
+        """Write one window.   flow : (H, W, 2) px.   tensor : the new window's events, as a predictor returns them.
+        at_events : flow of pixels without events nearby is not valid, NaN in ``npy/``."""
         name, valid, flow = f"{self.count:06d}", np.isfinite(flow).all(-1), flow.astype(np.float32, copy=False)
+        near = near_events(tensor)
+        if at_events:
+            valid &= near
         write_flow_png(self._tmp / f"{name}.png", flow, valid)
         with output_errors(self.final):
             if self.npy:
-                self._part("npy", f"{name}.npy").write_bytes(encode_npy(flow))
+                values = np.where(valid[..., None], flow, np.float32(np.nan)) if at_events else flow
+                self._part("npy", f"{name}.npy").write_bytes(encode_npy(values))
             if self.pictures:
                 where = None if truth is None else np.isfinite(truth).all(-1)
-                strip = comparison(events_of(tensor), flow, truth, where)
+                strip = comparison(events_of(tensor), flow, truth, where, near=near)
                 write_picture(self._part("pictures", f"{name}.png"), strip)
         self._lines.append(f"{window.new.t0}, {window.new.t1}")
         self.count += 1

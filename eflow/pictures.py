@@ -6,6 +6,7 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
+import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -17,6 +18,8 @@ from blinkgl.io.video import VideoWriter
 _GAP, BAR = 4, 18
 """Gap between panels and height of the bar of captions above them, px."""
 _STEADY = 0.95
+NEAR_PX = 3
+"""Distance from a pixel within which its events tell its flow."""
 _HEAT = np.array([[0, 0, 0], [70, 0, 90], [190, 40, 60], [250, 150, 30], [255, 250, 190]], np.float32)
 
 
@@ -37,6 +40,12 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
     return event_colour(np.stack([level(-tensor), level(tensor)]))
 
 
+def near_events(tensor: np.ndarray) -> np.ndarray:
+    """Return the pixels of an event tensor (C, H, W) with an event within ``NEAR_PX``, (H, W) bool."""
+    hit = (tensor != 0).any(axis=0).astype(np.uint8)
+    return cv2.dilate(hit, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
+
+
 def comparison(
     events: np.ndarray,
     predicted: np.ndarray,
@@ -45,22 +54,25 @@ def comparison(
     *,
     largest: float | None = None,
     caption: str = "events",
+    near: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return one RGB strip: events | ground truth | prediction | error; without truth events | prediction.
 
     A bar of :data:`BAR` px above names each panel and the length of flow at full colour. Flow panels share one scale:
     ``largest`` px, or the 99th percentile of the true speed (without truth, of the predicted speed).
-    events : (H, W, 3) uint8; flows (H, W, 2) px. caption : of the events."""
+    events : (H, W, 3) uint8; flows (H, W, 2) px. caption : of the events.   near : (H, W) bool; elsewhere predicted
+    flow is pale, since no event tells it."""
+    coloured = lambda: _paled(flow_colour(predicted, largest), near)
     panels = [(caption, events)]
     if truth is None or valid is None or not valid.any():
         largest = largest or full_colour(predicted)
-        panels.append((f"flow, full colour {largest:.3g} px", flow_colour(predicted, largest)))
+        panels.append((f"flow, full colour {largest:.3g} px", coloured()))
     else:
         largest = largest or full_colour(truth[valid])
         error, pale = np.hypot(*(np.moveaxis(predicted - truth, -1, 0))), max(3.0, largest / 2)
         panels += [
             (f"truth, full colour {largest:.3g} px", flow_colour(truth, largest, valid)),
-            ("predicted", flow_colour(predicted, largest)),
+            ("predicted", coloured()),
             (f"error, pale {pale:.3g} px", error_colour(error, pale, valid)),
         ]
     height, width = events.shape[:2]
@@ -72,6 +84,12 @@ def comparison(
         ImageDraw.Draw(bar).text((2, 2), text, (40, 40, 40), font=font)
         strip[:BAR, left : left + width], strip[BAR:, left : left + width] = np.asarray(bar), panel
     return strip
+
+
+def _paled(picture: np.ndarray, near: np.ndarray | None) -> np.ndarray:
+    if near is None:
+        return picture
+    return np.where(near[..., None], picture, (0.25 * picture + 0.75 * 255).astype(np.uint8))
 
 
 def full_colour(flow: np.ndarray) -> float:
@@ -100,11 +118,12 @@ class FlowVideo:
             self._opened = opened.pop_all()
         return self
 
-    def add(self, caption: str, events: np.ndarray, flow: np.ndarray) -> None:
+    def add(self, caption: str, events: np.ndarray, flow: np.ndarray, near: np.ndarray | None = None) -> None:
         """Add one window.   caption : text above the events, e.g. their time.   events : (H, W, 3) uint8; flow (H, W,
-        2) px."""
-        self._largest = max(_STEADY * self._largest, full_colour(flow))
-        self._video.write(self._fit(comparison(events, flow, largest=self._largest, caption=caption)))
+        2) px.   near : as of :func:`comparison`."""
+        told = flow if near is None or not near.any() else flow[near]
+        self._largest = max(_STEADY * self._largest, full_colour(told))
+        self._video.write(self._fit(comparison(events, flow, largest=self._largest, caption=caption, near=near)))
 
     def _fit(self, strip: np.ndarray) -> np.ndarray:
         """Return the strip enlarged and padded to an even height and width, which the codec needs."""

@@ -6,6 +6,7 @@ the transforms of voxel grids.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +67,16 @@ class Window:
         return Window(*columns, self.t0, self.t1)
 
 
+def hit_pixels(windows: Iterable[Window], height: int, width: int) -> np.ndarray:
+    """Return the pixels with an event in one of the windows, (H, W) bool; events outside are left out."""
+    found = np.zeros((height, width), bool)
+    for w in windows:
+        x, y = (np.rint(c).astype(np.int64) for c in (w.x, w.y))
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        found[y[inside], x[inside]] = True
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class RawSample:
     """A sample as a source returns it, before augmentation and grids.
@@ -91,13 +102,8 @@ class RawSample:
 
     @property
     def hit(self) -> np.ndarray:
-        """The pixels with an event in either window, (H, W) bool."""
-        found = np.zeros((self.height, self.width), bool)
-        for w in (self.old, self.new):
-            x, y = (np.rint(c).astype(np.int64) for c in (w.x, w.y))
-            inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
-            found[y[inside], x[inside]] = True
-        return found
+        """Return the pixels with an event in either window, (H, W) bool."""
+        return hit_pixels((self.old, self.new), self.height, self.width)
 
     def flip(self, axis: str) -> RawSample:
         """Return the sample mirrored horizontally (axis "x") or vertically ("y")."""

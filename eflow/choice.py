@@ -1,0 +1,68 @@
+"""Which of the networks that come with the package suits a recording: the one for a moving camera, or for bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from blinkgl.io.formats import EventFile
+from eflow import infer
+from eflow.data.window import hit_pixels
+from eflow.flow_of_file import WindowsAsked
+
+AUTO = "auto"
+CAMERA, BODIES = "real_small", "real_bodies"
+AFFINE = 0.33
+"""Mean distance of the flow from its nearest affine field, as a share of its mean length, below which only the camera
+moves. Medians of three windows were .15 to .26 for eight recordings of moving cameras, and .42 to .88 for 24 simulated
+sequences of independent bodies (docs/results_eflow.md)."""
+_PLACES = (0.25, 0.5, 0.75)
+
+
+def chosen(file: EventFile, asked: WindowsAsked, load: Callable[[str], infer.Predictor]) -> tuple[str, str]:
+    """Return (name of a network, the line that says why): by the flow of :data:`BODIES`, which reads two windows, at
+    three places of the recording. load : makes the predictor of a network."""
+    distances = []
+    predictor = load(BODIES)
+    for pair in _pairs(file, asked, predictor):
+        if len(pair.old) and len(pair.new):
+            flow, _ = predictor(pair)
+            distances.append(from_affine(flow, hit_pixels((pair.old, pair.new), file.height, file.width)))
+    if not distances:
+        return CAMERA, f"{CAMERA}, since there is no pair of windows with events ({BODIES} needs two)"
+    distance = float(np.median(distances))
+    name, moves = (CAMERA, "only the camera moves") if distance < AFFINE else (BODIES, "bodies move their own ways")
+    return name, f"{name}, since {moves}: the flow is {100 * distance:.0f} % of its length off an affine field"
+
+
+def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> Iterator[infer.StreamWindow]:
+    if asked.whole:
+        yield infer.whole_file(file)[0]
+        return
+    ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
+    if not ends:
+        return
+    first, last = ends[0][0], ends[-1][1]
+    start, end = (None if ms is None else first + round(ms * 1000) for ms in (asked.start_ms, asked.end_ms))
+    first, last = max(first, start or first), min(last, end or last)
+    span = infer.likely_span(file, predictor)[0] if asked.milliseconds is None else round(asked.milliseconds * 1000)
+    for place in _PLACES:
+        begin = max(first, min(round(first + place * (last - first)) - span, last + 1 - 2 * span))
+        pair = next(infer.windows(file, span, start_us=begin, end_us=last + 1), None)
+        if pair is not None:
+            yield pair
+
+
+def from_affine(flow: np.ndarray, hit: np.ndarray) -> float:
+    """Return the mean distance of the flow (H, W, 2) px from the affine field nearest to most of it, at the pixels
+    ``hit`` (H, W), as a share of its mean length there."""
+    y, x = np.nonzero(hit)
+    basis = np.stack([np.ones(len(x)), x / flow.shape[1], y / flow.shape[0]], axis=1)
+    field, weight = flow[hit].astype(np.float64), np.ones(len(x))
+    for _ in range(8):  # least absolute distances, by reweighted least squares
+        root = np.sqrt(weight)[:, None]
+        fit = np.linalg.lstsq(basis * root, field * root, rcond=None)[0]
+        distance = np.hypot(*(field - basis @ fit).T)
+        weight = 1 / np.maximum(distance, 0.1)
+    return float(distance.mean() / max(np.hypot(*field.T).mean(), 1e-9))

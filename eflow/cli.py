@@ -17,8 +17,10 @@ from blinkgl.machine.interrupts import interruptible
 from eflow.cli_arguments import (
     Answer,
     Dataset,
+    Dense,
     Device,
     Focal,
+    Frames,
     GroundTruth,
     Iterations,
     Network,
@@ -39,6 +41,7 @@ from eflow.cli_arguments import (
     network_of,
     one_of,
     precision_for,
+    ranges_of,
     rendered,
     windows_of,
 )
@@ -169,11 +172,14 @@ def evaluate(
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     protocol: Protocol = "all",
     ground_truth: GroundTruth = None,
+    frames: Frames = None,
+    dense: Dense = False,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Iterations = None,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     sharpen: Sharpened = False,
+    warm_start: WarmStart = False,
     raw: Raw = False,
     focal: Focal = None,
     precision: Precision = "fp32",
@@ -186,9 +192,9 @@ def evaluate(
     from eflow.evaluate import evaluate as score, show
 
     one_of("--empty", empty, ("error", "skip"))
-    model = method_named(checkpoint, focal, iterations=iterations, raw=raw)
+    model = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     if model is None:
-        model = network_of(checkpoint, device, raw, precision, iterations)
+        model = network_of(checkpoint, device, raw, precision, iterations, warm_start)
         precision = precision_for(model, precision)
     console = plain_console(stderr=True)
     if dataset.endswith((".yaml", ".yml")):
@@ -197,7 +203,8 @@ def evaluate(
     elif window_ms is not None:
         raise ConfigError("needs a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        source = open_source(dataset, known_format(format), dt=dt, protocol=protocol, truth=ground_truth)
+        mvsec = {"protocol": protocol, "truth": ground_truth, "frames": ranges_of(frames), "dense": dense}
+        source = open_source(dataset, known_format(format), dt=dt, **mvsec)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -208,6 +215,7 @@ def evaluate(
             precision=precision,
             limit=limit,
             sharpen=sharpen,
+            warm_start=warm_start,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
     show(result)
@@ -281,7 +289,7 @@ def predict(
     outputs = Outputs(out, video, npy, infer.read_truth(truth, *shape) if truth else None, at_events)
 
     def predictor_of(name: str, **options) -> infer.Predictor:
-        model = network_of(name, device, raw, precision, iterations)
+        model = network_of(name, device, raw, precision, iterations, options.get("warm_start", False))
         return infer.Predictor(model, *shape, precision=precision_for(model, precision), empty=empty, **options)
 
     if checkpoint == AUTO and not Path(AUTO).exists():
@@ -304,6 +312,7 @@ def submit(
     benchmark: Annotated[str, typer.Option(help="dsec or blinkflow.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New zip file.")],
     full: Annotated[bool, typer.Option("--full", help="BlinkFlow: all pixels instead of one per 4x4 cell.")] = False,
+    warm_start: WarmStart = False,
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
@@ -312,10 +321,11 @@ def submit(
     from eflow.submit import submit_blinkflow, submit_dsec
 
     one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
-    model = network_of(checkpoint, device, False, precision)
+    model = network_of(checkpoint, device, False, precision, warm_start=warm_start)
     precision = precision_for(model, precision)
     with plain_console(stderr=True).status("predicting") as status:
-        options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
+        progress = lambda i, n: status.update(f"{i}/{n} flows")
+        options = {"precision": precision, "warm_start": warm_start, "progress": progress}
         count = (
             submit_dsec(model, dataset, out, **options)
             if benchmark == "dsec"

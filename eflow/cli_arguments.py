@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,6 +59,11 @@ GroundTruth = Annotated[
         help="MVSEC: propagated (through the 20 Hz flow) or scaled (one field). Default: the protocol's.",
     ),
 ]
+Frames = Annotated[
+    list[str] | None,
+    typer.Option("--frames", metavar="FIRST-LAST", help="MVSEC: images (or 20 Hz fields) to score; may be repeated."),
+]
+Dense = Annotated[bool, typer.Option("--dense", help="MVSEC: score pixels without events, too.")]
 Sharpened = Annotated[
     bool, typer.Option("--sharpen", help="Scale the flow of a network to the length that makes the events sharpest.")
 ]
@@ -92,7 +98,18 @@ def method_named(name: str, focal: float | None, **network: object):
     return make_method(name, focal)
 
 
-def network_of(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):
+def ranges_of(frames: list[str] | None) -> tuple[tuple[int, int], ...]:
+    """Return the ranges [first, end) of ``--frames``. Raises ConfigError."""
+    found = [re.fullmatch(r"(\d{1,9})-(\d{1,9})", text) for text in frames or ()]
+    for text, one in zip(frames or (), found):
+        if one is None or int(one[1]) > int(one[2]):
+            raise ConfigError("not a range of frames", where="--frames", value=text, accepted="FIRST-LAST: 200-800")
+    return tuple((int(one[1]), int(one[2]) + 1) for one in found if one)
+
+
+def network_of(
+    checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None, warm_start: bool = False
+):
     """Return the trained network on its device. Raises ConfigError: this network or machine lacks an option."""
     import torch
 
@@ -105,9 +122,10 @@ def network_of(checkpoint: str, device: str, raw: bool, precision: str, iteratio
         raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
     keep_memory()
     model = load_model(checkpoint, averaged=not raw)
+    for option, given in (("--iterations", iterations is not None), ("--warm-start", warm_start)):
+        if given and not hasattr(model.config, "iterations"):
+            raise ConfigError("this network has no iterations", where=option, value=model.config.name)
     if iterations is not None:
-        if not hasattr(model.config, "iterations"):
-            raise ConfigError("this network has no iterations", where="--iterations", value=model.config.name)
         model.config = model.config.model_copy(update={"iterations": iterations})
     return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 

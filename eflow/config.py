@@ -196,7 +196,9 @@ class AugmentConfig(Config):
     hot_rate: float = Field(500.0, ge=0, le=1e6, description="largest rate of a hot pixel, events/s")
     noise_probability: Probability = Field(0.3, description="probability of adding background noise")
     noise_rate: float = Field(1.0, ge=0, le=1e4, description="largest rate of background noise, events/s per pixel")
-    scale_probability: Probability = Field(0.3, description="probability of scaling; needs data.crop")
+    scale_probability: Probability = Field(
+        0.3, description="probability of scaling; needs data.crop (sparse labels take the nearest pixel's)"
+    )
     scale: tuple[float, float] = Field((-0.2, 0.5), description="log2 of the scale factor, [low, high]")
 
     @rule("scale")

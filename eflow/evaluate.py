@@ -21,7 +21,7 @@ from blinkgl.machine.terminal import plain_console
 from blinkgl.sequence_files.sequence_dir import refuse_existing
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
-from eflow.infer import PICTURED, predict
+from eflow.infer import PICTURED, WarmStart, predict
 from eflow.methods import Method
 from eflow.methods.contrast import sharpest_length
 from eflow.metrics import NAMES, Tally, frame_metrics
@@ -45,6 +45,7 @@ def evaluate(
     precision: str = "fp32",
     limit: int | None = None,
     sharpen: bool = False,
+    warm_start: bool = False,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> dict[str, Any]:
     """Score ``model``, or a method that needs no training, on every labelled sample of ``source``.
@@ -54,6 +55,7 @@ def evaluate(
     limit : score only this many samples, evenly spaced.
     sharpen : scale the flow of a network to the length that makes the events of its windows sharpest, as `eflow
     predict` does.
+    warm_start : start the refinement of a sample whose new window follows the previous sample's from its flow.
     progress : called with (samples done, samples in all, AEE so far).
     empty : samples with an empty window: "error", or "skip" leaves them out, for every network the same ones.
     Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped" (no valid pixel), "left_out"
@@ -72,23 +74,25 @@ def evaluate(
     shown = {indices[k] for k in _evenly(len(indices), pictures)}
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
-    spent, sum_aee, scored, left_out = 0.0, 0.0, 0, 0
+    spent, sum_aee, scored, left_out, warm = 0.0, 0.0, 0, 0, WarmStart()
     for done, i in enumerate(indices, 1):
         if (sample := dataset[i]) is None:
             left_out += 1
             continue
         batch = collate([sample])
-        raw = batch["raw"][0]
+        raw, scene = batch["raw"][0], batch["scene"][0]
         began = time.perf_counter()
         if method is None:
-            flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
+            prediction = predict(model, warm.begin(batch, (scene, raw.new.t0)), precision=precision)
+            if warm_start:
+                warm.end(prediction, (scene, raw.new.t1))
+            flow = prediction.flow[0].permute(1, 2, 0).cpu().numpy()
             if sharpen:
                 flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow)[0])
         else:
             flow = method(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began
         truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
-        scene = batch["scene"][0]
         metrics = frame_metrics(flow, truth, valid)
         tallies["network"].add(scene, metrics)
         for name, constant in zip(BASELINES, (np.zeros(2), median, *_from_truth(truth, valid)), strict=True):
@@ -108,6 +112,7 @@ def evaluate(
         "samples": len(indices) - left_out,
         "skipped": tallies["network"].skipped,
         "left_out": left_out,
+        **({"warm": warm.count} if warm_start else {}),
         "ms": 1000 * spent / (len(indices) - left_out),
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
     }
@@ -188,6 +193,8 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
         for scene, scores in scenes.items():
             table.add_row(scene, str(scores["frames"]), *(f"{scores[c]:.3f}" for c in columns))
         console.print(table)
+    if "warm" in result:
+        console.print(f"{result['warm']} samples follow the one before and were started from its flow")
     for key, what in (("skipped", "without a valid pixel"), ("left_out", "with an empty window")):
         if result[key]:
             console.print(f"{result[key]} samples {what} are left out")

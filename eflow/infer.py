@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -241,6 +241,26 @@ class MethodPredictor:
             ) from None
 
 
+class WarmStart:
+    """Starts the refinement of each window from the flow of the previous one, moved along itself, where it follows it.
+
+    ``count`` : windows that did."""
+
+    def __init__(self):
+        self._end, self._low, self.count = None, None, 0
+
+    def begin(self, batch: dict, start: Hashable) -> dict:
+        """Return the batch with the initial flow, if a window ended at ``start``: a time, or a sequence and a time."""
+        if self._low is None or start != self._end:
+            return batch
+        self.count += 1
+        return {**batch, "flow_init": forward_warp(self._low)}
+
+    def end(self, prediction: FlowPrediction | None, end: Hashable) -> None:
+        """Keep the flow of the window that ends at ``end``; None: it has none."""
+        self._end, self._low = end, None if prediction is None else prediction.low
+
+
 class Predictor:
     """A model that is called with the windows of a stream, one after the other.
 
@@ -261,8 +281,8 @@ class Predictor:
         sharpen: bool = False,
     ):
         self.model, self.height, self.width = model, height, width
-        self.warm_start, self.precision, self.empty, self.sharpen = warm_start, precision, empty, sharpen
-        self._low: torch.Tensor | None = None
+        self.precision, self.empty, self.sharpen = precision, empty, sharpen
+        self._warm = WarmStart() if warm_start else None
         self.unsharpened: Counter[str] = Counter()
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
@@ -279,13 +299,15 @@ class Predictor:
         grids = {name: self.model.representation(w, self.height, self.width) for name, w in read.items()}
         new = grids["new"]
         if not all(len(w) for w in read.values()):
-            self._low = None
+            if self._warm is not None:
+                self._warm.end(None, None)
             return np.zeros((self.height, self.width, 2), np.float32), new
         batch = {name: torch.from_numpy(grid)[None] for name, grid in grids.items()}
-        if self.warm_start and self._low is not None:
-            batch["flow_init"] = forward_warp(self._low)
+        if self._warm is not None:
+            batch = self._warm.begin(batch, window.new.t0)
         prediction = predict(self.model, batch, precision=self.precision)
-        self._low = prediction.low
+        if self._warm is not None:
+            self._warm.end(prediction, window.new.t1)
         flow = prediction.flow[0].permute(1, 2, 0).cpu().numpy()
         if self.sharpen:
             follows = len(window.old) and window.old.t1 == window.new.t0

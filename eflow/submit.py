@@ -6,7 +6,7 @@ import io
 import os
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from blinkgl.io.flow import encode_flow_png
 from blinkgl.io.images import encode_png
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import FolderSource, open_source
-from eflow.infer import predict
+from eflow.infer import WarmStart, predict
 from eflow.models import FlowModel
 
 DSEC_SEQUENCES = (
@@ -41,6 +41,7 @@ def submit_dsec(
     *,
     sequences: tuple[str, ...] = DSEC_SEQUENCES,
     precision: str = "fp32",
+    warm_start: bool = False,
     progress: Progress | None = None,
 ) -> int:
     """Write a zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's CSV; return the number
@@ -64,7 +65,7 @@ def submit_dsec(
         raise AssetError("a file index is listed twice", where=str(root))
     with atomic_file(out, overwrite=False) as temporary:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            for i, flow in _flows(model, source, precision, progress):
+            for i, flow in _flows(model, source, precision, warm_start, progress):
                 sequence, entry = source.entry(i)
                 _member(
                     archive,
@@ -118,6 +119,7 @@ def submit_blinkflow(
     *,
     full: bool = False,
     precision: str = "fp32",
+    warm_start: bool = False,
     progress: Progress | None = None,
 ) -> int:
     """Write a zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the format of the benchmark, with one pixel per 4x4 cell
@@ -131,7 +133,7 @@ def submit_blinkflow(
     sizes: dict[str, tuple[int, int]] = {}
     with atomic_file(out, overwrite=False) as temporary:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for i, flow in _flows(model, source, precision, progress):
+            for i, flow in _flows(model, source, precision, warm_start, progress):
                 if not np.isfinite(flow).all():
                     raise OutputError("flow is not finite", where=name(i))
                 _member(archive, name(i), encode_full(flow) if full else encode_sampled(flow))
@@ -180,11 +182,19 @@ def decode(data: bytes) -> np.ndarray:
         raise AssetError("not a BlinkFlow submission file", value=data[:12]) from None
 
 
-def _flows(model: FlowModel, source: FolderSource, precision: str, progress: Progress | None):
-    dataset = FlowDataset([source], model.representation, empty="error", reads=model.reads)
+def _flows(
+    model: FlowModel, source: FolderSource, precision: str, warm_start: bool, progress: Progress | None
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield (number, flow) of every sample; with ``warm_start`` those that follow the one before start from its
+    flow."""
+    dataset, warm = FlowDataset([source], model.representation, raw=True, reads=model.reads), WarmStart()
     for i in range(len(dataset)):
-        flow = predict(model, collate([dataset[i]]), precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
-        yield i, flow
+        batch = collate([dataset[i]])
+        raw = batch["raw"][0]
+        prediction = predict(model, warm.begin(batch, (raw.scene, raw.new.t0)), precision=precision)
+        if warm_start:
+            warm.end(prediction, (raw.scene, raw.new.t1))
+        yield i, prediction.flow[0].permute(1, 2, 0).cpu().numpy()
         if progress is not None:
             progress(i + 1, len(dataset))
 

@@ -23,6 +23,7 @@ from eflow.data.window import RawSample
 
 ENDLESS = 4096
 """Number of samples of an endless source in an epoch."""
+SPARSE = 0.5
 MOST_TRIES = 1000
 """Samples in a row that may have no events, or no valid pixel."""
 MAX_FLOW = 400.0
@@ -259,13 +260,16 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
     """Return a sample scaled by ``factor``, but not below the size ``least`` = (H, W).
 
     Grids and flow are bilinear; flow is multiplied by the exact factor of each axis. A pixel is valid only if all four
-    contributing pixels are."""
+    contributing pixels are. Of sparse truth (less than ``SPARSE`` is valid), of which hardly any pixel would be, each
+    pixel takes the flow and validity of the nearest one."""
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
     out = {**sample, **{k: resize(sample[k]) for k in ("old", "new") if k in sample}}
     if "flow" in sample:
         ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]
+        if sample["valid"].float().mean() < SPARSE:
+            resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="nearest-exact")[0]
         out["flow"] = resize(torch.where(sample["valid"], sample["flow"], 0)) * ratio
         for k in ("valid", "mask"):
             out[k] = resize(sample[k][None].float())[0] > 0.999

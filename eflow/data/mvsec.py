@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -97,13 +98,22 @@ class MvsecSource:
     Times: µs since the sequence's first image.
 
     protocol : of :data:`PROTOCOLS`; at "flow" the windows of a sample are between time stamps i - 1, i, i + 1 of the
-    flow.   truth : of :data:`TRUTHS`; None: that of the protocol.
+    flow.   truth : of :data:`TRUTHS`; None: that of the protocol.   frames : ranges [first, end) of images or flow
+    fields to score, in place of the protocol's.   dense : score pixels without events, too.
     Raises AssetError: no sequence, or one without the frames that the protocol scores. EventDataError: bad dt.
     ConfigError: unknown protocol or truth."""
 
     has_backward = False
 
-    def __init__(self, root: Path, dt: int = 1, protocol: str = "all", truth: str | None = None):
+    def __init__(
+        self,
+        root: Path,
+        dt: int = 1,
+        protocol: str = "all",
+        truth: str | None = None,
+        frames: Sequence[tuple[int, int]] = (),
+        dense: bool = False,
+    ):
         if dt not in (1, 4):
             raise EventDataError("MVSEC interval", where="dt", value=dt, accepted="1 or 4")
         for name, value, known in (("protocol", protocol, PROTOCOLS), ("truth", truth or TRUTHS[0], TRUTHS)):
@@ -116,6 +126,7 @@ class MvsecSource:
         if not files:
             raise AssetError("no *_data.hdf5", where=str(root))
         self.dt, self.truth, self._index, self._sequences = dt, truth or self.protocol.truth, [], []
+        self.dense = dense
         for path in files:
             self._sequences.append(s := _MvsecSequence(path))
             stamps = self._stamps(s)
@@ -123,11 +134,11 @@ class MvsecSource:
             i0, i1 = np.searchsorted(stamps, (s.flow_us[0], s.flow_us[-1]))
             end = i1 + 1 if self.protocol.at == "flow" else i1  # the last stamp is the end of a sample
             found = range(max(int(i0), dt), min(int(end), len(stamps)) - dt)
-            ranges = self.protocol.frames.get(s.name)
+            ranges = tuple(frames) or self.protocol.frames.get(s.name)
             scored = [i for i in found if ranges is None or any(a <= i < b for a, b in ranges)]
             if not scored and ranges is not None:
                 raise AssetError(
-                    f"has no frame that {protocol} scores",
+                    f"has no frame that {'--frames' if frames else protocol} scores",
                     where=str(path),
                     value=f"{found.start} to {found.stop - 1}",
                     accepted=" and ".join(f"{a} to {b - 1}" for a, b in ranges),
@@ -145,7 +156,7 @@ class MvsecSource:
         t_old, t, t_new = (int(self._stamps(s)[j]) for j in (i - self.dt, i, i + self.dt))
         old, new = s.window(t_old, t), s.window(t, t_new)
         flow, valid = s.flow_between(t, t_new, self.truth)
-        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask = np.full((HEIGHT, WIDTH), self.dense)
         mask[new.y, new.x] = True
         inside = np.zeros_like(mask)
         top, left = (HEIGHT - CROP) // 2, (WIDTH - CROP) // 2

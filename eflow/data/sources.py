@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sized
 from dataclasses import dataclass
 from fnmatch import filter as matching
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -400,22 +400,20 @@ def detect_format(root: Path) -> str:
     )
 
 
-def open_source(
-    path: str | os.PathLike, format: str = "auto", *, dt: int = 1, protocol: str = "all", truth: str | None = None
-) -> Source:
+def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1, **mvsec: Any) -> Source:
     """Open the data set at ``path``.
 
-    dt, protocol, truth : for MVSEC only, see :class:`~eflow.data.mvsec.MvsecSource`.
-    Raises ConfigError: protocol or truth for another data set. AssetError: no data set, or a damaged index. Files of
+    dt, and ``protocol``, ``truth``, ``frames``, ``dense`` : for MVSEC, see :class:`~eflow.data.mvsec.MvsecSource`.
+    Raises ConfigError: one of these for another data set. AssetError: no data set, or a damaged index. Files of
     single samples are opened when they are read."""
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
         from eflow.data.mvsec import MvsecSource
 
-        return MvsecSource(root, dt, protocol, truth)
-    for name, value in (("protocol", protocol), ("truth", truth)):
-        if value not in ("all", None):
+        return MvsecSource(root, dt, **mvsec)
+    for name, value in mvsec.items():
+        if value not in ("all", None, (), False):
             raise ConfigError("only for MVSEC", where=name, value=value, accepted="a data set in the layout of MVSEC")
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")

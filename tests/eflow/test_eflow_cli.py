@@ -15,6 +15,7 @@ torch = pytest.importorskip("torch")
 from shared_data import shared  # noqa: E402
 
 import eflow  # noqa: E402
+from blinkgl.io.flow import read_flow_png  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from blinkgl.types.events import Events  # noqa: E402
 from eflow import checkpoint as ckpt, infer, submit  # noqa: E402
@@ -155,6 +156,56 @@ def test_warm_start_runs(refined, tmp_path, capsys):
         assert run(["predict", refined, str(tmp_path / "e.h5"), "--window-ms", "70", *flag]) == 0
         outputs.append(capsys.readouterr().out.splitlines())
     assert outputs[0][0] == outputs[1][0] and outputs[0][1:] != outputs[1][1:]
+
+
+def test_scoring_starts_warm_where_samples_follow(refined, network, tmp_path, capsys):
+    """Windows of 100 ms, one behind the other: in each sequence all but the first, and another result."""
+    data, results = str(blinkgl_set(tmp_path / "data", sequences=2, labels=3)), []
+    for flag in ([], ["--warm-start"]):
+        out = tmp_path / f"scores{len(flag)}"
+        assert run(["evaluate", refined, data, "--out", str(out), *flag]) == 0
+        results.append(json.loads((out / "results.json").read_text()))
+    assert "warm" not in results[0] and results[1]["warm"] == 4
+    assert "4 samples follow the one before" in capsys.readouterr().out
+    assert results[0]["methods"]["network"] != results[1]["methods"]["network"]
+    assert run(["evaluate", network, data, "--warm-start"]) == 2
+    assert "--warm-start: this network has no iterations (got 'ev_flownet')" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["5", "9-3", "a-b", "1-2-3", "-1-4"])
+def test_ranges_of_frames(network, tmp_path, text, capsys):
+    assert run(["evaluate", network, str(tmp_path), "--format", "mvsec", f"--frames={text}"]) == 2
+    assert f"--frames: not a range of frames (got '{text}'); expected FIRST-LAST" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("moving", "name"), [("camera", "real_small"), ("bodies", "real_bodies"), ("nothing before", "real_small")]
+)
+def test_a_network_is_chosen_by_what_moves(moving, name, tmp_path, capsys):
+    """A texture that slides by, or of which halves slide apart; of a file of one window there is no pair."""
+    late = 100_000 if moving == "nothing before" else 0
+    parts = [moving_events(128, 128, late, 4 * SPAN // 2, velocity=(60.0, 10.0), n=30_000)]
+    if moving == "bodies":
+        other = moving_events(128, 128, late, 4 * SPAN // 2, velocity=(-60.0, 30.0), n=30_000, seed=3)
+        band = lambda e: (e.x // 32) % 2 == 0
+        both = Events.concatenate([parts[0].part(band(parts[0])), other.part(~band(other))])
+        parts = [both.part(np.argsort(both.t, kind="stable"))]
+    path = tmp_path / "e.h5"
+    write_events(path, parts[0], 128, 128)
+    assert run(["predict", *([] if moving == "camera" else ["auto"]), str(path), "--window-ms", "90"]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith(f"network: {name}, since ")
+    assert {"camera": "only the camera moves", "bodies": "bodies move", "nothing before": "no pair"}[moving] in first
+
+
+def test_flow_without_events_nearby_is_written_as_not_valid(network, tmp_path):
+    events = moving_events(128, 144, 0, 3 * SPAN, n=9000)
+    write_events(tmp_path / "e.h5", events.part(events.x < 60), 128, 144)
+    out = tmp_path / "flow"
+    assert run(["predict", network, str(tmp_path / "e.h5"), "--out", str(out), "--npy", "--at-events"]) == 0
+    _, valid = read_flow_png(out / "000000.png")
+    assert valid[:, :60].mean() > 0.5 and not valid[:, 63:].any()
+    assert (np.isfinite(np.load(out / "npy/000000.npy")).all(-1) == valid).all()
 
 
 @pytest.mark.parametrize(("burst", "limit"), [("boxes_rotation", 0.15), ("shapes_rotation", 0.1)])

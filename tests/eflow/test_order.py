@@ -83,6 +83,22 @@ def test_scale_scales_flow_by_the_true_factor():
     assert scaled(sample, 0.5, least=(32, 32))["new"].shape == (15, 32, 32)
 
 
+def test_sparse_truth_survives_scaling():
+    """A twentieth of the pixels is valid, as of a lidar: as many are after scaling, each with its neighbour's flow."""
+    h, w = 60, 80
+    torch.manual_seed(0)
+    v, u = torch.meshgrid(torch.arange(h) * 1.0, torch.arange(w) * 1.0, indexing="ij")
+    valid = torch.rand(h, w) < 0.05
+    flow = torch.where(valid, torch.stack([0.1 * u, -0.2 * v]), torch.nan)
+    sample = {"new": torch.rand(2, h, w), "flow": flow, "valid": valid, "mask": torch.ones(h, w, dtype=torch.bool)}
+    for factor in (0.7, 1.5):
+        out = scaled(sample, factor)
+        assert out["valid"].float().mean() == pytest.approx(0.05, rel=0.15)
+        y, x = torch.nonzero(out["valid"], as_tuple=True)
+        expected = torch.stack([0.1 * (x + 0.5) - 0.05 * factor, -0.2 * (y + 0.5) + 0.1 * factor])
+        assert (out["flow"][:, y, x] - expected).abs().max() < 0.2 * factor  # a pixel's flow, as far as the next one
+
+
 def test_refusals(source, tmp_path):
     sample = FlowDataset([source], VoxelGrid())[0]
     with pytest.raises(BlinkGLError, match="data.crop, .*: sample is smaller than the crop"):

@@ -107,6 +107,19 @@ def test_mvsec_frames_of_a_protocol(tmp_path, monkeypatch):
     assert rows[0] == 2 and rows[-1] == 191 and MvsecSource(root)[1].mask[192].any()
 
 
+def test_mvsec_frames_and_pixels_of_ones_own(tmp_path):
+    root = outdoor(tmp_path)
+    source = MvsecSource(root, frames=((2, 4), (7, 8)), dense=True)
+    assert [s.name[-1] for s in source] == ["2", "3", "7"]
+    sparse = MvsecSource(root, frames=((2, 3),))[0].mask
+    # The whole centre crop above the hood: rows 2 to 192, columns 45 to 300.
+    assert source[0].mask.sum() == (193 - 2) * 256 > sparse.sum() and not (sparse & ~source[0].mask).any()
+    with pytest.raises(AssetError, match="has no frame that --frames scores .*expected 90 to 99"):
+        MvsecSource(root, frames=((90, 100),))
+    with pytest.raises(ConfigError, match="frames: only for MVSEC"):
+        open_source(blinkgl_set(tmp_path / "b", 1, 1), frames=((0, 1),))
+
+
 def test_both_conventions_of_mvsecs_ground_truth(tmp_path):
     """Images at 31 Hz, flow at 20: image 3 is at 96.8 ms, and its interval goes over the stamp at 100."""
     root = outdoor(tmp_path)

@@ -14,7 +14,7 @@ from eflow.config import EraftConfig
 from eflow.data.representation import VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
 from eflow.ops.correlation import DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, channels_of, pixel_grid
-from eflow.ops.upsample import convex_upsample, convex_upsample_slow
+from eflow.ops.upsample import convex_upsample
 from eflow.precision import fp32
 
 
@@ -140,14 +140,6 @@ class SepConvGru(nn.Module):
             h = torch.lerp(h, q.to(h.dtype), z.to(h.dtype))
         return h
 
-    def forward_slow(self, h: Tensor, context: Tensor, motion: Tensor) -> Tensor:
-        """Slow reference of :meth:`forward`: every convolution over all channels."""
-        for gate, candidate in zip(self.gates, self.candidates, strict=True):
-            z, r = torch.sigmoid(gate(torch.cat([h, context, motion], 1))).chunk(2, 1)
-            q = torch.tanh(candidate(torch.cat([r * h, context, motion], 1)))
-            h = (1 - z) * h + z * q
-        return h
-
 
 class Update(nn.Module):
     """One refinement step."""
@@ -163,20 +155,19 @@ class Update(nn.Module):
         )
 
     def forward(
-        self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool
+        self, h: Tensor, ready: list[tuple[Tensor, Tensor]], taps: Tensor, flow: Tensor, with_mask: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return hidden state, Δflow and mask logits (None unless wanted).
 
-        h (N, hidden, h, w); context: the result of :meth:`SepConvGru.prepare`, or the context itself for the slow
-        reference; taps (N, taps, h, w); flow (N, 2, h, w)."""
-        motion = self.motion(taps, flow)
-        h = self.gru.forward_slow(h, context, motion) if isinstance(context, Tensor) else self.gru(h, context, motion)
+        h (N, hidden, h, w); ready: what :meth:`SepConvGru.prepare` returned; taps (N, taps, h, w); flow (N, 2, h, w)."""
+        h = self.gru(h, ready, self.motion(taps, flow))
         # 0.25 balances the gradients of the two heads, as RAFT does.
         return h, self.flow_head(h), 0.25 * self.mask_head(h) if with_mask else None
 
 
 class Eraft(FlowModel):
-    """E-RAFT. ``plain = True`` uses the slow references, as in RAFT, of lookup, GRU, mask head and upsampling."""
+    """E-RAFT (Gehrig et al., 3DV 2021), with RAFT's arithmetic in a faster order: look-ups by one gather, the context's
+    part of the GRU's convolutions once, masks and upsampling only where they are used (a test compares)."""
 
     Config = EraftConfig
 
@@ -184,7 +175,7 @@ class Eraft(FlowModel):
         super().__init__()
         self.config, self.widths = config, widths_of(config)
         w = self.widths
-        # A look-up divides by the size of a level minus one (lookup_slow), so the top level needs two cells.
+        # A look-up of RAFT divides by the size of a level minus one, so the top level needs two cells.
         self.divisor, self.least = 8, 8 * 2**w.levels
         if config.padding == "start":
             self.pad_to, self.pad_start = 32, True
@@ -194,7 +185,6 @@ class Eraft(FlowModel):
         self.representation = VoxelGrid(config.input.bins, config.input.normalise, config.input.bounds)
         self.features, self.context = self.encoders()
         self.update = Update(channels_of(w.levels, w.radius), w.hidden)
-        self.plain = False
         initialise(self)
         # The first Δflow is near zero.
         nn.init.normal_(self.update.flow_head[-1].weight, std=1e-3)
@@ -210,14 +200,13 @@ class Eraft(FlowModel):
         flows = [] if first is None or not self.training else [first]
 
         grid = pixel_grid(*h.shape[-2:], h)
-        context = c if self.plain else self.update.gru.prepare(c)
+        context = self.update.gru.prepare(c)
         iterations = self.config.train_iterations if self.training else self.config.iterations
         h, flow = self._burn_in(h, flow, context, correlation, grid) if self.training else (h, flow)
-        upsample = convex_upsample_slow if self.plain else convex_upsample
         for i in range(iterations):
             # RAFT detaches the flow: gradients go through each update alone.
             flow = flow.detach()
-            wanted = self.training or self.plain or i == iterations - 1
+            wanted = self.training or i == iterations - 1
             step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023
             if self.training and self.config.checkpoint_iterations:
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
@@ -229,7 +218,7 @@ class Eraft(FlowModel):
                 # Flow is accumulated in fp32: bf16 would lose updates of a thousandth of a px.
                 flow = flow + self.config.damping**beyond * delta.float()
             if wanted:
-                flows.append(upsample(flow, mask, self.config.border))
+                flows.append(convex_upsample(flow, mask, self.config.border))
         return FlowPrediction(
             flows if self.training else flows[-1:],
             has_match=self.training and first is not None,
@@ -286,4 +275,4 @@ class Eraft(FlowModel):
         tokens = f1.shape[-1] * f1.shape[-2]
         if self.config.correlation == "on_demand" or (self.config.correlation == "auto" and tokens > DENSE_TOKENS):
             return OnDemandCorrelation(f1, f2, self.widths.levels, self.widths.radius)
-        return DenseCorrelation(f1, f2, self.widths.levels, self.widths.radius, slow=self.plain)
+        return DenseCorrelation(f1, f2, self.widths.levels, self.widths.radius)

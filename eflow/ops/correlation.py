@@ -4,11 +4,10 @@ The volume of feature maps f1, f2 (N, D, h, w) is C[i, j] = <f1_i, f2_j> / sqrt(
 axis; a lookup reads (2r+1)^2 bilinear taps around a target coordinate on each level (RAFT, Teed & Deng, ECCV 2020,
 sec. 3.2).
 
-Three implementations give the same taps:
+Two implementations give the same taps, those of RAFT's 81 grid samples (a test compares):
 - dense: one (2r+2)^2 integer gather per token and level. All taps share one sub-pixel fraction, so they are one 2-D
   interpolation of the patch. It is differentiable on any device; on the CPU without gradients a numba kernel does it.
 - on demand: the correlations of the patch are computed from pooled features at look-up; memory is linear in tokens.
-- ``lookup_slow``: the 81 grid samples of RAFT, the slow reference.
 """
 
 from __future__ import annotations
@@ -48,9 +47,9 @@ class DenseCorrelation:
     """The whole volume in memory, (N h w, h, w) fp32, and its pooled levels. The product is fp32 even under autocast:
     in bf16 a match can be wrong by a quarter of a pixel."""
 
-    def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4, *, slow: bool = False):
+    def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4):
         n, d, h, w = f1.shape
-        self.shape, self.radius, self.slow = (n, h, w), radius, slow
+        self.shape, self.radius = (n, h, w), radius
         # 1 / sqrt(D) keeps the products' spread independent of D (RAFT, section 3.2).
         with fp32(f1):
             scaled = f1.float().flatten(2).transpose(1, 2) * (1 / math.sqrt(d))
@@ -65,8 +64,6 @@ class DenseCorrelation:
         """Return the taps (N, taps, h, w) fp32 around target coordinates (N, 2, h, w) fp32.
 
         Channel (level*side + dy)*side + dx with side = 2r+1; zero outside the image."""
-        if self.slow:
-            return lookup_slow(self.levels, coords, self.radius)
         if coords.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
             return _lookup_cpu(self.levels, coords, self.radius)
         n, h, w = self.shape
@@ -195,25 +192,6 @@ def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
     # All taps share the fraction, so the patch is interpolated as a whole, first in y, then in x.
     rows = torch.lerp(patch[:, :-1], patch[:, 1:], fy)
     return torch.lerp(rows[:, :, :-1], rows[:, :, 1:], fx).flatten(1)
-
-
-def lookup_slow(levels: list[Tensor], coords: Tensor, radius: int = 4) -> Tensor:
-    """Return the taps as RAFT computes them: (2r+1)^2 bilinear grid samples per token and level.
-
-    The normalisation divides by the size of a level minus 1, so levels of one cell would be NaN (inputs below 128 px
-    with four levels); the models refuse such inputs."""
-    n, _, h, w = coords.shape
-    d = torch.arange(-radius, radius + 1, device=coords.device, dtype=coords.dtype)
-    dy, dx = torch.meshgrid(d, d, indexing="ij")
-    taps = []
-    for level, volume in enumerate(levels):
-        centre = coords.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2) / 2**level
-        at = centre + torch.stack([dx, dy], -1)[None]
-        size = torch.tensor([volume.shape[-1] - 1, volume.shape[-2] - 1], device=coords.device, dtype=coords.dtype)
-        # grid_sample takes -1 to 1 between the centres of the outermost cells (align_corners=True).
-        sampled = F.grid_sample(volume[:, None], 2 * at / size - 1, align_corners=True)
-        taps.append(sampled.view(n, h, w, -1))
-    return torch.cat(taps, -1).permute(0, 3, 1, 2).contiguous()
 
 
 def _lookup_cpu(levels: list[Tensor], coords: Tensor, radius: int) -> Tensor:

@@ -38,15 +38,6 @@ def _padded(flow: Tensor, border: str) -> Tensor:
     return F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode={"replicate": "replicate", "zero": "constant"}[border])
 
 
-def convex_upsample_slow(flow: Tensor, mask: Tensor, border: str = "replicate") -> Tensor:
-    """Slow reference of :func:`convex_upsample`, as in RAFT: unfold, one large product, one permutation."""
-    n, _, h, w = flow.shape
-    weights = torch.softmax(mask.float().view(n, 1, 9, SCALE, SCALE, h, w), dim=2)
-    patches = F.unfold(_padded(flow, border), [3, 3]).view(n, 2, 9, 1, 1, h, w)
-    fine = torch.sum(weights * patches, dim=2).permute(0, 1, 4, 2, 5, 3)
-    return fine.reshape(n, 2, SCALE * h, SCALE * w)
-
-
 def bilinear_upsample(flow: Tensor) -> Tensor:
     """Return flow (N, 2, h, w) low-resolution px upsampled to (N, 2, 8h, 8w) full-resolution px, bilinear."""
     with fp32(flow):

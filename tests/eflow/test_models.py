@@ -15,6 +15,7 @@ from eflow.infer import predict  # noqa: E402
 from eflow.metrics import pixel_error, sequence_loss  # noqa: E402
 from eflow.models import NETWORKS, SIZES, FlowPrediction, build_model, model_config, parameters_of, preset  # noqa: E402
 from eflow.models.unets import Consensus, seen_cells  # noqa: E402
+from raft_reference import as_raft  # noqa: E402
 
 
 def count(config) -> tuple[int, float]:
@@ -23,10 +24,10 @@ def count(config) -> tuple[int, float]:
     with torch.device("meta"):
         model = build_model(config).eval()
         batch = {k: torch.zeros(1, model.representation.channels, 480, 640) for k in ("old", "new")}
-    if hasattr(model, "plain"):
-        model.plain = True
     counter = FlopCounterMode(display=False)
-    with torch.inference_mode(), counter:
+    with pytest.MonkeyPatch.context() as patch, torch.inference_mode(), counter:
+        if hasattr(model, "update"):
+            as_raft(patch, model)
         model(batch)
     return parameters_of(model), counter.get_total_flops() / 2e9
 
@@ -82,23 +83,23 @@ def test_without_layers_and_from_zero_it_is_eraft():
 
 
 @pytest.mark.parametrize("name", ["eraft", "eflowformer"])
-def test_fast_path_equals_the_raft_style_twin_and_on_demand_correlation(name):
+def test_it_equals_rafts_arithmetic_and_on_demand_correlation(name, monkeypatch):
     """The same flow to 1e-3 px: lookup, hoisted context, mask and upsampling once; and without the volume."""
     model = build(name=name, iterations=4).eval()
     loud(model)
     batch = batch_for(model, 2, 136, 152)
     fast = predict(model, batch).flow
     assert fast.abs().mean() > 1  # otherwise equality says nothing
-    model.plain = True
-    plain = predict(model, batch).flow
-    model.plain = False
+    with monkeypatch.context() as patch:
+        as_raft(patch, model)
+        plain = predict(model, batch).flow
     model.config = model.config.model_copy(update={"correlation": "on_demand"})
     on_demand = predict(model, batch).flow
     assert (fast - plain).abs().max() < 1e-3
     assert (fast - on_demand).abs().max() < 1e-3
 
 
-def test_the_quick_eflowformer_trains_every_parameter_from_a_flow_of_its_own():
+def test_the_quick_eflowformer_trains_every_parameter_from_a_flow_of_its_own(monkeypatch):
     """Its first field is the U-Net's; sizes of an odd number of cells and no volume in memory change nothing."""
     torch.manual_seed(0)
     model = build_model(model_config(preset("eflowformer-quick"))).train()
@@ -109,9 +110,10 @@ def test_the_quick_eflowformer_trains_every_parameter_from_a_flow_of_its_own():
     assert not [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
     loud(model)
     dense = predict(model, batch).flow
-    model.plain = True
-    plain = predict(model, batch).flow
-    model.plain, model.config = False, model.config.model_copy(update={"correlation": "on_demand"})
+    with monkeypatch.context() as patch:
+        as_raft(patch, model)
+        plain = predict(model, batch).flow
+    model.config = model.config.model_copy(update={"correlation": "on_demand"})
     assert (dense - plain).abs().max() < 1e-3 and (dense - predict(model, batch).flow).abs().max() < 1e-3
     started = predict(model, {**batch, "flow_init": torch.full((1, 2, 9, 11), 5.0)}).flow
     assert (started - dense).mean() > 20, "a warm start takes the place of its own"

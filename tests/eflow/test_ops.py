@@ -5,15 +5,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+import raft_reference  # noqa: E402
 from eflow.ops import attention  # noqa: E402
 from eflow.ops.correlation import (  # noqa: E402
     DenseCorrelation,
     OnDemandCorrelation,
     local_correlation,
-    lookup_slow,
     pixel_grid,
 )
-from eflow.ops.upsample import bilinear_upsample, convex_upsample, convex_upsample_slow  # noqa: E402
+from eflow.ops.upsample import bilinear_upsample, convex_upsample  # noqa: E402
 from eflow.ops.warp import backward_warp, forward_warp  # noqa: E402
 
 H, W = 17, 21
@@ -37,7 +37,7 @@ def targets() -> torch.Tensor:
 def test_lookup_gather_cpu_and_on_demand_equal_rafts(maps):
     coords = targets()
     dense = DenseCorrelation(*maps)
-    slow = lookup_slow(dense.levels, coords)
+    slow = raft_reference.lookup(dense.levels, coords)
     assert slow.shape == (2, 324, H, W)
     with torch.enable_grad():
         gather = dense.lookup(coords)
@@ -51,7 +51,7 @@ def test_lookup_gather_cpu_and_on_demand_equal_rafts(maps):
 def test_lookup_gradients_equal_rafts(maps):
     coords, weights = targets(), torch.randn(2, 324, H, W)
     gradients = []
-    for make in (DenseCorrelation, lambda a, b: DenseCorrelation(a, b, slow=True), OnDemandCorrelation):
+    for make in (DenseCorrelation, raft_reference.SampledCorrelation, OnDemandCorrelation):
         f1, f2 = (m.clone().requires_grad_() for m in maps)
         (make(f1, f2).lookup(coords) * weights).sum().backward()
         gradients.append((f1.grad, f2.grad))
@@ -73,9 +73,9 @@ def test_matching_dense_equals_on_demand_equals_the_definition(maps):
 def test_convex_upsampling_equals_its_twin_and_keeps_constants():
     torch.manual_seed(3)
     flow, mask = torch.randn(2, 2, 7, 9), torch.randn(2, 576, 7, 9)
-    assert (convex_upsample(flow, mask) - convex_upsample_slow(flow, mask)).abs().max() < 1e-5
+    assert (convex_upsample(flow, mask) - raft_reference.convex_upsample(flow, mask)).abs().max() < 1e-5
     constant = torch.full((1, 2, 7, 9), 3.0)
-    for upsample in (convex_upsample, convex_upsample_slow):
+    for upsample in (convex_upsample, raft_reference.convex_upsample):
         assert torch.allclose(upsample(constant, mask[:1]), torch.tensor(24.0))  # edges and corners too
     assert torch.allclose(bilinear_upsample(constant), torch.tensor(24.0))
 

@@ -133,6 +133,11 @@ def _steps(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("*") if re.fullmatch("[0-9]{1,18}", p.name) and p.is_dir())
 
 
+def config_of(path: str | os.PathLike) -> dict[str, Any]:
+    """Return the configuration of a checkpoint's network as plain data. Raises AssetError: as :func:`load_model`."""
+    return json.loads(load_model(path).config.model_dump_json())
+
+
 def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any = None) -> FlowModel:
     """Return the model of a checkpoint, in evaluation mode on the CPU.
 

@@ -381,7 +381,7 @@ class TrainConfig(Config):
     init_from: str | None = Field(
         None,
         description="checkpoint with the initial weights (fine-tuning), or the name of a network that ships with "
-        "the package",
+        "the package; without `model` the network is its",
     )
 
 
@@ -415,8 +415,13 @@ def load_train_config(
     if minutes is not None:
         tree = {**tree, "optim": {**(tree.get("optim") or {}), "minutes": minutes}}
     path = Path("train.yaml" if path is None else path)
-    config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p is unchanged
+    tree = apply_overrides(tree, overrides)
+    if tree.get("model") is None and isinstance(tree.get("init_from"), str):
+        from eflow.checkpoint import config_of  # imports torch
+
+        tree = {**tree, "model": config_of(_start(tree["init_from"], absolute))}
+    config = validate(TrainConfig, tree)
     sources = {
         k: tuple(
             s.model_copy(update={key: absolute(p) for key in ("path", "recipe") if (p := getattr(s, key)) is not None})

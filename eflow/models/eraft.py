@@ -159,7 +159,7 @@ class Update(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return hidden state, Δflow and mask logits (None unless wanted).
 
-        h (N, hidden, h, w); ready: what :meth:`SepConvGru.prepare` returned; taps (N, taps, h, w); flow (N, 2, h, w)."""
+        h (N, hidden, h, w); ready: of :meth:`SepConvGru.prepare`; taps (N, taps, h, w); flow (N, 2, h, w)."""
         h = self.gru(h, ready, self.motion(taps, flow))
         # 0.25 balances the gradients of the two heads, as RAFT does.
         return h, self.flow_head(h), 0.25 * self.mask_head(h) if with_mask else None

@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.2.0"
+from blinkgl.version import __version__ as __version__
 
 _HOMES = {
     "blinkgl.front.poses": ("Keyframes", "Pose", "Trajectory", "look_at"),

@@ -13,10 +13,10 @@ from typing import Annotated
 
 import typer
 
-from blinkgl import __version__
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
 from blinkgl.machine.command_line import run_app
 from blinkgl.shader_debugger.cli import app as shader_app
+from blinkgl.version import __version__
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from blinkgl import __version__
 from blinkgl.errors import ConfigError
 from blinkgl.machine import event_options as of_events
 from blinkgl.machine.command_line import run_app
 from blinkgl.machine.interrupts import interruptible
+from blinkgl.version import __version__
 from eflow.cli_arguments import (
     Answer,
     Dataset,
@@ -95,7 +95,7 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
-    from eflow.config import load_train_config
+    from eflow.load_config import load_train_config
     from eflow.models import preset
     from eflow.train import as_yaml, train as run_training
 
@@ -387,8 +387,9 @@ def pack(
 
     The weights are read back before the folder appears."""
     from eflow import shipped
+    from eflow.packing import pack as write_pack
 
-    folder, full = shipped.pack(checkpoint, name, card, out, averaged=not raw)
+    folder, full = write_pack(checkpoint, name, card, out, averaged=not raw)
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from blinkgl.config.recipe import derived_seed
+from blinkgl.config.run import derived_seed
 from blinkgl.errors import AssetError, ConfigError
 from eflow.config import SourceConfig, TrainConfig
 from eflow.data.dataset import FlowDataset, Key, Mixture, collate, is_endless

@@ -44,7 +44,7 @@ def test_every_room_is_installed():
 
 
 FLOORS = (
-    "errors rng srgb types camera gl machine",
+    "version errors rng srgb types camera gl machine",
     "config",
     "io events",
     "labels scene timeline tensors",

@@ -39,7 +39,7 @@ both ends of every range, in all combinations of those that are looked at togeth
 `seed`, `output` and `gl` belong to the whole run and cannot be drawn.
 
 `groups: {name: {…}}` at the top level makes a recipe of several groups of sequences: each is what stands at the top
-level with the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/recipe.py`,
+level with the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/run.py`,
 `configs/blinkflow.yaml`).
 """
 

@@ -20,8 +20,10 @@ image's x axis: ``x`` is the share of its flow along it.
 The second line is for judging, and to be used seldom: the bursts' flow is known. AEE and cosine of the whole burst as
 one window and (``halves``) of its second half, behind its first, beside zero flow's and the best constant and affine
 flow (which know the truth); at pixels with events, and over all. ``NAME+sharp`` is a network whose flow is as long as
-makes the events sharpest, which is what `eflow predict` gives. ``--sets`` adds the same table for data sets with labels
-(configs/eflow/independent_data.yaml is one): means over up to ``--windows`` samples of each, evenly spaced.
+makes the events sharpest, which is what `eflow predict` gives. ``--changed`` adds their share of zero flow's error when
+only a part of the events is left (means of ten draws), and when the burst lies in the middle of a larger sensor.
+``--sets`` adds the same table for data sets with labels (configs/eflow/independent_data.yaml is one): means over up to
+``--windows`` samples of each, evenly spaced.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from blinkgl.machine.terminal import plain_console, say
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
-from eflow.data.window import Window
+from eflow.data.window import Window, hit_pixels
 from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
 from eflow.methods.iwe import flow_warp_loss
 from eflow.methods.table import METHODS, make_method
@@ -201,6 +203,48 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
     return {name: row_of([(np.asarray(flow, np.float64), truth, valid, hit)]) for name, flow in flows.items()}
 
 
+SHARES = (1.0, 0.2, 0.1, 0.05)
+SENSORS = ((294, 220), (394, 296), (537, 402), (640, 480), (1280, 720))
+"""Width and height, px, of sensors in whose middle a burst is put: 1.5, 2.7, 5, 7 and 21 times its area."""
+DRAWS = 10
+
+
+def changed(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
+    """AEE of a burst as a share of zero flow's, at its pixels with events, for each name: of a share of its events
+    (:data:`SHARES`), and in the middle of larger sensors (:data:`SENSORS`). A network of two windows has the burst's
+    halves."""
+    events, height, width = read(folder / "events.txt")
+    truth = read_truth(folder / "flow.npy", height, width).astype(np.float64)
+    focal = float((folder / "calib.txt").read_text().split()[0])
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    middle, rows = (t0 + t1) // 2, {}
+
+    def error(name: str, part: Events, wide: int, high: int) -> float:
+        left, top = (wide - width) // 2, (high - height) // 2
+        moved = Events(part.x + np.uint16(left), part.y + np.uint16(top), part.t, part.p)
+        halves = name not in METHODS and "old" in load_model(name.removesuffix(SHARPENED)).reads
+        pair, factor = (
+            (cut(moved, middle, t1 - middle), (t1 - t0) / (t1 - middle)) if halves else (cut(moved, t0, t1 - t0), 1)
+        )
+        flow = answer_of(name, high, wide, focal)(pair)[top : top + height, left : left + width] * factor
+        hit = (
+            np.isfinite(truth).all(-1)
+            & hit_pixels((pair.old, pair.new), high, wide)[top : top + height, left : left + width]
+        )
+        return float(np.hypot(*(flow[hit] - truth[hit]).T).mean() / np.hypot(*truth[hit].T).mean())
+
+    for name in names:
+        rows[name] = {}
+        for share in SHARES:
+            draws = [np.random.default_rng(k).random(len(events)) < share for k in range(DRAWS if share < 1 else 1)]
+            rows[name][f"{100 * share:g} %"] = float(
+                np.mean([error(name, events.part(d), width, height) for d in draws])
+            )
+        for size in SENSORS:
+            rows[name][f"{size[0]}x{size[1]}"] = error(name, events, *size)
+    return rows
+
+
 def best_of(truth: np.ndarray, valid: np.ndarray) -> dict[str, np.ndarray]:
     """Zero flow, and the best constant and affine flow, which know the truth (H, W, 2)."""
     v, u = np.mgrid[: truth.shape[0], : truth.shape[1]]
@@ -266,6 +310,7 @@ def main() -> None:
     parser.add_argument("--recordings", type=Path, required=True)
     parser.add_argument("--windows", type=int, default=12, help="of a recording or a set, at most")
     parser.add_argument("--bursts", action="store_true", help=f"the recordings of {TEST}, whose flow is known")
+    parser.add_argument("--changed", action="store_true", help="with --bursts: fewer events, larger sensors")
     parser.add_argument("--sets", type=Path, nargs="*", default=[], help="data sets with labels, with --bursts")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
@@ -283,6 +328,10 @@ def main() -> None:
             keys = [f"{what}_{where}" for where in ("events", "all") for what in ("aee", "of_zero", "cosine", "length")]
             heads = [key.replace("_", " ") for key in keys]
             say(console, table(title, heads, [[n, *(row[k] for k in keys)] for n, row in rows.items()]) + "\n")
+        for folder in sorted((a.recordings / TEST).iterdir()) if a.changed else ():
+            rows = found[f"{folder.name}, changed"] = changed(folder, a.answers)
+            title = f"{folder.name}: AEE of zero flow's"
+            say(console, table(title, list(rows[a.answers[0]]), [[n, *row.values()] for n, row in rows.items()]) + "\n")
     else:
         for path in recordings(a.recordings):
             name = path.relative_to(a.recordings).as_posix()

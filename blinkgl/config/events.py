@@ -16,9 +16,6 @@ from pydantic import Field
 
 from blinkgl.config.base import Family, Members, Refused, Removed, rule
 
-if TYPE_CHECKING:
-    from blinkgl.config.sensor import SensorConfig
-
 _MAX_EVENTS = Field(
     2**25,
     ge=1_000,
@@ -116,8 +113,10 @@ class EmulatorConfig(Family):
 
     @classmethod
     @abstractmethod
-    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
-        """Return the values of the keys that a camera's data sheet describes; None where this sensor gives none."""
+    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
+        """Return the values of the keys that a camera's data sheet describes; None where this sensor gives none.
+
+        sensor : a :class:`~blinkgl.config.sensor.SensorConfig`, which knows the emulators' keys."""
 
 
 def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any]:
@@ -134,7 +133,7 @@ def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any
         return data
 
 
-def _pixel(sensor: SensorConfig) -> dict[str, Any]:
+def _pixel(sensor: Any) -> dict[str, Any]:
     return dict(
         contrast_threshold=sensor.contrast_threshold,
         contrast_threshold_off=sensor.contrast_threshold_off,
@@ -220,7 +219,7 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
     device: Device = _DEVICE
 
     @classmethod
-    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
         return _pixel(sensor)
 
 
@@ -341,7 +340,7 @@ class V2eConfig(_TwoThresholds, EmulatorConfig):
             raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
 
     @classmethod
-    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
         return {
             **_pixel(sensor),
             "cutoff_hz": sensor.cutoff_hz,
@@ -396,7 +395,7 @@ class VoltmeterConfig(EmulatorConfig):
     causes: bool = _CAUSES
 
     @classmethod
-    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
         """Return the constants of the nearest calibrated camera, with the gain that gives the sensor's threshold."""
         gain = None if sensor.contrast_threshold is None else 1 / sensor.contrast_threshold
         return {"preset": "DVS346", "refractory_us": sensor.refractory_us, "k1": gain}

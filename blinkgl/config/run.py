@@ -1,12 +1,35 @@
-"""A YAML file as a template of sequences: overrides, sensor and scene files, draws, checks."""
+"""A YAML file as a template of sequences: overrides, sensor and scene files, draws, checks.
+
+A whole data set in one file: groups of sequences that share most of their parameters.
+
+    seed: 2023
+    camera: {width: 640, height: 480}         # common to all groups
+    groups:
+      flying_train:                           # the name of the sequences, unless output.name is given
+        output: {split: train, sequences: 3362}
+        events: {shares: [{share: 0.8, value: {emulator: v2e}}, {share: 0.2, value: {emulator: voltmeter}}]}
+      flying_test:
+        output: {split: test, sequences: 200}
+        events: {emulator: voltmeter}
+      e_tartan:
+        enabled: false                        # described, but not generated until it is enabled
+        ...
+
+A group is the common part with the group's keys laid over it. Each group has its own seed, derived from the recipe's
+seed and the group's name, so that changing the size of one group, adding or removing one changes no sequence of
+another.
+"""
 
 from __future__ import annotations
 
+import copy
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from blinkgl.config.base import remembering
 from blinkgl.config.draw import Fill, corners, draw, is_distribution, sites
@@ -14,7 +37,7 @@ from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
 from blinkgl.config.problems import validate, validate_field
 from blinkgl.config.quality import fill_quality, with_default
-from blinkgl.config.reader import apply_overrides, read_table, run_file
+from blinkgl.config.reader import apply_overrides, merge, read_table, run_file
 from blinkgl.config.rig import (
     SECTIONS,
     check_pairs,
@@ -25,10 +48,6 @@ from blinkgl.config.rig import (
 from blinkgl.config.sensor import fill_sensor
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
-
-if TYPE_CHECKING:
-    from blinkgl.config.recipe import Group
-
 
 FILLS = (
     Fill(("quality", "timeline.kind"), fill_quality),
@@ -53,7 +72,7 @@ class RunTemplate:
 
     def sequence(self, index: int) -> SequenceConfig:
         """Return the validated configuration of sequence ``index`` (>= 0). Raises ConfigError, also where the file has
-        several groups of sequences (:mod:`blinkgl.config.recipe` separates those)."""
+        several groups of sequences (:attr:`groups`)."""
         if "groups" in self.tree:
             raise ConfigError("the recipe has groups; only a group has numbered sequences", where="groups")
         tree = draw(self.tree, self.seed, index)
@@ -74,10 +93,10 @@ class RunTemplate:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """Return the groups of :func:`blinkgl.config.recipe.all_groups`."""
-        from blinkgl.config.recipe import split
-
-        return split(self)
+        """Return the groups, disabled ones included; a plain configuration is one group without a name. All that they
+        can draw has been checked. Raises ConfigError for no groups, an invalid name, or two groups that write the same
+        folders."""
+        return _split(self)
 
     @cached_property
     def _first(self) -> SequenceConfig:  # cached: a large recipe has thousands of configurations to check
@@ -102,6 +121,96 @@ class RunTemplate:
         ConfigError."""
         with remembering():
             return [_validated(tree) for tree in corners(with_default(self.tree))]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Sequences ``first`` … ``first + count - 1`` of ``template``. ``name`` is "" for a run without groups."""
+
+    name: str
+    template: RunTemplate
+    first: int
+    count: int
+    enabled: bool = True
+
+    @property
+    def identity(self) -> str:
+        """Return the SHA-256 of everything that determines sequence n; the number of sequences is not part of it."""
+        tree = copy.deepcopy(self.template.tree)
+        if isinstance(tree.get("output"), dict):
+            for key in ("sequences", "first_index"):
+                tree["output"].pop(key, None)
+        # Keys keep their type (1 is not "1"); their order does not matter.
+        text = json.dumps(_plain(tree), sort_keys=True, ensure_ascii=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _split(template: RunTemplate) -> tuple[Group, ...]:
+    if "groups" not in template.tree:
+        return (_group("", template.tree, template, True),)
+    groups = template.tree["groups"]
+    if not isinstance(groups, dict) or not groups:
+        raise ConfigError("not a table of groups", where="groups", value=groups, accepted="name: {keys of the group}")
+    common = {key: value for key, value in template.tree.items() if key != "groups"}
+    made = []
+    for name, own in groups.items():
+        where = f"groups.{name}"
+        if not isinstance(name, str) or not isinstance(own, dict):
+            raise ConfigError("not a group", where=where, value=own, accepted="a table of keys")
+        if "groups" in own:
+            raise ConfigError("a group cannot hold groups", where=f"{where}.groups")
+        own = dict(own)
+        enabled = own.pop("enabled", True)
+        if not isinstance(enabled, bool):
+            raise ConfigError("not true or false", where=f"{where}.enabled", value=enabled, accepted="true or false")
+        tree = merge(common, own)
+        if "seed" not in own:
+            tree["seed"] = derived_seed(template.seed, name)
+        elif not is_distribution(own["seed"]):
+            tree["seed"] = validate_field(SequenceConfig, "seed", own["seed"])
+        if isinstance(tree.setdefault("output", {}), dict):
+            tree["output"].setdefault("name", name)
+        try:
+            made.append(_group(name, tree, template, enabled))
+        except ConfigError as error:
+            raise ConfigError(
+                f"in group '{name}': {error.problem}", where=error.where, value=error.value, accepted=error.accepted
+            ) from None
+    folders: dict[tuple[str, str], str] = {}
+    for group in made:
+        output = group.template.tree["output"]
+        folder = (output.get("split", "train"), output["name"])
+        if folder in folders:
+            raise ConfigError(
+                f"writes the same folders as group '{folders[folder]}'",
+                where=f"groups.{group.name}.output",
+                value="/".join(folder),
+                accepted="another name or split",
+            )
+        folders[folder] = group.name
+    return tuple(made)
+
+
+def _group(name: str, tree: dict[str, Any], template: RunTemplate, enabled: bool) -> Group:
+    made = RunTemplate(tree, template.base)
+    config: SequenceConfig = made.check()
+    return Group(name, made, config.output.first_index, config.output.sequences, enabled)
+
+
+def derived_seed(seed: int, name: str) -> int:
+    """Return the 63-bit seed of the group ``name``."""
+    return int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little") >> 1
+
+
+def _plain(node: Any) -> Any:
+    if isinstance(node, dict):
+        return [
+            ["table"],
+            *sorted(([repr(key), _plain(value)] for key, value in node.items()), key=lambda pair: pair[0]),
+        ]
+    if isinstance(node, list):
+        return [_plain(value) for value in node]
+    return repr(node)
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:

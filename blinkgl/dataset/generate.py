@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-import blinkgl
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import PreviewConfig, SequenceConfig
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
@@ -26,6 +25,7 @@ from blinkgl.sequence.rig import RigSequence, simulate_rig
 from blinkgl.sequence_files.preview import Panels, RigPreviewWriter
 from blinkgl.sequence_files.rig_dir import RigWriter, write_lens
 from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
+from blinkgl.version import __version__
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Passes a sequence's items to the preview.
@@ -271,7 +271,7 @@ def made_by(config: SequenceConfig, index: int, libraries: Mapping[str, str]) ->
 
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
     return {
-        "blinkgl": blinkgl.__version__,
+        "blinkgl": __version__,
         "versions": {**versions, **libraries},
         "seed": config.seed,
         "sequence": index,

@@ -16,8 +16,7 @@ from typing import Any, overload
 
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.recipe import Group, all_groups
-from blinkgl.config.run import RunTemplate
+from blinkgl.config.run import Group, RunTemplate
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError, OutputError
@@ -126,7 +125,7 @@ class Plan:
         many).
 
         Raises ConfigError: any bad value of the recipe, or all groups disabled."""
-        groups = all_groups(template)
+        groups = template.groups
         parts = []
         for group in groups:
             count = group.count if num is None else num if group.name == "" else min(num, group.count)

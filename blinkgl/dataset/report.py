@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import blinkgl
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.version import __version__
 
 if TYPE_CHECKING:
     from blinkgl.sequence.rig import RigSequence
@@ -136,6 +136,6 @@ def config_yaml(config: SequenceConfig, index: int) -> str:
             if table.get(key, ...) is None:
                 del table[key]
     return (
-        f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
+        f"# BlinkGL {__version__}, sequence {index}: every value as drawn.\n"
         "# Relative paths start from the folder of the run's own configuration file.\n" + to_yaml(tree)
     )

@@ -30,7 +30,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
 
-from blinkgl import __version__
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
@@ -40,6 +39,7 @@ from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.posix import peak_kib
+from blinkgl.version import __version__
 
 Message = dict[str, Any]
 RUN_FOLDER = ".run"

@@ -21,7 +21,7 @@ from blinkgl.front.runs import (
 )
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.render.tracks import Tracks
-from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, simulate
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, factory
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.rig import RigSequence, simulate_rig as simulate_rig_of
 from blinkgl.srgb import to_srgb8
@@ -64,7 +64,7 @@ def simulate_sequence(
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
         pictures_hz = check.number(pictures_hz, "pictures_hz", above=0, most=1e4)
-    return simulate.simulate_sequence(requested(source, config, index, events=events, pictures_hz=pictures_hz))
+    return factory.simulate_sequence(requested(source, config, index, events=events, pictures_hz=pictures_hz))
 
 
 def _configured(source: Source, index: int, settings: Settings) -> SequenceConfig:
@@ -137,7 +137,7 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, settings)
     gathered = Gathered()
-    with simulate.simulate_sequence(requested(source, config, index)) as sequence:
+    with factory.simulate_sequence(requested(source, config, index)) as sequence:
         for item in sequence:
             gathered.take(item)
         return gathered.recording(sequence)

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from blinkgl.config.reader import parse_yaml
-from blinkgl.config.recipe import Group, derived_seed
-from blinkgl.config.run import RunTemplate
+from blinkgl.config.run import Group, RunTemplate, derived_seed
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.recipe import Group
+from blinkgl.config.run import Group
 from blinkgl.dataset.plan import sequence_name
 from blinkgl.dataset.work import Maker, Message, failed
 from blinkgl.errors import may_pass

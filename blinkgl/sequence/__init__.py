@@ -5,8 +5,9 @@ Out: its events, ground truth, the frame camera's images and pictures, in the or
 Start: simulate.py; rendered.py and recorded.py are its two sources, rig.py merges several.
 """
 
+from blinkgl.sequence.factory import simulate_sequence
 from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest
-from blinkgl.sequence.simulate import Simulation, simulate_sequence
+from blinkgl.sequence.simulate import Simulation
 
 __all__ = [
     "CameraImage",

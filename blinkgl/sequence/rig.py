@@ -22,9 +22,10 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
+from blinkgl.sequence.factory import simulate_sequence
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.request import Item, SequenceRequest, StageClock
-from blinkgl.sequence.simulate import Simulation, simulate_sequence
+from blinkgl.sequence.simulate import Simulation
 from blinkgl.timeline import together
 
 

@@ -25,33 +25,12 @@ import numpy as np
 from blinkgl.camera import CameraModel
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.gl import GLContext
 from blinkgl.imaging import FrameCamera
 from blinkgl.render.tracks import Tracks
 from blinkgl.sequence.inertial import Inertial
 from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.timeline import Ticks, Timeline
 from blinkgl.types.events import Events, count_causes, named_causes
-
-
-def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> Simulation:
-    """Return the sequence of a single camera, ready for iteration: :class:`EventChunk`, :class:`GroundTruth`,
-    :class:`CameraImage` and :class:`Picture` in time order.
-
-    gl : context to draw with; None: a new one, where something is drawn.
-    Raises BlinkGLError for every error of the user or the machine, here or while iterating."""
-    if request.config.sensors is not None:
-        raise ConfigError(
-            "several sensors are simulated together, not as one camera",
-            where="sensors",
-            value=[one.name for one in request.config.sensors],
-            accepted="record_rig or simulate_rig, or a configuration of a single camera",
-        )
-    # imported here, because they import this module
-    from blinkgl.sequence.recorded import RecordedSequence
-    from blinkgl.sequence.rendered import RenderedSequence
-
-    return RenderedSequence(request, gl) if request.config.frames is None else RecordedSequence(request)
 
 
 class _Due:

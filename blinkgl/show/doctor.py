@@ -15,11 +15,11 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
 from blinkgl.machine.cpu import bf16_instructions
 from blinkgl.machine.extras import EXTRAS, install, python
 from blinkgl.machine.terminal import plain_console, say
+from blinkgl.version import __version__
 
 # ---------------------------------------------------------------------------------------------------------------------
 # ``blinkgl doctor``: what this machine offers, what is missing, and the command that installs it.

@@ -17,7 +17,7 @@ from blinkgl.io.columns import check_events, microseconds
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
 from blinkgl.io.mvsec import event_table, events_of_rows
-from eflow.data.sources import below
+from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
 
 HEIGHT, WIDTH = 260, 346

@@ -16,9 +16,8 @@ import csv
 import os
 import re
 from collections import OrderedDict
-from collections.abc import Iterator, Sized
+from collections.abc import Sized
 from dataclasses import dataclass
-from fnmatch import filter as matching
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,28 +32,13 @@ from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
+from eflow.data.folders import below
+from eflow.data.mvsec import MvsecSource
 from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Layouts of data sets.
-
-
-def below(root: Path, pattern: str) -> Iterator[Path]:
-    """Yield the files and folders below ``root`` whose name matches ``pattern`` (`*` and `?`), sorted in each folder.
-
-    Links to folders are followed, since subsets are often made of links. Each folder is visited once, so circles of
-    links end."""
-    visited = set()
-    for folder, folders, files in os.walk(root, followlinks=True):
-        real = os.path.realpath(folder)
-        if real in visited:
-            folders.clear()
-            continue
-        visited.add(real)
-        folders.sort()
-        for name in sorted(matching([*folders, *files], pattern)):
-            yield Path(folder, name)
 
 
 FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow", "windows")
@@ -409,8 +393,6 @@ def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1, *
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
-        from eflow.data.mvsec import MvsecSource
-
         return MvsecSource(root, dt, **mvsec)
     for name, value in mvsec.items():
         if value not in ("all", None, (), False):

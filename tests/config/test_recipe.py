@@ -14,7 +14,6 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.config.expansion import load_recipe
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import shipped_names
-from blinkgl.config.recipe import all_groups
 from blinkgl.config.run import load_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
@@ -59,7 +58,7 @@ def test_groups_share_what_they_do_not_say(tmp_path):
 
 
 def test_a_group_does_not_depend_on_the_others(tmp_path):
-    before = {g.name: (g.template.sequence(1), g.identity) for g in all_groups(load(tmp_path, TREE))}
+    before = {g.name: (g.template.sequence(1), g.identity) for g in load(tmp_path, TREE).groups}
     grown = {
         **TREE,
         "groups": {
@@ -68,10 +67,10 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
             "a": TREE["groups"]["a"],
         },
     }
-    after = {g.name: (g.template.sequence(1), g.identity) for g in all_groups(load(tmp_path, grown))}
+    after = {g.name: (g.template.sequence(1), g.identity) for g in load(tmp_path, grown).groups}
     assert after["a"] == before["a"]
     assert after["b"][1] == before["b"][1], "how many there are is no part of what they are"
-    other = {g.name: g.identity for g in all_groups(load(tmp_path, TREE, ["camera.height=50"]))}
+    other = {g.name: g.identity for g in load(tmp_path, TREE, ["camera.height=50"]).groups}
     assert all(other[name] != before[name][1] for name in "ab")
 
 
@@ -205,7 +204,7 @@ def test_a_scene_from_another_file(tmp_path):
         "camera": {"width": 64},
         "groups": {"a": {"scene": {"from": "scenes/one.yaml", "background": 0.5}}, "b": {}},
     }
-    a, b = all_groups(load(tmp_path, tree, ["groups.a.scene.light.unlit=true"]))
+    a, b = load(tmp_path, tree, ["groups.a.scene.light.unlit=true"]).groups
     config = a.template.sequence(0)
     assert config.scene.objects[0].mesh == "a" and config.scene.background == 0.5 and config.scene.light.unlit
     assert config.camera.width == 64, "nothing else comes from there"

@@ -13,7 +13,6 @@ from blinkgl.camera import PinHole
 from blinkgl.cli import run
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.recipe import all_groups
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import TimeConfig
 from blinkgl.errors import ConfigError
@@ -30,7 +29,7 @@ def test_shipped_configurations_are_valid():
     shipped = [p for f in (folder, folder / "scenes") for p in f.iterdir() if p.name.endswith(".yaml")]
     assert {p.name for p in shipped} >= {"demo.yaml", "flying_objects.yaml", "falling_dice.yaml"}
     for path in (p for p in shipped if p.name != "blinkflow.yaml"):  # test_recipe.py draws from that one
-        for group in all_groups(load_run(path)):
+        for group in load_run(path).groups:
             group.template.sequence(0)
 
 

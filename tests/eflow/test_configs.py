@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("torch")
 
 from eflow.cli import run
-from eflow.config import load_train_config
+from eflow.load_config import load_train_config
 from eflow.models import model_config
 from flow_data import blinkgl_set
 

@@ -18,9 +18,9 @@ from blinkgl.online.cuts import drawn_spans  # noqa: E402
 from blinkgl.online.job import MIX  # noqa: E402
 from eflow.checkpoint import newest  # noqa: E402
 from eflow.cli import run  # noqa: E402
-from eflow.config import load_train_config  # noqa: E402
 from eflow.data.dataset import Mixture, StepSampler  # noqa: E402
 from eflow.data.online import open_online  # noqa: E402
+from eflow.load_config import load_train_config  # noqa: E402
 from eflow.train import train  # noqa: E402
 from small_recipe import RECIPE, asked, said  # noqa: E402
 

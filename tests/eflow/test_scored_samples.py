@@ -14,10 +14,10 @@ torch = pytest.importorskip("torch")
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError  # noqa: E402
 from blinkgl.io.flow import write_flow_png  # noqa: E402
 from eflow import checkpoint as ckpt  # noqa: E402
-from eflow.config import load_train_config  # noqa: E402
 from eflow.data.dataset import FlowDataset, Key  # noqa: E402
 from eflow.data.sources import open_source  # noqa: E402
 from eflow.evaluate import evaluate  # noqa: E402
+from eflow.load_config import load_train_config  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from eflow.train import train  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402
@@ -132,7 +132,7 @@ def test_a_script_without_a_guard_is_a_line(folder, tmp_path):
     """Its loader process imports the script, which would train again."""
     script = tmp_path / "script.py"
     script.write_text(
-        "from eflow.config import load_train_config\nfrom eflow.train import train\n"
+        "from eflow.load_config import load_train_config\nfrom eflow.train import train\n"
         f"c = load_train_config(None, ['data.batch=2', 'data.workers=1', 'optim.steps=2'], model={ONE},\n"
         f"    data=[{str(folder)!r}])\ntrain(c, 'out', quiet=True)\n"
     )

@@ -17,7 +17,7 @@ from blinkgl.io.formats import write_events  # noqa: E402
 from blinkgl.recordings.simulation import emulator_config, frames_to_events  # noqa: E402
 from blinkgl.tools import real_recordings as rr  # noqa: E402
 from blinkgl.types.events import Events  # noqa: E402
-from eflow import checkpoint as ckpt, shipped  # noqa: E402
+from eflow import checkpoint as ckpt, packing, shipped  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.data.window import Window  # noqa: E402
 from eflow.infer import StreamWindow, largest_change, read_truth  # noqa: E402
@@ -138,23 +138,23 @@ def test_what_cannot_be_packed(source, tmp_path, name, change, message):
     card = tmp_path / "card.yaml"
     card.write_text(yaml.safe_dump({**CARD, **change}))
     with pytest.raises(ConfigError, match=message):
-        shipped.pack(source / "run", name, card, tmp_path / "out")
+        packing.pack(source / "run", name, card, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_too_large(source, tmp_path):
     with pytest.raises(AssetError, match=r"too large to come with the package .*7\.\d MB in float16.*at most 5 MB$"):
-        shipped.pack(weights(tmp_path / "l.safetensors", width=32), "l", source / "card.yaml", tmp_path / "out")
-    shipped.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
+        packing.pack(weights(tmp_path / "l.safetensors", width=32), "l", source / "card.yaml", tmp_path / "out")
+    packing.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
     with pytest.raises(OutputError, match="exists"):
-        shipped.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
+        packing.pack(source / "run", "twice", source / "card.yaml", tmp_path / "ok")
     assert not (tmp_path / "out").exists() and [p.name for p in (tmp_path / "ok").iterdir()] == ["twice"]
 
 
 def test_large_weights_are_rounded(source, tmp_path):
     """Above 5 MB weights are stored in half precision, and the card says what that changes."""
     wide = weights(tmp_path / "wide.safetensors", width=24)
-    folder, card = shipped.pack(wide, "wide", source / "card.yaml", tmp_path / "out")
+    folder, card = packing.pack(wide, "wide", source / "card.yaml", tmp_path / "out")
     assert card.stored == "fp16" and card.bytes <= shipped.LARGEST < 4 * card.parameters
     stored, exact = ckpt.load_model(folder), ckpt.load_model(wide)
     for (name, mine), its in zip(stored.state_dict().items(), exact.state_dict().values(), strict=True):

@@ -19,7 +19,7 @@ from safetensors.torch import load_file  # noqa: E402
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError  # noqa: E402
 from eflow import checkpoint as ckpt  # noqa: E402
 from eflow.cli import run  # noqa: E402
-from eflow.config import load_train_config  # noqa: E402
+from eflow.load_config import load_train_config  # noqa: E402
 from eflow.progress import Log, TrainingError  # noqa: E402
 from eflow.train import learning_rate, train  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402

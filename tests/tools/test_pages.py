@@ -78,7 +78,7 @@ def test_a_block_is_accepted(text, tmp_path):
 
 def test_the_configuration_of_eflow_is_accepted(tmp_path):
     pytest.importorskip("torch")
-    from eflow.config import load_train_config
+    from eflow.load_config import load_train_config
 
     (text,) = [
         match

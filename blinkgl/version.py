@@ -1,0 +1,3 @@
+"""The version of the package, which manifests and files state."""
+
+__version__ = "0.2.0"

@@ -19,7 +19,6 @@ from typing import Any
 import moderngl
 
 from blinkgl.errors import GLError
-from blinkgl.gl.framebuffer import Target
 from blinkgl.gl.shader import ShaderLoader
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -192,12 +191,6 @@ class GLContext:
         """Return the program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
         _refuse_after_fork()
         return self.shaders.program(name, defines)
-
-    def framebuffer(
-        self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True
-    ) -> Target:
-        """Return a new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
-        return Target(self, width, height, colour, depth)
 
     def make_current(self) -> None:
         """Make this context the current one again, after another context was used in the same thread.

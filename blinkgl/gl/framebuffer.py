@@ -73,7 +73,9 @@ class Target:
     Raises GLError for unknown formats, sizes beyond the driver's limit.
     """
 
-    def __init__(self, gl: GLContext, width: int, height: int, colour: Sequence[str], depth: bool | str = True):
+    def __init__(
+        self, gl: GLContext, width: int, height: int, colour: Sequence[str] = ("RGBA8",), depth: bool | str = True
+    ):
         limit = gl.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if not (1 <= width <= limit and 1 <= height <= limit):
             raise GLError(

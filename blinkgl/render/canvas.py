@@ -188,7 +188,8 @@ class Canvas:
 
     def make_target(self, width: int, height: int) -> Target:
         pass_ = self.pass_
-        return self.painter.gl.framebuffer(
+        return Target(
+            self.painter.gl,
             *pass_.size(width, height),
             colour=tuple(o.format for o in self.outputs),
             depth=pass_.depth,

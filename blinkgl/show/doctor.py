@@ -143,10 +143,11 @@ def _to_torch(gl, section: str) -> Check:
     name = "frames for torch"
     if gl.is_software:  # torch takes seconds to import
         return Check(section, name, "info", "in the processor's memory, where they are drawn")
+    from blinkgl.gl import Target
     from blinkgl.render.tensors import TextureReader
 
     try:
-        with gl.framebuffer(8, 8, ("R32F",), depth=False) as target:
+        with Target(gl, 8, 8, ("R32F",), depth=False) as target:
             target.clear(0.25)
             reader = TextureReader(gl, target, 0, "cuda")
             reader.read()
@@ -178,6 +179,8 @@ def _full_screen(gl, output: str, expression: str):
 
 def _draw_exactly(gl, name: str) -> str:
     """Draw values that only this format's full precision holds and read back the same bits."""
+    from blinkgl.gl import Target
+
     integer, bytes_ = name.endswith("UI"), name.endswith("8")
     if integer:
         expected = np.array([4_000_000_001], np.uint32)
@@ -194,7 +197,7 @@ def _draw_exactly(gl, name: str) -> str:
     )
     kind, expression = ("uint", literals) if integer else ("vec4", f"vec4({literals})")
     program, vertices = _full_screen(gl, f"layout(location = 0) out {kind} value;", f"value = {expression};")
-    with gl.framebuffer(4, 4, (name,), depth=False) as target:
+    with Target(gl, 4, 4, (name,), depth=False) as target:
         target.clear()
         vertices.render(vertices=3)
         seen = target.read()
@@ -211,9 +214,11 @@ def _draw_depth(gl) -> str:
     nearer one is drawn."""
     import moderngl
 
+    from blinkgl.gl import Target
+
     near = 0.01
     program, vertices = _full_screen(gl, "uniform float value;\nlayout(location = 0) out float seen;", "seen = value;")
-    with gl.framebuffer(4, 4, ("R32F",)) as target:
+    with Target(gl, 4, 4, ("R32F",)) as target:
         gl.ctx.enable_only(moderngl.DEPTH_TEST)
         gl.ctx.depth_func = ">"
         worst = 0.0

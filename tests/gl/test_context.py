@@ -16,7 +16,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Inline
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import GLError, may_pass
-from blinkgl.gl import GLContext, context as context_module, create_context, egl_devices
+from blinkgl.gl import GLContext, Target, context as context_module, create_context, egl_devices
 from tests.dataset.runs import tree
 from tests.tiny_recipe import TINY
 
@@ -46,7 +46,7 @@ def draw(gl) -> tuple[np.ndarray, np.ndarray]:
     vertices = gl.ctx.vertex_array(program, [(gl.ctx.buffer(corners), "3f", "position")])
     gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
     gl.ctx.depth_func = ">"
-    with gl.framebuffer(61, 47, ("RGBA32F",)) as target:
+    with Target(gl, 61, 47, ("RGBA32F",)) as target:
         target.clear((9, 8, 7, 6), depth=0.0)
         vertices.render()
         assert gl.ctx.error == "GL_NO_ERROR"
@@ -342,7 +342,7 @@ def test_names_of_another_context_survive(gl):
     assert other.released
     gl.make_current()
     for _, program in zip(range(40, 80), ours):
-        target = gl.framebuffer(4, 4, ("R32F",), depth=False)
+        target = Target(gl, 4, 4, ("R32F",), depth=False)
         target.use()
         gl.ctx.vertex_array(program, []).render(vertices=3)
         assert np.isfinite(target.read(0)).all()
@@ -364,7 +364,7 @@ def test_an_abandoned_generator_leaves_the_current_context_current(gl):
     except GLError:
         pytest.skip("no EGL for a second context")
     gl.make_current()
-    with gl.framebuffer(4, 4, ("R32UI",), depth=False) as target:
+    with Target(gl, 4, 4, ("R32UI",), depth=False) as target:
         target.clear(7)
         generator.close()
         target.clear(9)
@@ -393,7 +393,7 @@ def test_a_context_of_another_thread_is_refused_and_nothing_of_ours_is_freed(gl)
         if "error" in box:
             pytest.skip("no EGL for a second context")
         gl.make_current()
-        with gl.framebuffer(4, 4, ("R32F",), depth=False) as target:
+        with Target(gl, 4, 4, ("R32F",), depth=False) as target:
             target.clear(1.0)
             with pytest.raises(GLError, match="another thread uses this context"):
                 box["other"].release()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import GLError
-from blinkgl.gl import FORMATS
+from blinkgl.gl import FORMATS, Target
 
 TRIANGLE = """#version 430 core
 uniform vec2 depth_w;  // clip z and w
@@ -49,7 +49,7 @@ def test_what_is_drawn_is_read(gl, name):
         f"uniform {prefix}sampler2D source; out {prefix}vec4 value;"
         "void main() { value = texelFetch(source, ivec2(gl_FragCoord.xy), 0); }",
     )
-    with gl.framebuffer(width, height, (name,), depth=False) as target:
+    with Target(gl, width, height, (name,), depth=False) as target:
         target.clear()
         source.use(0)
         vertices.render(vertices=3)
@@ -66,7 +66,7 @@ def test_what_is_drawn_is_read(gl, name):
 
 
 def test_attachments_are_cleared_each_by_its_own_value(gl):
-    with gl.framebuffer(9, 5, ("R32F", "RGBA8", "R32UI", "R16F", "RG32F", "R32I")) as target:
+    with Target(gl, 9, 5, ("R32F", "RGBA8", "R32UI", "R16F", "RG32F", "R32I")) as target:
         target.clear(1.5, (1, 0, 0.2, 1), 4_000_000_001, -0.5, (2, 3), -4, depth=0.25)
         for i, value in enumerate((1.5, [255, 0, 51, 255], 4_000_000_001, -0.5, [2, 3], -4)):
             assert np.all(target.read(i) == np.array(value))
@@ -76,7 +76,7 @@ def test_attachments_are_cleared_each_by_its_own_value(gl):
 
 
 def test_clear_honours_the_scissor(gl):
-    with gl.framebuffer(8, 6, ("R32F",)) as target:
+    with Target(gl, 8, 6, ("R32F",)) as target:
         target.clear(1.0, depth=0.5)
         target.fbo.scissor = (2, 1, 3, 4)
         target.clear(2.0, depth=0.75)
@@ -94,7 +94,7 @@ def test_reversed_z_keeps_float_precision(gl, kind):
     program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
     gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
     gl.ctx.depth_func = ">"
-    with gl.framebuffer(4, 4, ("R32F",), depth=kind) as target:
+    with Target(gl, 4, 4, ("R32F",), depth=kind) as target:
         for z in np.geomspace(0.011, 1e6, 25):
             target.clear(depth=0.0)
             program["depth_w"] = (near, z)
@@ -108,7 +108,7 @@ def test_depth_of_16_bits_is_rounded_to_its_steps(gl):
     program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
     gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
     gl.ctx.depth_func = ">"
-    with gl.framebuffer(4, 4, (), depth="texture of 16 bits") as target:
+    with Target(gl, 4, 4, (), depth="texture of 16 bits") as target:
         worst = 0.0
         for depth in np.linspace(0.001, 0.999, 57):
             target.clear(depth=0.0)
@@ -126,7 +126,7 @@ def test_depth_texture_can_be_sampled(gl):
         "uniform sampler2D depths; out float value;"
         "void main() { value = texelFetch(depths, ivec2(gl_FragCoord.xy), 0).r; }",
     )
-    with gl.framebuffer(5, 4, (), depth="texture") as first, gl.framebuffer(5, 4, ("R32F",), depth=False) as second:
+    with Target(gl, 5, 4, (), depth="texture") as first, Target(gl, 5, 4, ("R32F",), depth=False) as second:
         first.clear(depth=1.2345e-6)
         second.clear()
         first.depth.use(0)
@@ -138,7 +138,7 @@ def test_depth_texture_can_be_sampled(gl):
 
 def test_releasing_the_bound_target_leaves_a_usable_context(gl):
     for _ in range(3):
-        target = gl.framebuffer(4, 4, ("R8",))
+        target = Target(gl, 4, 4, ("R8",))
         target.clear()
         target.release()
         target.release()
@@ -149,14 +149,14 @@ def test_bad_requests(gl):
     limit = gl.ctx.info["GL_MAX_TEXTURE_SIZE"]
     for size in ((0, 4), (4, limit + 1), (-1, 2)):
         with pytest.raises(GLError, match="exceeds this OpenGL's limit"):
-            gl.framebuffer(*size)
+            Target(gl, *size)
     with pytest.raises(GLError, match=r"unknown pixel format \(got 'R64F'\); expected one of R8, "):
-        gl.framebuffer(4, 4, ("R64F",))
+        Target(gl, 4, 4, ("R64F",))
     with pytest.raises(GLError, match="unknown kind of depth"):
-        gl.framebuffer(4, 4, depth="stencil")
+        Target(gl, 4, 4, depth="stencil")
     with pytest.raises(GLError, match="too many colour attachments"):
-        gl.framebuffer(4, 4, ("R8",) * 99)
-    with gl.framebuffer(6, 4, ("R32F",), depth=False) as target:
+        Target(gl, 4, 4, ("R8",) * 99)
+    with Target(gl, 6, 4, ("R32F",), depth=False) as target:
         for wrong in (np.empty((6, 4), np.float32), np.empty((4, 6)), np.empty((4, 12), np.float32)[:, ::2]):
             with pytest.raises(ValueError, match="out must be"):
                 target.read(out=wrong)

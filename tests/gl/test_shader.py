@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from blinkgl.gl import ShaderError, ShaderLoader, expand
+from blinkgl.gl import ShaderError, ShaderLoader, Target, expand
 from blinkgl.gl.shader import normalised, translate
 
 PROGRAM = """// a comment before the version is fine
@@ -58,7 +58,7 @@ def loader(gl, folder):
 
 def drawn(gl, program) -> float:
     vertices = gl.ctx.vertex_array(program, [])
-    with gl.framebuffer(2, 2, ("R32F",), depth=False) as target:
+    with Target(gl, 2, 2, ("R32F",), depth=False) as target:
         target.clear()
         vertices.render(vertices=3)
         value = target.read()

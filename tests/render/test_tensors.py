@@ -11,6 +11,7 @@ import torch
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import GLError
+from blinkgl.gl import Target
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tensors import TextureReader
 from render_scenes import mixed_scene
@@ -90,7 +91,7 @@ class Driver:
 
 @pytest.fixture
 def target(gl):
-    with gl.framebuffer(16, 8, ("RGBA32F",), depth=False) as made:
+    with Target(gl, 16, 8, ("RGBA32F",), depth=False) as made:
         made.clear((0.25, 0.5, 1.0, 2.0))
         yield made
 

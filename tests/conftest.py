@@ -36,7 +36,7 @@ class _Lender:
     WHERE = (
         "blinkgl.dataset.generate",
         "blinkgl.dataset.work",
-        "blinkgl.dataset.verify",
+        "blinkgl.dataset.deep",
         "blinkgl.sequence.rendered",
         "blinkgl.sequence.rig",
         "blinkgl.trade.run",

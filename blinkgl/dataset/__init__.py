@@ -5,7 +5,3 @@ Out:   folders that appear completely or not at all, their cost, their problems.
 Start: generate.py (one sequence, readable top to bottom); run.py makes many, verify.py checks the existing ones,
 explain.py describes a run in advance.
 """
-
-from blinkgl.dataset.generate import SequenceReport, generate_run, generate_sequence
-
-__all__ = ["SequenceReport", "generate_run", "generate_sequence"]

@@ -16,7 +16,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from blinkgl.dataset.work import Job, Maker, Message, Work, environment_differences, thread_environment
+from blinkgl.dataset.messages import Message
+from blinkgl.dataset.work import Job, Maker, Work, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 from blinkgl.machine.extras import install

@@ -13,9 +13,9 @@ from typing import Any
 
 from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.dataset.messages import RUN_FOLDER
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.records import open_regular, shown
 from blinkgl.sequence_files.index import INDEX, entry, read_index

@@ -23,7 +23,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from blinkgl.dataset.work import RUN_FOLDER, Maker, Message, Work, maker_of, thread_environment
+from blinkgl.dataset.messages import RUN_FOLDER, Message
+from blinkgl.dataset.work import Maker, Work, maker_of, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 from blinkgl.machine.posix import fcntl

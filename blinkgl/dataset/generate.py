@@ -12,6 +12,7 @@ import numpy as np
 
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import PreviewConfig, SequenceConfig
+from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
@@ -95,7 +96,7 @@ def generate_run(
     plan = Plan.of(template, num)
     for _, task in plan.tasks.present(Path(out)):
         refuse_existing(Path(out) / task.name)
-    plan.check_assets()
+    check_assets(plan)
     with ExitStack() as stack:
         gl = None
         for task in plan.tasks:

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import Group, RunTemplate
-from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, SequenceConfig
-from blinkgl.errors import AssetError, ConfigError, OutputError
-from blinkgl.scene.build import check_assets, panorama_of
-from blinkgl.scene.importing.mesh_files import dependencies
-from blinkgl.scene.motion.dynamics import engine_version
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
-from blinkgl.scene.worlds.pool import files_below, resolve
-from blinkgl.scene.worlds.random_world import pools
-from blinkgl.sequence.recorded import matching_folders, used_images
+from blinkgl.errors import ConfigError, OutputError
 
 
 @dataclass(frozen=True)
@@ -154,117 +143,9 @@ class Plan:
         """Return group -> hash of its recipe, without the numbers of sequences, so that a run may be extended."""
         return {group.name: group.identity for group in self.groups}
 
-    def check_assets(self) -> dict[str, str]:
-        """Return the content hash of every file that the run's scenes may use, by name; frame folders by name and size.
-
-        Raises ConfigError and AssetError: missing folders, empty pools, pools too small for the split, too few frame
-        folders."""
-        hashes: dict[str, str] = {}
-        for group in self.used:
-            try:
-                _check_group(group, self.counts[group.name], hashes)
-            except ConfigError as error:
-                if group.name:
-                    raise ConfigError(
-                        f"in group '{group.name}': {error.problem}",
-                        where=error.where,
-                        value=error.value,
-                        accepted=error.accepted,
-                    ) from None
-                raise
-        return hashes
-
-    def libraries(self) -> dict[str, str]:
-        """Return versions of libraries that only some runs use and that affect the bytes. Raises ConfigError where one
-        is not installed."""
-        return {"mujoco": engine_version()} if any(_falls(group.template.tree) for group in self.used) else {}
-
     def recipe_text(self) -> str:
         """Return the recipe with all overrides, as YAML that ``load_run`` reads."""
         return to_yaml(self.template.tree)
-
-
-_ASSET_CORNERS = 48
-"""Configurations whose files are checked: enough for every choice of a file, few enough for scenes that take long."""
-
-
-def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
-    base = group.template.base
-    if _falls(group.template.tree):
-        engine_version()
-    for config in _asset_corners(group.template):
-        if config.frames is not None:
-            folders = matching_folders(config.frames, base)
-            last = group.first + count - 1
-            if len(folders) > 1 and last >= len(folders):
-                raise ConfigError(
-                    f"{len(folders)} folders are too few for sequence {last}",
-                    where="frames.folders",
-                    value=list(config.frames.folders),
-                    accepted=f"at least {last + 1} folders, or fewer output.sequences",
-                )
-            for folder in folders:
-                # One bad folder is set aside alone; frames that are too far apart are an error of the recipe.
-                with suppress(AssetError):
-                    used_images(config.frames, folder)
-                for path in sorted(folder.rglob("*")):
-                    if path.is_file():
-                        hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = (
-                            f"{path.stat().st_size} bytes"
-                        )
-            continue
-        check_assets(config.scene, base, config.output.split)
-        _hash_scene_files(config.scene, base, hashes)
-
-
-def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
-    """Yield configurations that represent the scenes and frame folders that can be drawn; each once."""
-    seen = set()
-    for config in template.corners()[:_ASSET_CORNERS]:
-        said = repr((config.scene, config.frames))
-        if said not in seen:
-            seen.add(said)
-            yield config
-
-
-def _falls(tree: Any) -> bool:
-    """Return whether some draw of a recipe may have physics."""
-    if isinstance(tree, dict):
-        return tree.get("physics") is not None or any(_falls(value) for value in tree.values())
-    return isinstance(tree, (list, tuple)) and any(_falls(value) for value in tree)
-
-
-def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
-    def file(path: Path, name: str) -> None:
-        data = path.read_bytes()
-        hashes[name] = content_hash(data, *dependencies(path, data))
-
-    if isinstance(scene, RandomSceneConfig):
-        for pool in pools(scene, base):
-            hashes.update(
-                {f"{entry.source}/{entry.name}": entry.source_hash for entry in pool.entries if entry.file is not None}
-            )
-        for name in scene.sky.panoramas if scene.sky else ():
-            path = resolve(name, base)
-            for found in (
-                files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]
-            ):
-                hashes[f"{name}/{found.name}"] = content_hash(found.read_bytes())
-    elif isinstance(scene, ExplicitSceneConfig):
-        for used in (mesh.file for mesh in scene.meshes.values()):
-            if used is not None:
-                file(resolve(used, base), used)
-        for used in {used: None for m in scene.materials.values() for used in m.files.values()}:
-            file(resolve(used, base), used)
-    elif isinstance(scene, FileSceneConfig):
-        file(resolve(scene.path, base), scene.path)
-    if not isinstance(scene, RandomSceneConfig) and (panorama := panorama_of(scene.light)) is not None:
-        file(resolve(panorama, base), panorama)
-
-
-def digest(hashes: dict[str, str]) -> str:
-    """Return one hash of :meth:`Plan.check_assets`, to compare machines."""
-    return hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
 
 
 def check_output(out: str | Path) -> None:

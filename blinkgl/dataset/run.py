@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Protocol
 
 from blinkgl.config.run import RunTemplate
+from blinkgl.dataset.assets import check_assets, digest
 from blinkgl.dataset.executor import Executor, Inline, StartError
-from blinkgl.dataset.plan import Plan, check_output, digest
+from blinkgl.dataset.messages import Message
+from blinkgl.dataset.plan import Plan, check_output
 from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.work import Job, Message, environment_differences, report_of
+from blinkgl.dataset.work import Job, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.machine.interrupts import interruptible
 from blinkgl.sequence_files.index import INDEX, write_index
@@ -83,7 +85,7 @@ def run_dataset(
     out = Path(out)
     check_output(out)
     plan = Plan.of(template, num)
-    assets = plan.check_assets()
+    assets = check_assets(plan)
     folder = RunFolder(out)
     with (
         interruptible(signal.SIGTERM),

@@ -25,8 +25,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from blinkgl.dataset.messages import RUN_FOLDER, Message, SequenceLog
 from blinkgl.dataset.plan import Plan, Task
-from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, lock_folder, output_errors, remove_stale
 from blinkgl.io.records import entries_below, inside, parse, read_text, shown

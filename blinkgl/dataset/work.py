@@ -32,8 +32,10 @@ from typing import Any, ClassVar, Protocol
 
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.run import RunTemplate
+from blinkgl.dataset.assets import check_assets, digest, libraries
 from blinkgl.dataset.generate import generate_sequence
-from blinkgl.dataset.plan import Plan, digest
+from blinkgl.dataset.messages import Message, SequenceLog
+from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
@@ -41,10 +43,6 @@ from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.posix import peak_kib
 from blinkgl.version import __version__
 
-Message = dict[str, Any]
-RUN_FOLDER = ".run"
-"""Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and its content is not
-compared."""
 _NEWS_EVERY_S = 0.25
 
 
@@ -110,7 +108,7 @@ class Maker:
 
     def open(self) -> Message:
         """Check the assets, make the OpenGL context, and return the hello. Raises BlinkGLError."""
-        assets = self.plan.check_assets()
+        assets = check_assets(self.plan)
         rendered = [group.template.check() for group in self.plan.used]
         rendered = [config.gl for config in rendered if config.frames is None]
         if rendered:
@@ -127,7 +125,7 @@ class Maker:
         return {
             "kind": "hello",
             "pid": os.getpid(),
-            "environment": environment(self.gl, self.plan.libraries()),
+            "environment": environment(self.gl, libraries(self.plan)),
             "assets": digest(assets),
         }
 
@@ -273,18 +271,3 @@ def _disk_is_full(error: BaseException) -> bool:
             return True
         error = error.__cause__
     return False
-
-
-class SequenceLog:
-    """Appends to ``.run/logs/<split>/<sequence>.log``. A log that cannot be written stops nothing."""
-
-    def __init__(self, out: str | Path, name: str):
-        self.path = Path(out) / RUN_FOLDER / "logs" / f"{name}.log"
-
-    def write(self, text: str) -> None:
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.path, "a", encoding="utf-8") as file:
-                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text.rstrip()}\n")
-        except OSError:
-            pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from blinkgl.errors import ConfigError
@@ -31,26 +32,36 @@ def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool
     if log and low > 0:
         with np.errstate(invalid="ignore", divide="ignore"):
             return map_scalar(np.log(values), name, float(np.log(low)), float(np.log(high)))
-    import matplotlib  # imported here: it is slow to import, and only pictures need it
-
     if name not in MAPS:
         raise ConfigError("unknown colour map", where="map", value=name, accepted="one of " + ", ".join(MAPS))
     with np.errstate(invalid="ignore", over="ignore"):
         scaled = np.clip((values.astype(np.float64) - low) / ((high - low) or 1.0), 0.0, 1.0)
-    rgb = (matplotlib.colormaps[name](np.nan_to_num(scaled))[..., :3] * 255).round().astype(np.uint8)
+    rgb = _table(name)[np.minimum(256 * np.nan_to_num(scaled), 255).astype(np.uint8)]
     rgb[~np.isfinite(values)] = EMPTY
     return rgb
+
+
+def _table(name: str) -> np.ndarray:
+    """Return the 256 colours of a map of :data:`MAPS`, (256, 3) uint8."""
+    steps = np.arange(256, dtype=np.uint8)[:, None]
+    if name == "gray":
+        return np.repeat(steps, 3, axis=1)
+    if (number := getattr(cv2, f"COLORMAP_{name.upper()}", None)) is not None:
+        return cv2.applyColorMap(steps, number)[:, 0, ::-1]
+    import matplotlib  # has the diverging maps, and is slow to import
+
+    return (matplotlib.colormaps[name](steps[:, 0])[:, :3] * 255).round().astype(np.uint8)
 
 
 def id_colours(ids: np.ndarray) -> np.ndarray:
     """Return distinct hues by the golden ratio, (H, W, 3) uint8, dark grey for 0; a number always has the same
     colour."""
-    from matplotlib.colors import hsv_to_rgb
-
     numbers = ids.astype(np.int64)
     hue = (numbers * 0.61803398875) % 1.0
     value = 0.62 + 0.38 * ((numbers * 0.7548776662) % 1.0)
-    rgb = hsv_to_rgb(np.stack([hue, np.full(hue.shape, 0.62), value], axis=-1))
+    # HSV to RGB: with k = (n + 6 hue) mod 6 a channel is value (1 - saturation clip(min(k, 4 - k), 0, 1)), n = 5, 3, 1.
+    k = (np.array([5, 3, 1]) + 6 * hue[..., None]) % 6
+    rgb = value[..., None] * (1 - 0.62 * np.clip(np.minimum(k, 4 - k), 0, 1))
     out = (rgb * 255).round().astype(np.uint8)
     out[numbers == 0] = EMPTY
     return out

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.run import Group
+from blinkgl.dataset.messages import Message
 from blinkgl.dataset.plan import sequence_name
-from blinkgl.dataset.work import Maker, Message, failed
+from blinkgl.dataset.work import Maker, failed
 from blinkgl.errors import may_pass
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob

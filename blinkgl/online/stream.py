@@ -30,7 +30,7 @@ import numpy as np
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.executor import Executor, Inline, Local, StartError, several_cards
-from blinkgl.dataset.work import Message
+from blinkgl.dataset.messages import Message
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from blinkgl.online.cuts import Sample
 from blinkgl.online.job import MIX, StreamJob, flow_labels

@@ -5,7 +5,3 @@ Out:   report.html and index.jsonl.
 Start: page.py (``build_report``) and templates/data_set.html. collect.py collects the data; charts.py makes histograms
 and renders the templates of any room. calibration.py makes the page of a fitted emulator.
 """
-
-from blinkgl.report.page import build_report, write_report
-
-__all__ = ["build_report", "write_report"]

@@ -14,10 +14,11 @@ from rich.table import Table
 
 from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Executor, Inline, Local
+from blinkgl.dataset.messages import Message
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Listener, Outcome, run_dataset
-from blinkgl.dataset.work import Message, report_of
+from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
 from blinkgl.layouts.export import refuse_plan
 from blinkgl.machine.compiling import compiling_line

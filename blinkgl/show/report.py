@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from blinkgl.machine.terminal import plain_console, say
-from blinkgl.report import write_report
+from blinkgl.report.page import write_report
 
 
 def run(folder: str, out: str | None = None, *, examples: int = 6, overwrite: bool = False) -> int:

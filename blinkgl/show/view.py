@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from blinkgl.dataset.run import Listener, Outcome
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.terminal import plain_console, say
@@ -18,8 +17,9 @@ from blinkgl.sequence_files.index import made_folders
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from blinkgl.dataset.messages import Message
     from blinkgl.dataset.plan import Plan
-    from blinkgl.dataset.work import Message
+    from blinkgl.dataset.run import Listener, Outcome
     from blinkgl.viewer.page import Page
 
 

@@ -15,6 +15,7 @@ from blinkgl.config.expansion import load_recipe
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import shipped_names
 from blinkgl.config.run import load_run
+from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 from blinkgl.show.simulate import emulator_options
@@ -141,7 +142,7 @@ def test_bad_recipes(tmp_path, changes, message):
 )
 def test_pools_that_cannot_serve_the_split(tmp_path, scene, message):
     with pytest.raises(ConfigError) as error:
-        Plan.of(load(tmp_path, {**TREE, "scene": {"kind": "random", **scene}})).check_assets()
+        check_assets(Plan.of(load(tmp_path, {**TREE, "scene": {"kind": "random", **scene}})))
     assert message in str(error.value)
 
 
@@ -180,7 +181,7 @@ def test_shares_are_dealt_out():
 )
 def test_shipped_recipes(name, counts):
     plan = Plan.of(load_run(CONFIGS / f"{name}.yaml"))
-    plan.check_assets()
+    check_assets(plan)
     drawn = [plan.by_name[t.group].template for t in plan.tasks]
     emulators = Counter(
         (t.name.split("/")[0], draw({"events": template.tree["events"]}, template.seed, t.index)["events"]["emulator"])

@@ -22,8 +22,8 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flo, read_flow_png
 from blinkgl.io.frame_camera import read_exposures
 from blinkgl.labels import LABELS, asked_for
-from blinkgl.report import write_report
 from blinkgl.report.collect import collect
+from blinkgl.report.page import write_report
 from blinkgl.sequence_files.index import read_index
 from blinkgl.sequence_files.sequence_dir import read_manifest
 from blinkgl.types.events import Events, count_causes, named_causes

@@ -11,6 +11,7 @@ import pytest
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset import executor as executor_module, work
+from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset
@@ -117,7 +118,7 @@ def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
     class Nothing(Inline):
         def open(self, job):
             super().open(job)
-            return [{"environment": {}, "assets": work.digest(self._maker.plan.check_assets())}]
+            return [{"environment": {}, "assets": work.digest(check_assets(self._maker.plan))}]
 
         def poll(self, timeout_s):
             return [{"kind": "progress", "task": self._next[0], "error": "stop here"}]

@@ -12,9 +12,10 @@ import pytest
 import yaml
 
 from blinkgl.config.run import load_run
+from blinkgl.dataset.deep import differences
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.run import run_dataset
-from blinkgl.dataset.verify import differences, verify_dataset
+from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.records import SEAL
 from blinkgl.render.reference import render as by_reference

@@ -12,7 +12,6 @@ import pytest
 import yaml
 
 from blinkgl.dataset import work
-from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Maker
 from blinkgl.errors import ConfigError, OutputError
@@ -152,7 +151,7 @@ def test_groups_that_ask_for_different_opengl(tmp_path, monkeypatch):
     monkeypatch.setattr(work, "create_context", lambda *given: made.append(given) or SimpleNamespace(
         renderer="r", version="v", release=lambda: made.append("released")
     ))  # fmt: skip
-    monkeypatch.setattr(Plan, "check_assets", lambda self: {"a": "b"})
+    monkeypatch.setattr(work, "check_assets", lambda plan: {"a": "b"})
     with pytest.raises(
         ConfigError, match="gl: the groups need different OpenGL implementations; expected one gl section"
     ):

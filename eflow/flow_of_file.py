@@ -73,6 +73,8 @@ def show_flows(
     reads : the windows of a pair that the predictor uses.
     Raises BlinkGLError: the file has no events, or is shorter than its windows."""
     stream, span, factor = _windows(file, predictor, reads, asked, say)
+    kept = getattr(predictor, "unsharpened", {})
+    kept.clear()  # of the windows that were looked at to choose their length
     count = began = 0
     with contextlib.ExitStack() as opened:
         writer = opened.enter_context(infer.FlowWriter(outputs.folder, npy=outputs.npy)) if outputs.folder else None
@@ -104,7 +106,7 @@ def show_flows(
                 where=str(file.path),
                 accepted="a smaller --window-ms, or --whole",
             )
-    for why, windows in getattr(predictor, "unsharpened", {}).items():
+    for why, windows in kept.items():
         say(f"  {windows} of {count} flows have the network's own length: {why} (--no-sharpen for all)")
     for path in filter(None, (outputs.folder, outputs.video)):
         say(f"written: {path}")

@@ -13,6 +13,7 @@ import pickle
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,11 +39,21 @@ def import_published(path: str | os.PathLike, out: str | os.PathLike) -> FlowMod
     return model
 
 
+_SCALAR = np.float64(0).__reduce__()[0]
+_NUMBERS: list[Any] = [
+    np.dtype,
+    *(type(np.dtype(code)) for code in "?bBhHiIlLqQefd"),
+    *((_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
+]
+"""What NumPy's numbers beside the tensors (an epoch, a score) are made of; under either name of its module."""
+
+
 def read_published(path: Path) -> dict[str, Tensor]:
     """Return the named tensors of a torch checkpoint, or of its entry ``model`` or ``state_dict``. Raises
     AssetError."""
     try:
-        tree = torch.load(path, map_location="cpu", weights_only=True)
+        with torch.serialization.safe_globals(_NUMBERS):
+            tree = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
     except pickle.UnpicklingError as error:

@@ -50,7 +50,8 @@ def published(prefix: str = "") -> dict[str, torch.Tensor]:
 
 def test_an_imported_network_gives_the_published_flow(tmp_path):
     weights = published(prefix="module.")
-    torch.save({"state_dict": weights, "epoch": 3, "best": 0.788}, tmp_path / "dsec.tar")
+    beside = {"epoch": np.int64(3), "best": np.float64(0.788), "losses": [np.float32(1)]}  # NumPy's numbers, too
+    torch.save({"state_dict": weights, **beside}, tmp_path / "dsec.tar")
     import_published(tmp_path / "dsec.tar", tmp_path / "eraft.safetensors")
     model = load_model(tmp_path / "eraft.safetensors")
     assert json.loads(model.config.model_dump_json())["input"] == {

@@ -15,6 +15,7 @@ import typer
 
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
 from blinkgl.machine.command_line import run_app
+from blinkgl.machine.plugins import load_plugins
 from blinkgl.shader_debugger.cli import app as shader_app
 from blinkgl.version import __version__
 
@@ -36,8 +37,13 @@ def _global_options(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the traceback of an error; may also follow the command.")
     ] = False,
+    plugin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="Python file that registers parts of yours; before the command."),
+    ] = None,
 ) -> None:
     """Event-camera and optical-flow data sets by rasterisation."""
+    load_plugins(plugin or ())
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------

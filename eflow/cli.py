@@ -13,6 +13,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.machine import event_options as of_events
 from blinkgl.machine.command_line import run_app
 from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.plugins import load_plugins
 from blinkgl.version import __version__
 from eflow.cli_arguments import (
     Answer,
@@ -58,8 +59,13 @@ def _options(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")
     ] = False,
+    plugin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="Python file that registers parts of yours; before the command."),
+    ] = None,
 ) -> None:
     """Train, evaluate and run event-flow networks."""
+    load_plugins(plugin or ())
 
 
 def _print_version(wanted: bool) -> None:

@@ -20,6 +20,7 @@ from blinkgl.imaging.exposure import decibels
 from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
+from blinkgl.machine.plugins import plugin_versions
 from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, Simulation
 from blinkgl.sequence.request import StageClock
 from blinkgl.sequence.rig import RigSequence, simulate_rig
@@ -273,7 +274,7 @@ def made_by(config: SequenceConfig, index: int, libraries: Mapping[str, str]) ->
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
     return {
         "blinkgl": __version__,
-        "versions": {**versions, **libraries},
+        "versions": {**versions, **libraries, **plugin_versions()},
         "seed": config.seed,
         "sequence": index,
         "split": config.output.split,

@@ -35,6 +35,7 @@ from blinkgl.io.imu import FILES as IMU_FILES
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS, asked_for
+from blinkgl.machine.plugins import missing_plugins
 from blinkgl.sequence_files.index import made_folders, sequence_folders
 from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, manifest_problems, read_manifest, verify_sequence
@@ -170,6 +171,8 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
             return missing
         if "config.yaml" not in manifest["files"]:
             return ["config.yaml: missing"]
+        if missing := missing_plugins(manifest.get("versions") or {}):
+            return missing
         config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
         if manifest["format"] == "blinkgl-rig":
             problems = look_at_rig(folder, name, manifest, config)

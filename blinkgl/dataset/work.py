@@ -40,6 +40,7 @@ from blinkgl.dataset.report import SequenceReport
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
 from blinkgl.machine.compiling import announced_compiling
+from blinkgl.machine.plugins import load_plugins, plugin_versions
 from blinkgl.machine.posix import peak_kib
 from blinkgl.version import __version__
 
@@ -77,6 +78,7 @@ class Work(Protocol):
 
 def maker_of(name: str, job: Mapping[str, Any], device: int | None) -> Maker:
     """Return the maker called ``name`` ("module:class", of a job's ``maker``) for a job in plain data."""
+    load_plugins()  # those of the process that started this one
     module, _, kind = name.partition(":")
     return getattr(importlib.import_module(module), kind).of(job, device)
 
@@ -238,6 +240,7 @@ def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProx
         "numba": numba.__version__,
         "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used",
         **libraries,
+        **plugin_versions(),
     }
 
 

@@ -27,7 +27,7 @@ MOST_PER_FRAME = 8
 _NOTHING = 1e-6  # of its size: a thing that small is hidden
 
 At = Callable[[int], np.ndarray]
-"""Returns (V, 3) points in the world at a time in ns."""
+"""Returns (V, 3) points in the world at one of the times."""
 Difference = tuple[float, float]
 """Largest distance of something from where Blender has it, of its size, and the share of the times at which it is too
 large."""
@@ -54,14 +54,14 @@ def compare(glb: Path, seen: Path | None, per: int = 1) -> tuple[dict[str, Diffe
     things = json.loads(str(table["things"]))
     for k, (name, _) in enumerate(things):
         theirs.setdefault(name, []).append(table[f"arr_{k}"])
-    ours, changing = _played(document, scene.objects), {name for name, changes in things if changes}
+    ours, changing = _played(document, scene.objects, t_ns), {name for name, changes in things if changes}
     morphs = ["targets" in mesh["primitives"][0] for mesh in document.tree["meshes"]]
     deforming = {node.name for node in shown if node.skin is not None or morphs[node.mesh or 0]}
     differs: dict[str, Difference] = {}
     denser = 1
     for name in sorted(theirs.keys() | ours.keys()):
         those, mine = theirs.get(name, []), ours.get(name, [])
-        error = _distances(those, mine, t_ns) if those and mine else np.ones(len(t_ns))
+        error = _distances(those, mine) if those and mine else np.ones(len(t_ns))
         at, between = (float(error[table["whole"] == whole].max(initial=0.0)) for whole in (True, False))
         # The error of straight lines goes down with the square of their number.
         factor = 2 ** math.ceil(math.log2(max(between / BETWEEN, 1.0)) / 2)
@@ -74,35 +74,36 @@ def compare(glb: Path, seen: Path | None, per: int = 1) -> tuple[dict[str, Diffe
     return differs, denser, scene.omissions
 
 
-def _played(document: gltf.Document, objects: Sequence[SceneObject]) -> dict[str, list[At]]:
+def _played(document: gltf.Document, objects: Sequence[SceneObject], t_ns: Sequence[int]) -> dict[str, list[At]]:
     """Return what the GLB plays, by name: surfaces and cameras."""
     names = {node.name for node in document.nodes.values()}
     ours: dict[str, list[At]] = {}
-    for made in objects:
+    # All at one time, since a skeleton keeps one time.
+    poses = np.array([[made.path.pose(t) for made in objects] for t in t_ns])
+    for k, made in enumerate(objects):
         name = made.name if made.name in names else made.name.rpartition("#")[0]
-        ours.setdefault(name, []).append(partial(_surface, made))
+        ours.setdefault(name, []).append(partial(_surface, made, poses[:, k], t_ns))
     animation = play(document, AnimationConfig(loop=False), Path(), "animation") if clip_names(document) else None
     for index, node in document.nodes.items():
         if node.camera is not None:
-            ours.setdefault(node.name, []).append(partial(_axes, document, index, animation))
+            ours.setdefault(node.name, []).append(partial(_axes, document, index, animation, t_ns))
     return ours
 
 
-def _surface(made: SceneObject, t_ns: int) -> np.ndarray:
+def _surface(made: SceneObject, poses: np.ndarray, t_ns: Sequence[int], k: int) -> np.ndarray:
     shapes = [(part.mesh, part.mesh.deformer) for part in made.parts]
-    points = [mesh.vertices if deformer is None else deformer.positions(mesh, t_ns) for mesh, deformer in shapes]
-    matrix = made.path.pose(t_ns)
-    return np.concatenate(points) @ matrix[:3, :3].T + matrix[:3, 3]
+    points = [mesh.vertices if deformer is None else deformer.positions(mesh, t_ns[k]) for mesh, deformer in shapes]
+    return np.concatenate(points) @ poses[k, :3, :3].T + poses[k, :3, 3]
 
 
-def _axes(document: gltf.Document, node: int, animation: Animation | None, t_ns: int) -> np.ndarray:
-    moving = animation is not None and animation.skeleton.at(t_ns)[0][document.places[node]]
+def _axes(document: gltf.Document, node: int, animation: Animation | None, t_ns: Sequence[int], k: int) -> np.ndarray:
+    moving = animation is not None and animation.skeleton.at(t_ns[k])[0][document.places[node]]
     world = Z_UP @ (document.world(node) if animation is None else moving)
     axes = world[:3, :3].T / np.linalg.norm(world[:3, :3], axis=0)[:, None]
     return world[:3, 3] + np.concatenate([np.zeros((1, 3)), axes])
 
 
-def _distances(those: Sequence[np.ndarray], ours: Sequence[At], t_ns: Sequence[int]) -> np.ndarray:
+def _distances(those: Sequence[np.ndarray], ours: Sequence[At]) -> np.ndarray:
     """Return (T,) the largest distance of a point of ``those`` from ``ours``, of its instance's size; 1 where only one
     of the two is seen.
 
@@ -112,14 +113,14 @@ def _distances(those: Sequence[np.ndarray], ours: Sequence[At], t_ns: Sequence[i
     largest = np.fmax.reduce(sizes, axis=1)[:, None]
     hidden = ~(sizes > _NOTHING * largest)
     common = ~hidden.any(axis=0) if (~hidden.any(axis=0)).any() else ~hidden[0]
-    directions = np.random.default_rng(0).normal(size=(len(t_ns), 3, 8)) * common[:, None, None]
+    directions = np.random.default_rng(0).normal(size=(sizes.shape[1], 3, 8)) * common[:, None, None]
     counts = [points.shape[1] for points in those]
     true = np.nan_to_num(np.concatenate(those, axis=1))
-    played = [np.concatenate([at(t) for at in ours]).astype(np.float32) for t in t_ns]
+    played = [np.concatenate([at(k) for at in ours]).astype(np.float32) for k in range(sizes.shape[1])]
     tree = KDTree(sum(points @ way for points, way in zip(played, directions)))
     nearest = tree.query(sum(points @ way for points, way in zip(true, directions)))[1]
     starts = np.cumsum([0, *counts[:-1]])
-    error = np.zeros((len(those), len(t_ns)))
+    error = np.zeros(sizes.shape)
     for k, points in enumerate(played):
         off = np.abs(points[nearest] - true[k]).max(axis=1)
         scale = np.fmax(sizes[:, k], 0.1 * largest[:, 0])

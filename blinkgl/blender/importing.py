@@ -122,6 +122,7 @@ def import_scene(
 def _as_line(name: str, distance: float, share: float, duration_s: float, reason: str) -> str:
     """Return what is wrong with a thing, for how long, and why."""
     shown = "is missing, or shown too much" if distance >= 1 else f"is off by up to {100 * distance:.2g} % of its size"
+    shown = f"as glTF exports it {shown}" if reason else shown
     return f"'{name}' {shown}, for {share * duration_s:.2g} of {duration_s:.2g} s" + (f" ({reason})" if reason else "")
 
 

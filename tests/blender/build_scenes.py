@@ -92,7 +92,7 @@ def truth(name: str, objects=(), cameras=(), everything: bool = False, per: int 
             parts = []
             for i in graph.object_instances:
                 original, seen = i.object.original, i.show_self and not i.particle_system
-                itself = i.is_instance and i.parent.type == "FONT"  # its mesh, which is the text
+                itself = i.is_instance and i.parent.type in ("FONT", "CURVE")  # its mesh, which is the curve
                 if i.object.hide_render or itself or (not i.is_instance and not original.show_instancer_for_render):
                     seen = False
                 if seen and i.object.type in MESH_LIKE:
@@ -328,8 +328,10 @@ def unsaid() -> None:
         one.instance_type, one.instance_collection, one.location = "COLLECTION", tree, (-5, 3 * k, 0)
     spots, seed = grid("Spots", 2), cube("Seed", size=0.2)
     spots.location, seed.parent, spots.instance_type = (0, -5, 0), spots, "VERTS"
-    bpy.ops.object.text_add(location=(12, 4, 0))
-    keyed(bpy.context.object.data, "extrude", 0.1, 1.0, frames=(1, 8))
+    bpy.ops.curve.primitive_bezier_circle_add(location=(12, 4, 0))
+    ring = bpy.context.object
+    ring.name, ring.data.resolution_u, ring.data.bevel_resolution = "Ring", 2, 0
+    keyed(ring.data, "bevel_depth", 0.1, 0.5, frames=(1, 8))
     camera = linked(bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye")))
     keyed(camera, "rotation_euler", (1.3, 0, 1.0), (1.1, 0, 0), frames=(1, 8))
     scene.camera = camera

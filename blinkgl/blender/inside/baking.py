@@ -1,7 +1,7 @@
 """What Blender itself sees over time, and objects that show it where its exporter of glTF does not.
 
 :func:`sample` writes points of everything that is rendered, at a few times; BlinkGL compares them with what the GLB
-plays. :func:`bake` evaluates what differs at eight times per frame. What only moves becomes a rigid node, anything else
+plays. :func:`bake` evaluates what differs at four times per frame. What only moves becomes a rigid node, anything else
 morph targets, one for a time, as few as straight lines in between allow. A part of convert.py.
 """
 
@@ -21,7 +21,7 @@ from mathutils import Matrix
 SEEN = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CAMERA")
 SIMULATED = {"CLOTH", "SOFT_BODY", "FLUID", "DYNAMIC_PAINT", "PARTICLE_SYSTEM"}
 SAMPLES, MOST_POINTS, MOST_EACH = 25, 400_000, 400
-PER_FRAME = 8
+PER_FRAME = 4
 FURTHEST = 1e9
 """Beyond it a place counts as broken."""
 CLOSE = 5e-5
@@ -183,8 +183,7 @@ class Track:
             ).max() > 0.02 * CLOSE * np.ptp(shape):
                 self.bend()
         points = moved(shape if self.deforms else self.box, matrix)
-        # Keys of a rigid node are small: it gets more of them.
-        limit = CLOSE * (1 if self.deforms else 0.1) * max(float(np.ptp(points, axis=0).max()), 1e-9)
+        limit = CLOSE * (0.1 if self.camera else 1) * max(float(np.ptp(points, axis=0).max()), 1e-9)
         begin, _, start = self.kept[-1] if self.kept else (frame, None, points)
         stride = len(self.waiting) // 8 + 1  # every frame, and some between
         for at, _, passed in [one for k, one in enumerate(self.waiting) if one[0] == int(one[0]) or k % stride == 0]:
@@ -202,17 +201,21 @@ class Track:
             past[:] = [(at, matrix, moved(self.shape, matrix)) for at, matrix, _ in past]
 
     def end(self, count: int) -> None:
-        """Keep the last time, or one key where nothing moves. count : of all times. The base of the morph targets is
-        the key with the fewest collapsed edges, since collapsed faces are not drawn."""
+        """Keep the last time, or one key where nothing moves. count : of all times."""
         self.kept += self.waiting[-1:]
         first = self.kept[0][2]
         if all(np.abs(points - first).max() <= CLOSE * np.ptp(first, axis=0).max() for *_, points in self.kept):
             del self.kept[1:]
         if len(self.seen) < count and not self.camera:
             self.bend()
+
+    @property
+    def base(self) -> int:
+        """Return the key that is the base of the morph targets. Its faces are not collapsed, if there is such a key:
+        those would not be drawn at all."""
         edges = [np.linalg.norm(np.diff(points, axis=0), axis=1) for *_, points in self.kept]
         lengths = [float(np.quantile(edge, 0.1)) for edge in edges]
-        self.base = 0 if lengths[0] > 0.1 * max(lengths) else int(np.argmax(lengths))
+        return 0 if lengths[0] > 0.1 * max(lengths) else int(np.argmax(lengths))
 
     @property
     def size(self) -> int:
@@ -242,6 +245,8 @@ def bake(clock: Clock, owners: set[str], room: float) -> tuple[list[Track], dict
     for track in tracks.values():
         track.end(len(frames))
     for track in sorted(tracks.values(), key=lambda track: track.size):
+        if track.size > room:  # whole frames alone, rather than nothing
+            track.kept = [one for one in track.kept if one[0] == int(one[0])]
         room -= track.size
         if track.other:
             reasons[track.owner] = f"its faces change, {len(track.other) / len(frames):.0%} of the time"
@@ -279,11 +284,11 @@ def stand_in(clock: Clock, track: Track) -> None:
         track.object.matrix_world = Matrix(track.kept[0][1])
         return
     track.object.shape_key_clear()
-    for k in (track.base, *(k for k in range(len(track.kept)) if k != track.base)):
-        frame, _, points = track.kept[k]
+    base = track.base
+    for frame, _, points in (track.kept[base], *track.kept[:base], *track.kept[base + 1 :]):
         block = track.object.shape_key_add(name=f"frame {frame:g}", from_mix=False)
         block.data.foreach_set("co", points.astype(np.float32).ravel())
-    track.object.data.vertices.foreach_set("co", track.kept[track.base][2].astype(np.float32).ravel())
+    track.object.data.vertices.foreach_set("co", track.kept[base][2].astype(np.float32).ravel())
 
 
 def write_keys(tracks: list[Track], tree: dict, binary: bytearray) -> None:
@@ -292,8 +297,9 @@ def write_keys(tracks: list[Track], tree: dict, binary: bytearray) -> None:
     for track in tracks:
         node = nodes[track.object.name]
         tree["nodes"][node]["name"] = track.name
-        values = {"weights": np.delete(np.eye(len(track.kept)), track.base, axis=1)}
-        if not track.deforms:
+        if track.deforms:
+            values = {"weights": np.delete(np.eye(len(track.kept)), track.base, axis=1)}
+        else:
             turn = Matrix() if track.camera else Y_UP.transposed()  # a camera's axes are glTF's
             parts = [(Y_UP @ Matrix(matrix) @ turn).decompose() for _, matrix, _ in track.kept]
             places, turns, scales = (np.array([tuple(part) for part in parts]) for parts in zip(*parts))

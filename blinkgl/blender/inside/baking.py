@@ -35,11 +35,11 @@ NOT_EXPORTED = "glTF_not_exported"
 
 
 class Clock:
-    """The scene's time. first, last : frames.   fps : of the file.   per : key frames per frame.   factor : by which
-    the exporter's times are to be multiplied.   simulated : whether only whole frames in their order mean something.
-    here : the frame that the file shows.   graph : the dependency graph of the time that :meth:`go` was called with."""
+    """The scene's time. first, last : frames.   fps : of the file.   per : key frames per frame.
+    simulated : whether only whole frames in their order mean something.   here : the frame that the file shows.
+    graph : the dependency graph of the time that :meth:`go` was called with."""
 
-    def __init__(self, first: int, last: int):
+    def __init__(self, first: int, last: int, per: int):
         self.scene, self.first, self.last = bpy.context.scene, first, last
         self.here = self.scene.frame_current
         self.fps = self.scene.render.fps / self.scene.render.fps_base
@@ -50,11 +50,11 @@ class Clock:
         body = self.scene.rigidbody_world is not None
         self.simulated = body or not SIMULATED.isdisjoint(kinds) or "GeometryNodeSimulationInput" in nodes
         self.graph: Any = None
+        self.stretch(per)
 
     def stretch(self, per: int) -> None:
-        """Set the scene to ``per`` key frames per frame: its time is stretched. (The exporter divides frames by fps
-        times base, where Blender has fps over base.)"""
-        self.per, self.factor = per, self.scene.render.fps_base**2 / per
+        """Set the scene to ``per`` key frames per frame: its time is stretched."""
+        self.per = per
         self.scene.render.frame_map_old, self.scene.render.frame_map_new = self.map[0], self.map[1] * per
         self.scene.frame_start, self.scene.frame_end = self.first * per, self.last * per
         for marker, frame in self.markers:
@@ -160,12 +160,13 @@ class Track:
 
     name, owner : of its object, of what shows it.   data : its mesh at first, or the camera's data.
     deforms : whether its vertices move, not only its place.   kept : (frame, matrix, points in the world) of each key.
-    seen : frames at which it is there; other : at which it has other faces.   object : that shows it."""
+    seen : frames at which it is there; other : at which it has other faces.   coarse : whether it has keys at whole
+    frames alone; over : bytes at which it was given up.   object : that shows it."""
 
     def __init__(self, owner: str, thing: Any, shape: np.ndarray, corners: int, form: int):
         self.name, self.owner, self.camera, self.original = thing.name, owner, thing.type == "CAMERA", thing.original
         self.shape, self.corners, self.form, self.deforms = shape, corners, form, False
-        self.kept, self.waiting, self.seen, self.other = [], [], [], []
+        self.kept, self.waiting, self.seen, self.other, self.coarse, self.over = [], [], [], [], False, 0
         self.data = self.object = None
         ends = shape.min(axis=0), shape.max(axis=0)
         self.box = np.array([[ends[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
@@ -175,6 +176,7 @@ class Track:
         self.seen.append(frame)
         if form != self.form:
             self.other.append(frame)
+        if form != self.form or self.over or (self.coarse and frame != int(frame)):
             return
         if not self.deforms:
             straight = np.array(Matrix.LocRotScale(*Matrix(matrix).decompose()))
@@ -199,6 +201,16 @@ class Track:
         self.deforms = True
         for past in (self.kept, self.waiting):
             past[:] = [(at, matrix, moved(self.shape, matrix)) for at, matrix, _ in past]
+
+    def thin(self) -> None:
+        """Keep whole frames alone, or give up."""
+        if not self.coarse:
+            self.coarse = True
+            self.kept, self.waiting = (
+                [one for one in some if one[0] == int(one[0])] for some in (self.kept, self.waiting)
+            )
+        else:
+            self.over, self.kept, self.waiting = self.size, self.kept[:1], []
 
     def end(self, count: int) -> None:
         """Keep the last time, or one key where nothing moves. count : of all times."""
@@ -240,19 +252,21 @@ def bake(clock: Clock, owners: set[str], room: float) -> tuple[list[Track], dict
                 keep = {"preserve_all_data_layers": True, "depsgraph": clock.graph}
                 data[thing.name] = bpy.data.meshes.new_from_object(thing, **keep)
             tracks[key].data = data[thing.name]
-        tracks[key].add(frame, matrix, points, form)
+        track = tracks[key]
+        room += track.size
+        track.add(frame, matrix, points, form)
+        room -= track.size
+        while room < 0 and not (largest := max(tracks.values(), key=lambda track: track.size)).over:
+            room += largest.size
+            largest.thin()
+            room -= largest.size
     reasons: dict[str, str] = {}
     for track in tracks.values():
         track.end(len(frames))
-    for track in sorted(tracks.values(), key=lambda track: track.size):
-        if track.size > room:  # whole frames alone, rather than nothing
-            track.kept = [one for one in track.kept if one[0] == int(one[0])]
-        room -= track.size
         if track.other:
             reasons[track.owner] = f"its faces change, {len(track.other) / len(frames):.0%} of the time"
-        elif room < 0 or len(track.kept) > MOST_KEYS or len(track.kept) * track.corners > MOST_TARGET_VERTICES:
-            reasons.setdefault(track.owner, f"baked it would take {track.size / 1e6:.1f} MB")
-            room += track.size
+        elif track.over or len(track.kept) > MOST_KEYS or len(track.kept) * track.corners > MOST_TARGET_VERTICES:
+            reasons.setdefault(track.owner, f"baked it would take more than {max(track.over, track.size) / 1e6:.1f} MB")
     why = {track.name: reasons[track.owner] for track in tracks.values() if track.owner in reasons}
     baked = [track for track in tracks.values() if track.owner not in reasons]
     keep_out(clock, owners - reasons.keys() | {track.name for track in baked})

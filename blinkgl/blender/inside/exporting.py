@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 import numpy as np
 from baking import FURTHEST, SEEN, Clock, Track, bake, keep_out, sample, write_keys
-from glb import multiply_times, read, write
+from glb import read, write
 
 MOST_FRAMES = 100_000
 CONSTANT = 1e-7
@@ -30,7 +30,6 @@ NO_MATERIAL = (
 """What the exporter takes for a material that is missing."""
 UNKNOWN = {
     "VOLUME": "volumes", "POINTCLOUD": "point clouds", "CURVES": "hair", "GREASEPENCIL": "grease pencil",
-    "LIGHT_PROBE": "light probes", "SPEAKER": "speakers", "LATTICE": "lattices",
 }  # fmt: skip
 
 
@@ -111,9 +110,7 @@ def clock_of(frames: list[int] | None, per: int) -> Clock:
             f"frames {first} to {last} with {per} keys each cannot be exported",
             f"--frames FIRST LAST, at most {MOST_FRAMES} keys, or fewer --keys-per-frame",
         )
-    clock = Clock(first, last)
-    clock.stretch(per)
-    return clock
+    return Clock(first, last, per)
 
 
 # --- what is rendered -------------------------------------------------------------------------------------------------
@@ -197,6 +194,11 @@ def left_out(things: list[Any], clock: Clock) -> list[str]:
     used = {slot.material for thing in things for slot in thing.material_slots if slot.material is not None}
     odd = sorted((m for m in used if not has_plain_colour(m)), key=lambda m: m.name)
     say("materials without a plain colour or image look different (bake them in Blender)", odd, 8)
+    nodes = [
+        (m, node.inputs["Alpha"]) for m in used if m.use_nodes for node in m.node_tree.nodes if "Alpha" in node.inputs
+    ]
+    clear = {m for m, alpha in nodes if not alpha.links and alpha.default_value == 0}
+    say("materials with an alpha of 0 are invisible", sorted(clear, key=lambda m: m.name))
     pictures = [i for i in bpy.data.images if i.source == "FILE" and not i.packed_file and i.users]
     say("missing images", (i for i in pictures if not os.path.isfile(bpy.path.abspath(i.filepath))))
     missing = (one for one in bpy.data.libraries if not os.path.isfile(bpy.path.abspath(one.filepath)))
@@ -258,6 +260,8 @@ def export(clock: Clock, out: Path, clips: bool, tracks: list[Track]) -> dict[st
         import_module(f"io_scene_gltf2.blender.exp.animation.sampled.{part}.keyframes").fcurve_is_constant = is_constant
     out.unlink(missing_ok=True)
     clock.scene.frame_set(clock.here)  # its pose becomes the nodes' rest
+    render, base = clock.scene.render, clock.scene.render.fps_base
+    render.fps_base = clock.per / base  # the exporter divides frames by fps times base, where Blender has fps over base
     bpy.ops.export_scene.gltf(
         filepath=str(out),
         export_format="GLB",
@@ -277,20 +281,11 @@ def export(clock: Clock, out: Path, clips: bool, tracks: list[Track]) -> dict[st
         export_optimize_animation_keep_anim_object=False,
         export_try_omit_sparse_sk=False,
     )
+    render.fps_base = base
     if not out.is_file():
         raise Refused("Blender's exporter wrote nothing")
     tree, binary = read(out)
-    bends = ["targets" in mesh["primitives"][0] for mesh in tree.get("meshes", [])]
-    lost = False
-    for animation in tree.get("animations", []):  # it keys shape keys that modifiers have cost
-        aims = [
-            (channel["target"]["path"], tree["nodes"][channel["target"]["node"]]) for channel in animation["channels"]
-        ]
-        kept = [path != "weights" or bends[node["mesh"]] for path, node in aims]
-        animation["channels"] = [channel for channel, keep in zip(animation["channels"], kept) if keep]
-        lost |= not all(kept)
-    if tracks or lost or clock.factor != 1:
-        multiply_times(tree, binary, clock.factor)
+    if tracks:
         write_keys(tracks, tree, binary)
         write(out, tree, binary)
     return counts(tree)
@@ -372,7 +367,7 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
         verdict = json.loads(sys.stdin.readline())
         differ = {owner for name in verdict["differs"] for owner in owners.get(name, {name})} - tried
         denser = 1 if clock.simulated else verdict["denser"]
-        if number == ROUNDS - 1 or (not differ and denser == 1):
+        if number == ROUNDS - 1 or not (differ or denser > 1):
             break
         clock.stretch(clock.per * denser)
         say(doing=f"baking {len(differ)} objects")

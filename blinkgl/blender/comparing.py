@@ -20,7 +20,7 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import SceneObject
 from blinkgl.scene.worlds.from_file import from_document
 
-AT_FRAMES, BETWEEN = 1e-4, 5e-4
+AT_FRAMES, BETWEEN = 1e-4, 8e-4
 """Largest distances at frames and between frames, of a thing's size."""
 MOST_PER_FRAME = 8
 """Largest number of key frames per frame of the whole scene; what needs more is baked alone."""

@@ -218,7 +218,7 @@ def test_what_gltf_cannot_say_is_baked(imported):
             [part for part in (places(scene, o.name, t) for o in scene.objects) if np.ptp(part) > 1e-6]
         )
         off = max(cKDTree(ours).query(true)[0].max(), cKDTree(true).query(ours)[0].max())
-        assert off < 1e-4 * np.ptp(true, axis=0).max(), (t, off)
+        assert off < 2e-4 * np.ptp(true, axis=0).max(), (t, off)
     assert off_camera(scene, came, "Eye") < 1e-3
     assert {"Thick", "Both", "Column", "Spin", "Comes", "Trunk", "Ring"} <= set(came.report.baked)
     assert came.report.wrong == () and came.report.baked_mb < 2

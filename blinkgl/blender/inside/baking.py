@@ -25,7 +25,7 @@ PER_FRAME = 4
 FURTHEST = 1e9
 """Beyond it a place counts as broken."""
 CLOSE = 5e-5
-"""Error that straight lines between keys may have at a frame, of the size; between frames seven times as much."""
+"""Error that straight lines between keys may have at a frame, of the size; between frames twelve times as much."""
 MOST_KEYS, MOST_TARGET_VERTICES = 4000, 8_000_000
 """What BlinkGL reads of one mesh."""
 WAITING = 64
@@ -190,7 +190,7 @@ class Track:
         stride = len(self.waiting) // 8 + 1  # every frame, and some between
         for at, _, passed in [one for k, one in enumerate(self.waiting) if one[0] == int(one[0]) or k % stride == 0]:
             line = start + (points - start) * ((at - begin) / (frame - begin))
-            if np.abs(passed - line).max() > limit * (1 if at == int(at) else 7) or len(self.waiting) == WAITING:
+            if np.abs(passed - line).max() > limit * (1 if at == int(at) else 12) or len(self.waiting) == WAITING:
                 self.kept.append(self.waiting[-1])
                 self.waiting = []
                 break

@@ -19,7 +19,7 @@ from glb import add_keys
 from mathutils import Matrix
 
 SEEN = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CAMERA")
-SIMULATED = {"CLOTH", "SOFT_BODY", "FLUID", "DYNAMIC_PAINT", "PARTICLE_SYSTEM"}
+SIMULATED = {"CLOTH", "SOFT_BODY", "FLUID", "DYNAMIC_PAINT", "PARTICLE_SYSTEM", "GeometryNodeSimulationInput"}
 SAMPLES, MOST_POINTS, MOST_EACH = 25, 400_000, 400
 PER_FRAME = 4
 FURTHEST = 1e9
@@ -46,9 +46,8 @@ class Clock:
         self.map = self.scene.render.frame_map_old, self.scene.render.frame_map_new
         self.markers = [(marker, marker.frame) for marker in self.scene.timeline_markers]
         kinds = {modifier.type for thing in self.scene.objects for modifier in thing.modifiers}
-        nodes = {node.bl_idname for group in bpy.data.node_groups for node in group.nodes}
-        body = self.scene.rigidbody_world is not None
-        self.simulated = body or not SIMULATED.isdisjoint(kinds) or "GeometryNodeSimulationInput" in nodes
+        kinds |= {node.bl_idname for group in bpy.data.node_groups for node in group.nodes}
+        self.simulated = self.scene.rigidbody_world is not None or not SIMULATED.isdisjoint(kinds)
         self.graph: Any = None
         self.stretch(per)
 
@@ -84,11 +83,11 @@ class Clock:
             shapes: dict[str, tuple | None] = {}
             for one in self.graph.object_instances:
                 thing, owner = one.object, one.parent if one.is_instance else one.object
-                # The mesh of a curve is the curve.
+                unwanted = owners is not None and owner.name not in owners
+                # The mesh of a curve, an instance of its own, is the curve.
                 itself = one.is_instance and owner.name == thing.name and owner.type != thing.type
-                if itself or not one.show_self or thing.hide_render or owner.hide_render or thing.type not in SEEN:
-                    continue
-                if owners is not None and owner.name not in owners:
+                hidden = not one.show_self or thing.hide_render or owner.hide_render
+                if unwanted or itself or hidden or thing.type not in SEEN:
                     continue
                 if thing.name not in shapes:
                     shapes[thing.name] = surface(thing)
@@ -147,8 +146,9 @@ def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
             if not (np.abs(seen[key][3][frame]) < FURTHEST).all():
                 broken.add(key[0])
     kept = {key: one for key, one in seen.items() if key[0] not in broken}
-    gone = np.full((most, 3), np.nan)
-    points = [[at.get(frame, gone[: len(picked)]) for frame in frames] for *_, picked, at in kept.values()]
+    points = [
+        [at.get(frame, np.full((len(picked), 3), np.nan)) for frame in frames] for *_, picked, at in kept.values()
+    ]
     things = json.dumps([(name, changes) for (_, name, _), (_, changes, *_) in kept.items()])
     whole = [frame == int(frame) for frame in frames]
     np.savez(path, *points, things=things, times=[clock.seconds(frame) for frame in frames], whole=whole)

@@ -215,12 +215,11 @@ def left_out(things: list[Any], clock: Clock) -> list[str]:
 def has_plain_colour(material: Any) -> bool:
     """Return whether the exporter supports the colour: that of a Principled or an emitting surface, or a still
     picture's in the coordinates of the mesh."""
-    if not material.use_nodes:
-        return True
-    outputs = [node for node in material.node_tree.nodes if node.type == "OUTPUT_MATERIAL" and node.is_active_output]
+    nodes = material.node_tree.nodes if material.use_nodes else ()
+    outputs = [node for node in nodes if node.type == "OUTPUT_MATERIAL" and node.is_active_output]
     links = outputs[0].inputs["Surface"].links if outputs else ()
     if not links or links[0].from_node.type not in ("BSDF_PRINCIPLED", "EMISSION"):
-        return False
+        return not material.use_nodes
     surface = links[0].from_node
     colour = surface.inputs["Base Color" if surface.type == "BSDF_PRINCIPLED" else "Color"]
     paint = colour.links[0].from_node if colour.links else None

@@ -335,10 +335,15 @@ def import_(
     ] = None,
     keys_per_frame: Annotated[
         int,
-        typer.Option("--keys-per-frame", min=1, max=64, help="Key frames per frame; motion between them is linear."),
+        typer.Option(
+            "--keys-per-frame", min=1, max=64, help="Least key frames per frame; between them motion is linear."
+        ),
     ] = 1,
+    bake_mb: Annotated[
+        float, typer.Option("--bake-mb", min=1, help="Most megabytes of shapes that glTF has no words for, baked.")
+    ] = 256.0,
     clips: Annotated[
-        bool, typer.Option("--clips", help="One animation per action instead of one for the scene.")
+        bool, typer.Option("--clips", help="One animation per action instead of one for the scene; no baking.")
     ] = False,
     time_limit: Annotated[float, typer.Option("--time-limit", min=1, help="Time limit of Blender, s.")] = 900.0,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
@@ -358,6 +363,7 @@ def import_(
         frames=frames,
         fps=fps,
         keys_per_frame=keys_per_frame,
+        bake_mb=bake_mb,
         clips=clips,
         time_limit_s=time_limit,
         overwrite=overwrite,

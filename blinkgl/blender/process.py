@@ -88,7 +88,7 @@ class Blender:
         self._process = subprocess.Popen(
             [interpreter(), str(program), str(folder)],
             env=environment(home),
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
             start_new_session=True,
@@ -106,9 +106,18 @@ class Blender:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
         self._log.close()
+
+    def tell(self, words: dict[str, Any]) -> None:
+        """Send a line of JSON to the program's standard input. That it has ended is said by its answers."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(words).encode() + b"\n")
+            self._process.stdin.flush()
 
     def answers(self) -> Iterator[dict[str, Any]]:
         """Yield each line's object, until the program closes its standard output. A ``{"doing": …}`` is stored for

@@ -13,6 +13,7 @@ from blinkgl.config.reader import to_short_yaml
 from blinkgl.machine.terminal import plain_column, plain_console, say
 
 _LONGER_SIDE = 640  # px, typical of an event camera
+_MOST = 12  # things in a line
 
 
 def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False, **options: Any) -> int:
@@ -36,10 +37,15 @@ def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False,
     size = os.path.getsize(target)
     say(console, f"{target}: {size / 1e6:.1f} MB, from {os.path.basename(source)} by Blender {came.blender}")
     say(console, "  " + ", ".join(f"{count:,} {kind}" for kind, count in came.counts.items() if count))
-    for line in came.left_out:
-        say(console, f"note: {line}")
-    for line in came.omissions:
-        say(console, f"note: {line}")
+    taken = f"baked, since glTF cannot express it ({came.baked_mb:.1f} of {options['bake_mb']:g} MB)"
+    for what, lines, between in (
+        (taken, [f"'{name}'" for name in came.baked], ", "),
+        ("wrong", came.wrong, "; "),
+        ("missing or different", (*came.left_out, *came.omissions), "; "),
+    ):
+        if lines:
+            more = f"{between}and {len(lines) - _MOST} more (--json has all)" if len(lines) > _MOST else ""
+            say(console, f"{what}: {between.join(lines[:_MOST])}{more}")
     say(console, "to play it:")
     for line in _recipe(target, came).splitlines():
         say(console, f"  {line}")

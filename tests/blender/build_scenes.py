@@ -75,12 +75,13 @@ def vertices(shown, matrix) -> np.ndarray:
     return found.astype(float) @ T[:3, :3].T + T[:3, 3] if faces else np.zeros((0, 3))
 
 
-def truth(name: str, objects=(), cameras=(), everything: bool = False) -> None:
+def truth(name: str, objects=(), cameras=(), everything: bool = False, per: int = 1) -> None:
     if (FOLDER / f"{name}.blend").exists():
         bpy.ops.wm.open_mainfile(filepath=str(FOLDER / f"{name}.blend"))
     scene, found = bpy.context.scene, {}
-    for frame in range(scene.frame_start, scene.frame_end + 1):
-        scene.frame_set(frame)
+    for k in range((scene.frame_end - scene.frame_start) * per + 1):
+        frame = scene.frame_start + k / per if per > 1 else scene.frame_start + k
+        scene.frame_set(int(frame), subframe=frame - int(frame))
         graph, at = bpy.context.evaluated_depsgraph_get(), f"@{frame}"
         for thing in objects:
             shown = bpy.data.objects[thing].evaluated_get(graph)
@@ -91,7 +92,8 @@ def truth(name: str, objects=(), cameras=(), everything: bool = False) -> None:
             parts = []
             for i in graph.object_instances:
                 original, seen = i.object.original, i.show_self and not i.particle_system
-                if not i.is_instance and (original.hide_render or not original.show_instancer_for_render):
+                itself = i.is_instance and i.parent.type in ("FONT", "CURVE")  # its mesh, which is the curve
+                if i.object.hide_render or itself or (not i.is_instance and not original.show_instancer_for_render):
                     seen = False
                 if seen and i.object.type in MESH_LIKE:
                     parts.append(vertices(i.object, i.matrix_world))
@@ -288,28 +290,88 @@ def left_out() -> None:
     save("left_out")
 
 
-def refused() -> None:
-    """A file for each thing that would come wrong."""
-    fresh(8)
-    both = cube("Both")
+def unsaid() -> None:
+    """Motion that the exporter of glTF has no words for, or not between frames; at 30/1.001 frames per second."""
+    scene = fresh(8, 30)
+    scene.render.fps_base = 1.001
+    grid("Thick", 2).modifiers.new("Solidify", "SOLIDIFY").thickness = 0.1
+    thick = bpy.context.object.modifiers[0]
+    keyed(thick, "thickness", 0.1, 1.0, frames=(1, 8))
+    both = cube("Both", (3, 0, 0))
     both.shape_key_add(name="Basis")
-    both.modifiers.new("Bevel", "BEVEL")
-    save("keys_and_modifiers")
-    fresh(8)
-    spots, seed = grid("Spots", 2), cube("Seed", size=0.2)
-    seed.parent, spots.instance_type = spots, "VERTS"
-    save("at_vertices")
-    fresh(8)
+    for point in both.shape_key_add(name="wide").data:
+        point.co.x *= 3
+    both.modifiers.new("Bevel", "BEVEL").width = 0.1
+    keyed(both.data.shape_keys, "eval_time", 0.0, 10.0, frames=(1, 8))
+    both.data.shape_keys.use_relative = False
+    armature, column = rig()
+    column.location = (0, 3, 0)
+    second = armature.copy()
+    second.animation_data_clear()
+    linked(second)
+    keyed(second.pose.bones["lower"], "location", (0, 0, 0), (1, 0, 0), frames=(1, 8))
+    for bones in (armature, second):
+        column.modifiers.new("Armature", "ARMATURE").object = bones
+    spin = cube("Spin", (6, 0, 0))
+    spin.scale = (1, 0.2, 0.1)
+    keyed(spin, "rotation_euler", (0, 0, 0), (0, 0, 7 * math.radians(250)), frames=(1, 8))
+    comes = cube("Comes", (9, 0, 0))
+    keyed(comes, "hide_render", True, False, frames=(1, 5))
     tree = bpy.data.collections.new("Tree")
-    tree.objects.link(bpy.data.objects.new("Trunk", bpy.data.meshes.new("Trunk")))
+    trunk = cube("Trunk", (1, 0, 0))
+    keyed(trunk, "location", (1, 0, 0), (1, 0, 2), frames=(1, 8))
+    scene.collection.objects.unlink(trunk)
+    tree.objects.link(trunk)
     tree.instance_offset = (0.5, 0.25, 0)
-    one = linked(bpy.data.objects.new("One", None))
-    one.instance_type, one.instance_collection = "COLLECTION", tree
-    save("offset")
-    fresh(8)
+    for k in range(2):
+        one = linked(bpy.data.objects.new(f"Tree {k}", None))
+        one.instance_type, one.instance_collection, one.location = "COLLECTION", tree, (-5, 3 * k, 0)
+    spots, seed = grid("Spots", 2), cube("Seed", size=0.2)
+    spots.location, seed.parent, spots.instance_type = (0, -5, 0), spots, "VERTS"
+    bpy.ops.curve.primitive_bezier_circle_add(location=(12, 4, 0))
+    ring = bpy.context.object
+    ring.name, ring.data.resolution_u, ring.data.bevel_resolution = "Ring", 2, 0
+    keyed(ring.data, "bevel_depth", 0.1, 0.5, frames=(1, 8))
+    camera = linked(bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye")))
+    keyed(camera, "rotation_euler", (1.3, 0, 1.0), (1.1, 0, 0), frames=(1, 8))
+    scene.camera = camera
+    save("unsaid")
+    truth("unsaid", cameras=["Eye"], everything=True, per=2)
+
+
+def named() -> None:
+    """What cannot be baked, what is broken, and what glTF does not keep."""
+    scene = fresh(8)
+    scene.unit_settings.scale_length = 0.01
     build = cube("Builds").modifiers.new("Build", "BUILD")
     build.frame_start, build.frame_duration = -4, 10
-    save("builds")
+    grid("Large", 60).modifiers.new("Wave", "WAVE")
+    keyed(cube("Gone"), "location", (0, 0, 0), (1e20, 0, 0), frames=(1, 8))
+    cube("Shadow").visible_camera = False
+    cube("Away").users_collection[0].objects.unlink(bpy.context.object)
+    away = bpy.data.collections.new("Away")
+    away.objects.link(bpy.data.objects["Away"])
+    scene.collection.children.link(away)
+    away.hide_render = True
+    for name in ("Empty", "Tiles"):
+        made, tree = material(name)
+        cube(name).data.materials.append(made)
+        node = tree.nodes.new("ShaderNodeGroup" if name == "Empty" else "ShaderNodeTexImage")
+        if name == "Empty":
+            node.node_tree = bpy.data.node_groups.new("Empty", "ShaderNodeTree")
+            node.node_tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+        else:
+            node.image = bpy.data.images.new("Tiles", 8, 8, tiled=True)
+        tree.links.new(node.outputs[0], tree.nodes["Principled BSDF"].inputs["Base Color"])
+    lamp = linked(bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN")))
+    keyed(lamp.data, "energy", 0.0, 8.0, frames=(1, 8))
+    for k, name in enumerate(("Left", "Right")):
+        camera = linked(bpy.data.objects.new(name, bpy.data.cameras.new(name)))
+        camera.data.shift_x = 0.1 * k
+        scene.timeline_markers.new(name, frame=1 + 3 * k).camera = camera
+    keyed(camera.data, "lens", 20.0, 80.0, frames=(1, 8))
+    cube("Python").driver_add("location", 0).driver.expression = "str(frame) and 1"
+    save("named")
 
 
 def paints() -> None:
@@ -374,5 +436,5 @@ def odd() -> None:
 
 
 if __name__ == "__main__":
-    for build in (dancer, mixamo, formats, world, left_out, refused, paints, evil, odd):
+    for build in (dancer, mixamo, formats, world, left_out, unsaid, named, paints, evil, odd):
         build()

@@ -49,7 +49,8 @@ glb = {triangle()!r}
 Path({str(tmp_path / "who")!r}).write_text(f"{{os.getpid()}} {{folder}}")
 def say(**words): print(json.dumps(words), flush=True)
 REPORT = dict(blender="4.5.15", counts=dict(meshes=1, lights=0), left_out=["no [hair]: 'B'"],
-     cameras=["Eye"], camera="Eye", size=[1920, 1080], first=1, last=49, fps=24.0, duration_s=2.0)
+     cameras=["Eye"], camera="Eye", size=[1920, 1080], frames=[1, 49], fps=24.0, keys_per_frame=1, duration_s=2.0,
+     baked=["A"], baked_mb=0.25, unbaked=dict(A="its faces change"))
 """
         path.write_text(head + code)
         path.chmod(path.stat().st_mode | stat.S_IXUSR)

@@ -37,7 +37,8 @@ def test_blender_stays_in_its_own_programs():
         found = set(re.findall(r"^\s*(?:import|from)\s+([\w.]+)", file.read_text(), re.M))
         tops = {name.split(".")[0] for name in found}
         if file.parent == inside:
-            assert tops <= {"bpy", "numpy"} | set(sys.stdlib_module_names), (file, tops)
+            own = {other.stem for other in inside.glob("*.py")}
+            assert tops <= {"bpy", "mathutils", "numpy"} | own | set(sys.stdlib_module_names), (file, tops)
         else:
             assert not tops & {"bpy", "mathutils", "bmesh"}, file
 
@@ -56,6 +57,7 @@ def test_blender_stays_in_its_own_programs():
         ("a.blend", {"frames": (9, 2)}, ConfigError, r"--frames: not a range of frames \(got \(9, 2\)\)"),
         ("a.blend", {"fps": 0.0}, ConfigError, "--fps: out of range"),
         ("a.blend", {"keys_per_frame": 0}, ConfigError, "--keys-per-frame: out of range"),
+        ("a.blend", {"bake_mb": 0.5}, ConfigError, r"--bake-mb: out of range \(got 0.5\); expected 1 to 100000"),
         ("a.blend", {"time_limit_s": float("nan")}, ConfigError, "--time-limit: out of range"),
     ],
 )
@@ -128,7 +130,7 @@ def test_what_blender_is_asked_and_what_it_is_given(blend, tmp_path, fake, monke
     job, environment, argv, folder = json.loads(kept.read_text())
     assert job == {
         "source": str(blend), "shown": str(blend), "scene": "S", "frames": [3, 7], "fps": 25.0, "keys_per_frame": 4,
-        "clips": True,
+        "clips": True, "bake_mb": 256.0,
     }  # fmt: skip
     home = f"{folder}/home"
     assert environment["HOME"] == environment["BLENDER_USER_RESOURCES"] == environment["TMPDIR"] == home
@@ -143,13 +145,32 @@ def test_what_blender_is_asked_and_what_it_is_given(blend, tmp_path, fake, monke
     assert (tmp_path / "new" / "out.glb").read_bytes()[:4] == b"glTF"
 
 
+def test_blender_is_told_what_differs(blend, tmp_path, fake):
+    """Its triangle is a tenth beside its place at the second of two times."""
+    fake("""
+import numpy as np
+at = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1.0]])
+np.savez(folder / "seen.npz", at + [[[0, 0, 0]], [[0.1, 0, 0]]], times=[0, 0.5], whole=[True, True],
+         things=json.dumps([["A", False]]))
+(folder / "scene.glb").write_bytes(glb); say(compare=1)
+answer = json.loads(sys.stdin.readline())
+say(report=REPORT | {"left_out": [json.dumps(answer)]})
+""")
+    came = import_scene(blend, tmp_path / "out.glb")
+    assert json.loads(came.left_out[0]) == {"differs": ["A"], "denser": 1}
+    assert came.wrong == ("'A' as glTF exports it is off by up to 10 % of its size, for 1 of 2 s (its faces change)",)
+
+
 def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
     fake('say(blender="4.5.15"); say(doing="opening the file")\n' + WRITES)
     monkeypatch.chdir(tmp_path)
     assert cli.run(["import", str(blend), "--out", "out.glb"]) == 0
     out = capsys.readouterr().out
     assert re.search(r"out\.glb: 0\.0 MB, from a scene\.blend by Blender 4\.5\.15\n", out)
-    assert "\n  1 meshes\nnote: no [hair]: 'B'\n" in out
+    assert (
+        "\n  1 meshes\nbaked, since glTF cannot express it (0.2 of 256 MB): 'A'\nmissing or different: no [hair]: 'B'\n"
+        in out
+    )
     recipe = out.split("to play it:\n")[1]
     (tmp_path / "play.yaml").write_text(recipe)
     from blinkgl.config.run import load_run
@@ -181,6 +202,10 @@ def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
             r"a scene\.blend: the scene shows no shape; expected a scene with a mesh$",
         ),
         ("(folder / 'scene.glb').write_bytes(glb[:-4]); say(report=REPORT)", r"what Blender wrote cannot be read"),
+        (
+            "(folder / 'scene.glb').write_bytes(glb[:-4]); say(compare=1); time.sleep(600)",
+            r"what Blender wrote cannot be",
+        ),
     ],
 )
 def test_blender_that_refuses_crashes_or_stops_is_one_line(blend, tmp_path, fake, code, words):

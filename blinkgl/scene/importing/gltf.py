@@ -354,7 +354,8 @@ class Document:
             if path not in (*PATHS, "weights"):
                 self.omissions.add("animation of other properties")
                 continue
-            if node not in self.nodes:
+            # Blender keys the weights of shape keys that its modifiers have cost.
+            if node not in self.nodes or (path == "weights" and not self._target_count(node)):
                 continue
             if path != "weights" and self.nodes[node].matrix is not None:
                 self.omissions.add("animation of nodes that have a matrix")

@@ -78,7 +78,6 @@ float around_at(vec2 place)
 void main()
 {
     ivec2 here = in_pixel.xy;
-    // One point in the middle of its pixel, in NDC.
     gl_Position = vec4((vec2(here) + 0.5) / image_size * 2.0 - 1.0, 0.5, 1.0);
 
     LIGHT seen[9]; // row by row, the pixel itself in the middle
@@ -245,10 +244,9 @@ void main()
         float counted = 0.0;
         for (int k = 0; k < SAMPLES; ++k) {
             vec2 at = (vec2(k, 5 * k % SAMPLES) + 0.5) / float(SAMPLES) - 0.5;
-            // The nearest four centres: the pixel's own, and those across, down and at the corner. Is the way cut?
+            // The nearest four centres of the picture: its own, those across, down and at the corner. Is the way cut?
             ivec2 quarter = ivec2(sign(at));
             vec4 x = vec4(0.0, quarter.x, 0.0, quarter.x), y = vec4(0.0, 0.0, quarter.y, quarter.y);
-            // (Beyond the picture there is none.)
             bvec2 outside = notEqual(here + quarter, inside_picture(here + quarter));
             bvec4 cut = bvec4(false, outside, any(outside));
             for (int n = 0; n < count; ++n) {

@@ -125,14 +125,10 @@ def judged_by_samples(
                 and ids_there[y1, x0] == own
                 and ids_there[y1, x1] == own
             ):
-                above = (1.0 - ax) * nearness[y0, x0] + ax * nearness[y0, x1]
-                below = (1.0 - ax) * nearness[y1, x0] + ax * nearness[y1, x1]
-                # Farther is undecided, too: some may show another part of the object, behind the point, others one in
-                # front of it.
-                corners = nearness[y0, x0], nearness[y0, x1], nearness[y1, x0], nearness[y1, x1]
-                off = abs((1.0 - ay) * above + ay * below - inverse)
-                steep = max(corners) - min(corners) > _STEEP * inverse
-                if off > _SAME * inverse or steep or thin[y0, x0]:
+                n00, n01, n10, n11 = nearness[y0, x0], nearness[y0, x1], nearness[y1, x0], nearness[y1, x1]
+                between = (1.0 - ay) * ((1.0 - ax) * n00 + ax * n01) + ay * ((1.0 - ax) * n10 + ax * n11)
+                steep = max(n00, n01, n10, n11) - min(n00, n01, n10, n11) > _STEEP * inverse
+                if abs(between - inverse) > _SAME * inverse or steep or thin[y0, x0]:
                     verdict[y, x] = UNDECIDED
                 continue
             # Otherwise hidden, unless some pixel shows its own object or something that is not nearer.

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Rec. 709 weights of linear r, g, b."""
+
 
 def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
     """Return the linear light of sRGB values in [0, 1]. Any shape; float64 stays float64, all others become float32."""

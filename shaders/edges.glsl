@@ -4,17 +4,19 @@
 // A pixel's centre is inside a surface or not: 1 or 0, while the mean over its square is a share in between. Their
 // difference is a sum over the lines that bound the surface: each adds the area between it and the square's own
 // boundary as seen from the centre, signed. So corners, ends of lines and surfaces narrower than a pixel are correct,
-// for any order of the lines.
+// for any order of the lines. An outline of triangles smaller than a pixel is a zigzag: some of its lines run back, and
+// their shares cancel those of others. So all lines of a pixel use the same two surfaces, in either direction: those
+// that the depth buffer shows around the pixel, before and behind the line's depth.
 //
-// An outline of triangles smaller than a pixel is a zigzag: some of its lines run back, and their shares cancel those
-// of others. So all lines of a pixel must use the same two surfaces as "in front" and "behind", in either direction:
-// those that the depth buffer shows around the pixel, before and behind the line's depth.
+// The result is a mean of values of the picture, whose weights are areas: not negative, 1 in all. So no value arises
+// that no surface has. Where several lines cross a pixel, which surfaces they divide is a guess. Samples in the pixel
+// check it, and need no depth: a sample shows what those centres around show that a straight way leads to without
+// crossing a line. A hidden line changes nothing, because both of its sides show one surface. Within the accuracy of
+// the samples the shares decide.
 //
-// contours.py computes which lines cross which pixels, and their shares. Here one vertex and one point are drawn for
-// each crossed pixel, so that its neighbours are read once for any number of lines.
+// contours.py computes which lines cross which pixels (strokes.py): one vertex and one point for each crossed pixel.
 //
-// LIGHT: the type of a pixel's value, OF: its components in the picture. The sum is at least 0, because lines of
-// different surfaces may together subtract more than there is.
+// LIGHT: the type of a pixel's value, OF: its components in the picture.
 
 #ifndef LIGHT
 #define LIGHT vec4
@@ -41,10 +43,11 @@ const float NEARER = 0.001;
 const float DIAGONAL = 0.25; // weight of a pixel that touches at a corner
 const int ALONG = 12; // px, less one
 const float SNAP = 1.0 / 128.0; // px: rasterisers place corners on a grid of 1/256
-// Sums of shares: up to FEW they belong to an outline, a wire, a corner or a fold; from MANY on to a tangle.
-const float FEW = 1.4;
-const float MANY = 2.0;
 const int ROW = 512; // crossings in a row of their texture
+const int SAMPLES = 16; // a lattice: column k has row 5 k
+const int LINES = 12; // that the samples look at
+const int TANGLE = 48; // lines of a pixel that are looked at
+const float BORDER = 0.4999; // px from the centre: a line that reaches it goes on
 
 ivec2 inside_picture(ivec2 place)
 {
@@ -61,10 +64,20 @@ float depth_at(ivec2 place)
     return texelFetch(depths, inside_picture(place), 0).r;
 }
 
+// Where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round.
+float around_at(vec2 place)
+{
+    // A line that ends in the pixel's centre has no direction.
+    if (place == vec2(0.0))
+        return 0.0;
+    if (abs(place.x) >= abs(place.y))
+        return place.y / place.x + (place.x > 0.0 ? 0.0 : 4.0);
+    return (place.y > 0.0 ? 2.0 : 6.0) - place.x / place.y;
+}
+
 void main()
 {
     ivec2 here = in_pixel.xy;
-    // One point in the middle of its pixel, in NDC.
     gl_Position = vec4((vec2(here) + 0.5) / image_size * 2.0 - 1.0, 0.5, 1.0);
 
     LIGHT seen[9]; // row by row, the pixel itself in the middle
@@ -74,25 +87,43 @@ void main()
         seen[k] = seen_at(beside);
         there[k] = depth_at(beside);
     }
-    LIGHT plain = seen[4], change = LIGHT(0.0);
+    LIGHT plain = seen[4];
     float own = there[4];
-    // Sums of the silhouettes' shares and their sizes; of the creases' shares, the directions to their other sides, and
-    // the sizes of those that are not seams.
-    float shares = 0.0, sizes = 0.0, creases = 0.0, bent = 0.0;
+    // Of silhouettes beyond which the centre's surface is, and of those before it: the pixel's part that shows another
+    // surface; the sizes of the shares, and the sum of the others' values weighted by them.
+    vec2 parts = vec2(0.0), weights = vec2(0.0);
+    LIGHT others[2] = LIGHT[2](LIGHT(0.0), LIGHT(0.0));
+    // Of creases: the sum of the shares, the directions to their other sides, and the sizes of those that are no seams.
+    float creases = 0.0, bent = 0.0;
     vec2 towards = vec2(0.0);
+    // For the samples: lines' directions to the left and px from there to the centre; where they begin and end.
+    vec3 lines[LINES];
+    vec2 spans[LINES];
+    int count = 0;
 
-    // The pixel's crossings, CROSSING numbers each in two texels (contours.py): share, turn, room, depth; left, gain,
-    // kind.
-    for (int n = in_pixel.z; n < in_pixel.w; ++n) {
+    // The pixel's crossings (contours.py), each in two texels: begin, end, room, depth; left, kind, gain.
+    for (int n = in_pixel.z; n < min(in_pixel.w, in_pixel.z + TANGLE); ++n) {
         ivec2 at = ivec2(2 * (n % ROW), n / ROW);
         vec4 first = texelFetch(crossings, at, 0), second = texelFetch(crossings, at + ivec2(1, 0), 0);
-        float share = first.x, turn = first.y, room = first.z, depth = first.w;
-        vec2 left = second.xy;
-        float further = second.z, kind = second.w;
+        float room = first.z, depth = first.w, kind = second.z;
+        vec2 left = second.xy, way = vec2(left.y, -left.x);
+        // The area between the line and the square's boundary: the line's triangle with the centre, minus the square's
+        // sector between the same rays, of which 8 half sides are an area of 1. The shorter way round, unless the
+        // centre lies on the other side of the line.
+        vec2 begin = first.x * way - room * left, end = first.y * way - room * left;
+        float turn = around_at(end) - around_at(begin);
+        turn -= 8.0 * round(turn / 8.0);
+        if ((room > 0.0) != (turn > 0.0) && abs(turn) > 2.0)
+            turn += room > 0.0 ? 8.0 : -8.0;
+        float share = 0.5 * (begin.x * end.y - begin.y * end.x) - 0.125 * turn;
+        if (count < LINES && own <= depth * (1.0 + COVER * pixel)) {
+            lines[count] = vec3(left, room);
+            vec2 far = vec2(max(abs(begin.x), abs(begin.y)), max(abs(end.x), abs(end.y)));
+            spans[count++] = mix(first.xy, vec2(-9.0, 9.0), greaterThan(far, vec2(BORDER)));
+        }
         // 0: a silhouette; -1: one of the two faces' inner side, which runs back; 1: a crease; 2: a seam of textures
-        bool crease = kind > 0.5, seam = kind > 1.5, back_again = kind < -0.5;
-
-        if (crease) {
+        bool seam = kind > 1.5, back_again = kind < -0.5;
+        if (kind > 0.5) {
             // Otherwise the pixel shows something else. Seams are those of small parts of bent bodies, near what is
             // behind them.
             if (own <= depth * (1.0 + COVER * pixel) && own >= depth * (1.0 - (seam ? GAP * pixel : SAME))) {
@@ -161,16 +192,13 @@ void main()
             back = seen_at(to_back);
         }
         // A surface narrower than a pixel may be between all centres around, and visible further along.
-        if (!known) {
-            vec2 onwards = vec2(left.y, -left.x) / max(abs(left.x), abs(left.y));
-            for (int k = 0; k < 2 * ALONG && !known; ++k) {
-                int steps = (k % 2 * 2 - 1) * (k / 2 + 2);
-                ivec2 beside = ivec2(floor(vec2(here) + 0.5 + float(steps) * onwards));
-                float expected = depth + float(steps) * further;
-                known = abs(depth_at(beside) - expected) < SAME * expected;
-                if (known)
-                    front = seen_at(beside);
-            }
+        vec2 onwards = way / max(abs(left.x), abs(left.y));
+        for (int k = 0; k < 2 * ALONG && !known; ++k) {
+            int steps = (k % 2 * 2 - 1) * (k / 2 + 2);
+            ivec2 beside = ivec2(floor(vec2(here) + 0.5 + float(steps) * onwards));
+            float expected = depth + float(steps) * second.w;
+            known = abs(depth_at(beside) - expected) < SAME * expected;
+            front = known ? seen_at(beside) : front;
         }
         if (!known)
             continue;
@@ -182,42 +210,72 @@ void main()
                 other += on_left ? 8.0 : -8.0;
             share -= 0.125 * (other - turn);
         }
-        // The crossing moves its share of the pixel from the one surface to the other.
-        change += share * (front - back);
-        shares += share;
-        sizes += abs(share);
+        // The crossing moves its share of the pixel from the centre's surface to the other.
+        int side = inside ? 1 : 0;
+        parts[side] += inside ? -share : share;
+        weights[side] += abs(share);
+        others[side] += abs(share) * (inside ? back : front);
     }
 
-    // A surface folded within the pixel covers parts of it twice: limit to the whole. Where it covers the centre twice
-    // the sum starts from two.
-    float whole = 1.0;
-    if (shares < -1.0)
-        whole = max(shares + 1.0, -1.0) / shares;
-    else if (shares > 1.0)
-        whole = 1.0 / shares;
-    LIGHT result = plain + change * whole;
-    // A surface rough below a pixel has too many layers to count those over the centre: use their mean.
-    LIGHT around = LIGHT(0.0);
-    for (int k = 0; k < 9; ++k)
-        around += (k == 4 ? 0.25 : k % 2 == 1 ? 0.125 : 0.0625) * seen[k];
-    result = mix(result, around, smoothstep(FEW, MANY, sizes));
+    // A surface folded within the pixel covers parts of it twice: limit to the whole.
+    parts = clamp(parts, 0.0, 1.0);
+    parts /= max(parts.x + parts.y, 1.0);
+    LIGHT result = plain;
+    for (int side = 0; side < 2; ++side)
+        result += weights[side] > 0.0 ? parts[side] * (others[side] / weights[side] - plain) : LIGHT(0.0);
 
     // Of a crease the centre shows one side: the other has the sum's share, with either sign.
     if (towards != vec2(0.0)) {
-        float weights = 0.0, level = (bent > 0.0 ? SAME : COVER * pixel) * own;
-        LIGHT others = LIGHT(0.0);
+        float total = 0.0, level = (bent > 0.0 ? SAME : COVER * pixel) * own;
+        LIGHT beyond = LIGHT(0.0);
         towards = normalize(towards);
         for (int k = 0; k < 9; ++k) {
             vec2 by = vec2(k % 3, k / 3) - 1.0;
             float weight = max(dot(by, towards) / max(dot(by, by), 1.0) - 0.3, 0.0);
             weight = abs(there[k] - own) < level ? weight : 0.0;
-            others += weight * seen[k];
-            weights += weight;
+            beyond += weight * seen[k];
+            total += weight;
         }
-        if (weights > 0.0)
-            result += min(abs(creases), 1.0) * (others / weights - plain);
+        if (total > 0.0)
+            result += min(abs(creases), 1.0 - parts.x - parts.y) * (beyond / total - plain);
     }
-    result = max(result, min(LIGHT(0.0), plain));
+    if (count > 1) {
+        LIGHT sum = LIGHT(0.0), least = plain, most = plain;
+        float counted = 0.0;
+        for (int k = 0; k < SAMPLES; ++k) {
+            vec2 at = (vec2(k, 5 * k % SAMPLES) + 0.5) / float(SAMPLES) - 0.5;
+            // The nearest four centres of the picture: its own, those across, down and at the corner. Is the way cut?
+            ivec2 quarter = ivec2(sign(at));
+            vec4 x = vec4(0.0, quarter.x, 0.0, quarter.x), y = vec4(0.0, 0.0, quarter.y, quarter.y);
+            bvec2 outside = notEqual(here + quarter, inside_picture(here + quarter));
+            bvec4 cut = bvec4(false, outside, any(outside));
+            for (int n = 0; n < count; ++n) {
+                vec3 line = lines[n];
+                float off = dot(line.xy, at) + line.z, along = line.y * at.x - line.x * at.y;
+                vec4 offs = line.x * x + line.y * y + line.z, alongs = line.y * x - line.x * y;
+                vec4 meet = (alongs * off - along * offs) / (off - offs);
+                for (int i = 0; i < 4; ++i)
+                    cut[i] = cut[i] || offs[i] * off < 0.0 && meet[i] > spans[n].x && meet[i] < spans[n].y;
+            }
+            vec4 away = (x - at.x) * (x - at.x) + (y - at.y) * (y - at.y);
+            vec4 near = mix(1.0 / (away * sqrt(away)), vec4(0.0), cut);
+            float total = near.x + near.y + near.z + near.w;
+            if (total + weights.x == 0.0)
+                continue;
+            LIGHT value = near.x * plain + near.y * seen[4 + quarter.x] + near.z * seen[4 + 3 * quarter.y];
+            value += near.w * seen[4 + quarter.x + 3 * quarter.y];
+            // What no centre shows is a surface between them: one of those in front.
+            value = total > 0.0 ? value / total : others[0] / weights.x;
+            sum += value;
+            least = min(least, value);
+            most = max(most, value);
+            counted += 1.0;
+        }
+        LIGHT accuracy = (most - least) / float(SAMPLES);
+        sum /= max(counted, 1.0);
+        if (counted > 0.0)
+            result = clamp(clamp(result, sum - accuracy, sum + accuracy), least, most);
+    }
     light = vec4(0.0);
     light.OF = result;
 }

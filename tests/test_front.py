@@ -179,6 +179,17 @@ def test_arrays_as_mesh_and_image():
         blinkgl.generate(scene, "nowhere")
 
 
+def test_light_is_that_of_yaml_and_what_duration_leaves_out_is_said():
+    given = RunTemplate({"scene": {"kind": "random"}}, Path()).sequence(0).scene.light
+    assert box_scene().template().sequence(0).scene.light == given and (given.sun, given.sky) == (0.6, 0.4)
+    cut = box_scene(duration=0.07)
+    said = (
+        "time.duration: 0.07 s are 0.05 s, 1 intervals of labels (a multiple of 1 / time.label_rate = 0.05 s is whole)"
+    )
+    made, whole = (one.build(one.template().sequence(0)) for one in (cut, box_scene()))
+    assert made.omissions == (said,) and whole.omissions == ()
+
+
 def test_emulators_take_a_sensor():
     assert blinkgl.V2e(4, 4, sensor="davis346").config == blinkgl.load_sensor("davis346").emulator("v2e")
     assert blinkgl.Esim(4, 4, sensor="davis346", contrast_threshold=0.5).config.contrast_threshold == 0.5

@@ -10,7 +10,9 @@ recordings of its camera.
 
 A single recording does not tell the dark offset (ESIM's cost differs by 3 to 23 % between 0.003 and 0.1 of full scale,
 not always to the same side, since the threshold makes up for it): there it is held (``HELD``). Noise of single pixels
-is off while fitting; still pixels make 0.004 and 0.005 events a second (two recordings).
+is off while fitting; still pixels make 0.004 and 0.005 events a second (two recordings). The Voltmeter's noise k6 is
+held at what they tell: 0.0005 OFF events a second are half of k6^2 in us. Moving recordings do not tell it (from 2.7e-4
+to 3e-5 their rates change by 0.02, the judge by 0.01), and 2.7e-4 would make 0.08 events a second of every pixel.
 
 evbench (fbarranco/eventVision-evbench, ``DATA/sequences``) has a sequence that is not among the small recordings; its
 rows are turned over, its polarity inverted, and its frames' times are known by correlation alone.
@@ -47,7 +49,7 @@ FIT, WHOLE = 1_000_000, 10**10
 """Pixels times frames that are looked at of a recording: while fitting, and while judging."""
 NOISE_ELSEWHERE: dict[str, dict[str, Any]] = {
     "v2e": {"leak_rate_hz": 0.0, "leak_jitter": 0.0, "leak_cov_decades": 0.0, "shot_noise_rate_hz": 0.0},
-    "voltmeter": {"k4": 0.0, "k5": 0.0},
+    "voltmeter": {"k4": 0.0, "k5": 0.0, "k6": 3e-5},
 }
 HELD: dict[str, dict[str, Any]] = {"esim": {"log_eps": 0.01}, "v2e": {"full_scale": 255.0}, "voltmeter": {"k2": 5.0}}
 HOT = ("hot_pixel_fraction", "hot_pixel_rate_hz")

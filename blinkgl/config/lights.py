@@ -77,7 +77,8 @@ class EnvironmentConfig(Config):
 
     map: str = Field(description="equirectangular image: hdr or exr; an 8-bit image has no bright sun")
     strength: Radiance = Field(
-        1.0, description="factor on its radiance, which is scaled so that its 90th percentile is 0.8"
+        1.0,
+        description="factor on its radiance, which is scaled so that 90 % of its solid angle is darker than 0.8",
     )
     heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn as a sky at infinity")

@@ -96,6 +96,16 @@ class TimeConfig(Config):
         return int(self.duration * self.label_rate + 1e-9)
 
     @property
+    def cut(self) -> tuple[str, ...]:
+        """Return a line on the part of ``duration`` after the last whole label interval, which is left out; () if there
+        is none."""
+        whole = self.label_count / self.label_rate
+        if self.duration - whole < 1e-6 * self.duration:
+            return ()
+        said = f"time.duration: {self.duration:.6g} s are {whole:.6g} s, {self.label_count} intervals of labels"
+        return (f"{said} (a multiple of 1 / time.label_rate = {1 / self.label_rate:.6g} s is whole)",)
+
+    @property
     def t0_ns(self) -> int:
         """Return the start of the pre-roll, ns."""
         return round(self.start * NS_PER_S)

@@ -76,17 +76,22 @@ class DisplacementTimeline(_AdaptiveTimeline):
 
 class BrightnessTimeline(_AdaptiveTimeline):
     """Event frames between which the signal changes by at most a fraction of the contrast threshold, by |dL/dt| from
-    the shader at both ends of the step."""
+    the shader at both ends of the step, and edges of at least a threshold move by at most that many pixels."""
 
     kind: Literal["brightness"] = "brightness"
     max_fraction_of_threshold: float = Field(
         1.0,
         gt=0,
         le=100,
-        description="largest change between two frames, in units of the smallest nominal contrast threshold",
+        description="largest change between two frames, in units of the smallest nominal contrast threshold, and of "
+        "edges in px",
     )
     percentile: float = Field(
-        95.0, gt=0, le=100, description="percentile of |dL/dt| over the changing pixels; 100 bounds every sampled pixel"
+        95.0,
+        gt=0,
+        le=100,
+        description="percentile of |dL/dt| over the changing pixels, and of the speeds of edges; 100 bounds every "
+        "sampled pixel",
     )
 
 

@@ -252,7 +252,8 @@ class EventCamera:
             return self.emulator.step(frame.luminance, frame.t_ns, frame.rows)
         shown = self._resets.shown(frame.t_ns, self.emulator.decoded(frame.luminance))
         chunks = [self.emulator.step(light, t_ns, None if jump else frame.rows) for t_ns, light, jump in shown]
-        return chunks[0] if len(chunks) == 1 else Events.concatenate(chunks)
+        # Up to the first frame the pixels get used to the resets; no events are recorded.
+        return Events.concatenate(chunks) if self.frames > 1 else chunks[0]
 
 
 def emulate(

@@ -23,6 +23,11 @@ RISE_NS = 300_000
 """Duration of the jump: the ON events of a reset lie within half a millisecond."""
 
 
+BEFORE = 3
+"""Resets before the first frame, in its light. Afterwards no pixel is so near to its threshold that the next one
+carries it over, but for those that leak and noise bring there: a still scene is still from the first frame on."""
+
+
 class _Seen(NamedTuple):
     t_ns: int
     luminance: np.ndarray
@@ -33,8 +38,7 @@ class FrameResets:
 
     The signal is higher by ``kick`` thresholds ``RISE_NS`` after a reset. In an emulator that follows light at once it
     rises and, in ``length_ms``, returns linearly; an emulator with a low-pass gets brighter light, and its pixels
-    return at their own speed. Resets have the interval ``interval_ms``; the first comes ``first_ms`` after the first
-    frame.
+    return at their own speed. Resets have the interval ``interval_ms``; one comes ``first_ms`` after the first frame.
 
     emulator : that of the pixels.   threshold : its smallest nominal one, ln units: in three recordings whose
     thresholds differ by a factor of four the jump is 0.31 to 0.39 of it."""
@@ -51,18 +55,19 @@ class FrameResets:
 
     def shown(self, t_ns: int, luminance: np.ndarray) -> Iterator[tuple[int, np.ndarray, bool]]:
         """Yield (t_ns, luminance, changed) for an emulator up to a frame, that frame last; changed: the jump is in it,
-        or was in the one before.
+        or was in the one before. Up to the first frame: the resets before it (:data:`BEFORE`).
 
         luminance : (H, W) float32, linear; it is not changed, and a copy of it is kept."""
-        last, kicked = self._last, False
+        last = self._last
         if last is None:
-            self._began = t_ns
-        else:
-            kicked = self._at(last.t_ns) > 0
-            for knot in self._knots(last.t_ns, t_ns):
-                part = np.float32((knot - last.t_ns) / (t_ns - last.t_ns))
-                yield knot, self._lit(last.luminance + (luminance - last.luminance) * part, self._at(knot)), True
-                kicked = True
+            self._began = t_ns - BEFORE * self._every
+            last = _Seen(self._began, luminance)
+            yield self._began, luminance, True
+        kicked = self._at(last.t_ns) > 0
+        for knot in self._knots(last.t_ns, t_ns):
+            part = np.float32((knot - last.t_ns) / (t_ns - last.t_ns))
+            yield knot, self._lit(last.luminance + (luminance - last.luminance) * part, self._at(knot)), True
+            kicked = True
         here = self._at(t_ns)
         yield t_ns, self._lit(luminance, here), kicked or here > 0
         self._last = _Seen(t_ns, np.array(luminance, np.float32))

@@ -36,8 +36,8 @@ class Light(Piece):
 
     def __init__(
         self,
-        sun: float = 0.9,
-        sky: float = 0.6,
+        sun: float = 0.6,
+        sky: float = 0.4,
         *,
         lights: Sequence[Mapping[str, Any]] = (),
         environment: Mapping[str, Any] | None = None,

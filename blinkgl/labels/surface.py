@@ -43,15 +43,19 @@ class Normals(Label):
     name = "normals"
     unit, kind = "camera axes", "unit"
     shard = "normals.npy"
-    buffer, varyings, channels = "RGBA32F", ("normal",), 3
+    buffer, varyings, channels = "RGBA32F", ("local", "normal"), 3
     judged_in, tolerance = "of a unit vector", 1e-3
 
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
-        return {"camera_from_local": shot.moment.T_cam_obj[:, :3, :3]}
+        return {"camera_from_local": shot.moment.T_cam_obj}
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
-        rotation = scene.camera_path.pose(frame.t_ns)[:3, :3]
-        return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)
+        normal = frame.normal @ scene.camera_path.pose(frame.t_ns)[:3, :3]
+        ray = scene.camera.rays(frame.xy.reshape(-1, 2)).reshape(normal.shape)
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        normal = normal - np.maximum((normal * ray).sum(axis=-1, keepdims=True) + 1e-4, 0.0) * ray
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        return np.where(frame.hit[..., None], normal, 0.0)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -12,10 +12,8 @@ from numpy.typing import DTypeLike
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.io.frames import FrameSource
 from blinkgl.machine.kernels import kernel
-from blinkgl.srgb import linear_from_srgb
+from blinkgl.srgb import LUMA, linear_from_srgb
 
-_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
-"""ITU-R BT.709, on linear light."""
 _REFERENCE_WHITE = 203.0
 """cd/m² of white in PQ, which is 1 here (ITU-R BT.2408, 2.1)."""
 CURVES = ("srgb", "linear", "pq", "hlg")
@@ -136,7 +134,7 @@ class Decoder:
             if frame.ndim == 2:
                 return table[frame]
             out = np.empty(frame.shape[:2], np.float32)
-            _luma_by_table(np.ascontiguousarray(frame), table, _LUMA, out)
+            _luma_by_table(np.ascontiguousarray(frame), table, LUMA, out)
             return out
         if frame.dtype.kind != "f":
             raise EventDataError(
@@ -156,7 +154,7 @@ class Decoder:
             black, white = map(np.float32, self._levels)
             frame = np.maximum((frame - black) / (white - black), np.float32(0))
         linear = self._curve(frame)
-        return np.ascontiguousarray(linear if linear.ndim == 2 else linear @ _LUMA, np.float32)
+        return np.ascontiguousarray(linear if linear.ndim == 2 else linear @ LUMA, np.float32)
 
     def _curve(self, code: np.ndarray) -> np.ndarray:
         gamma = self.gamma

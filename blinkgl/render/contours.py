@@ -29,12 +29,16 @@ LINE = 7
 """Numbers of a line (:meth:`Lines.of`): both of its ends, px and depth (near / Z); its kind. The surface lies to the
 left of the direction from the first to the second end, x to the right and y down."""
 CROSSING = 8
-"""Numbers of a line's part in one pixel (:meth:`Lines.in_pixels`): its share, and its turn, in eighths of a turn along
-the pixel's boundary; px from the line to the centre, to the left; depth in the middle of the part; the direction to the
-left, a unit vector; the change of depth along the line per px of the longer axis; the line's kind."""
+"""Numbers of a line's part in one pixel (:meth:`Lines.in_pixels`): where it begins and ends, px along the line from the
+place nearest to the pixel's centre; px from the line to the centre, to the left; depth in the middle of the part; the
+direction to the left, a unit vector; the line's kind; the change of depth along it per px of the longer axis."""
 SILHOUETTE, BACK_AGAIN = 0, -1
 """Kinds of lines besides creases and seams (mesh_edges.py): silhouettes and borders; silhouettes where a closed surface
 is hollow."""
+
+
+_BUSIEST = 12
+"""Pixels with at least this many crossings are not sorted further (:func:`_by_pixel`)."""
 
 
 class _Arrays(NamedTuple):
@@ -264,22 +268,10 @@ def _most(lines):
 
 
 @kernel
-def _around(x, y):
-    """Return where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
-    # A line that ends in the pixel's centre has no direction.
-    if x == 0.0 and y == 0.0:
-        return 0.0
-    if abs(x) >= abs(y):
-        return y / x + (0.0 if x > 0.0 else 4.0)
-    return (2.0 if y > 0.0 else 6.0) - x / y
-
-
-@kernel
 def _cross(lines, width, height, out, places):
     """Write the crossings of each line, in order along it, and each one's pixel, y * width + x. Return their number.
 
-    A line is cut where it passes from pixel to pixel. The share is the area between the part and the square's boundary
-    as seen from the centre: the part's triangle with the centre, minus the square's sector between the same rays."""
+    A line is cut where it passes from pixel to pixel."""
     count = 0
     for n in range(len(lines)):
         ax, ay, dx, dy = lines[n, 0], lines[n, 1], lines[n, 3] - lines[n, 0], lines[n, 4] - lines[n, 1]
@@ -301,21 +293,13 @@ def _cross(lines, width, height, out, places):
         while low < 1.0:
             high = min(1.0, next_x, next_y)
             if high > low and 0 <= x < width and 0 <= y < height:
-                # Both ends of the part, from the pixel's centre.
+                # From the pixel's centre to the line's first end; the centre's place along the line.
                 fx, fy = ax - (x + 0.5), ay - (y + 0.5)
-                px, py, qx, qy = fx + low * dx, fy + low * dy, fx + high * dx, fy + high * dy
-                room = -(lx * fx + ly * fy)
-                # The shorter way round, unless the centre lies on the other side of the line.
-                turn = _around(qx, qy) - _around(px, py)
-                turn -= 8.0 * np.rint(turn / 8.0)
-                if (room > 0.0) != (turn > 0.0) and abs(turn) > 2.0:
-                    turn += 8.0 if room > 0.0 else -8.0
-                # Triangle with the centre, minus the sector: 8 half sides are an area of 1.
-                out[count, 0] = 0.5 * (px * qy - py * qx) - 0.125 * turn
-                out[count, 1] = turn
+                room, along = -(lx * fx + ly * fy), fx * ly - fy * lx
+                out[count, 0], out[count, 1] = along + low * length, along + high * length
                 out[count, 2], out[count, 3] = room, lines[n, 2] + 0.5 * (low + high) * gain
                 out[count, 4], out[count, 5] = lx, ly
-                out[count, 6], out[count, 7] = gain / longer, lines[n, 6]
+                out[count, 6], out[count, 7] = lines[n, 6], gain / longer
                 places[count] = y * width + x
                 count += 1
             low = high
@@ -336,13 +320,24 @@ def _by_pixel(crossings, places, width, counts, pixels, out):
     for n in range(len(crossings)):
         place = places[n]
         if counts[place] == 0:
-            pixels[found, 0], pixels[found, 1] = place % width, place // width
+            pixels[found, 2] = place
             found += 1
         counts[place] += 1
+    # Another one, of the pixels by their numbers of crossings: processors shade several at once, as long as the one
+    # with the most takes.
+    begins = np.zeros(_BUSIEST + 1, np.int64)
+    for k in range(found):
+        begins[min(counts[pixels[k, 2]], _BUSIEST)] += 1
+    begins[:] = np.cumsum(begins) - begins
+    for k in range(found):
+        place = pixels[k, 2]
+        at = min(counts[place], _BUSIEST)
+        pixels[begins[at], 3] = place
+        begins[at] += 1
     first = 0
     for k in range(found):
-        place = pixels[k, 1] * width + pixels[k, 0]
-        pixels[k, 2] = first
+        place = pixels[k, 3]
+        pixels[k, 0], pixels[k, 1], pixels[k, 2] = place % width, place // width, first
         first += counts[place]
         pixels[k, 3] = first
         counts[place] = pixels[k, 2]

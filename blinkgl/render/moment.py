@@ -57,11 +57,6 @@ def cam_from_obj_rate(
     return out
 
 
-def mat4_bytes(matrices: np.ndarray) -> bytes:
-    """Return the GLSL mat4 (column-major float32) of one (4, 4) float64 matrix."""
-    return np.ascontiguousarray(matrices.T, dtype=np.float32).tobytes()
-
-
 def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
     """Return the GLSL mat4x3 (4 columns of 3) with the x, y, w rows of a (4, 4) clip-space matrix."""
     return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()

@@ -18,9 +18,11 @@ SEEN, HIDDEN, UNDECIDED = 0, 1, 2
 
 # Relative differences of 1/Z. Another surface is in front when it is nearer by the first one: a pixel beside the
 # point's position shows another place of its surface. The point's own surface is visible when it is this near to the
-# plane through the four samples; a ray decides where it bends more.
+# plane through the four samples; a ray decides where it bends more. Where the samples themselves differ by the third,
+# they may be parts of the object one behind the other, with the point between them.
 _IN_FRONT = 1e-3
 _SAME = 3e-4
+_STEEP = 0.05
 # A ray ends this much before the point. Flow is float32: its end is off by up to some 1e-3 px, which on a slanted
 # surface is this much of its depth.
 SLACK = 1e-4
@@ -88,7 +90,7 @@ def judged_by_samples(
     HIDDEN: outside the image, before the near plane, or all four pixels around the new position show other, nearer
     objects.
     SEEN: all four show the point's own object, nothing thin is near (:func:`near_thin`), and their depths, interpolated
-    in 1/Z (exact on a plane, in the outermost half pixel, too), are not in front of it. UNDECIDED: the rest.
+    in 1/Z (exact on a plane, in the outermost half pixel, too), are the point's and differ little. UNDECIDED: the rest.
     """
     height, width = valid.shape
     thin = near_thin(ids_there, depth_there)
@@ -116,16 +118,17 @@ def judged_by_samples(
             y0 = min(max(int(np.floor(yt)), 0), last_y)
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
             ax, ay, own = xt - x0, yt - y0, ids[y, x]
-            # All four show its own object: visible, unless the interpolated surface is in front of the point.
+            # All four show its own object: visible, if the point is on the interpolated surface.
             if (
                 ids_there[y0, x0] == own
                 and ids_there[y0, x1] == own
                 and ids_there[y1, x0] == own
                 and ids_there[y1, x1] == own
             ):
-                above = (1.0 - ax) * nearness[y0, x0] + ax * nearness[y0, x1]
-                below = (1.0 - ax) * nearness[y1, x0] + ax * nearness[y1, x1]
-                if (1.0 - ay) * above + ay * below > inverse * (1.0 + _SAME) or thin[y0, x0]:
+                n00, n01, n10, n11 = nearness[y0, x0], nearness[y0, x1], nearness[y1, x0], nearness[y1, x1]
+                between = (1.0 - ay) * ((1.0 - ax) * n00 + ax * n01) + ay * ((1.0 - ax) * n10 + ax * n11)
+                steep = max(n00, n01, n10, n11) - min(n00, n01, n10, n11) > _STEEP * inverse
+                if abs(between - inverse) > _SAME * inverse or steep or thin[y0, x0]:
                     verdict[y, x] = UNDECIDED
                 continue
             # Otherwise hidden, unless some pixel shows its own object or something that is not nearer.

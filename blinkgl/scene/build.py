@@ -81,7 +81,9 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
 
 
 def equipped(scene: Scene, config: SequenceConfig) -> Scene:
-    """Return the scene with the sensors of the configuration, each recording what is configured."""
+    """Return the scene with the sensors of the configuration, each recording what is configured, and a note on what its
+    times leave out."""
+    scene = replace(scene, omissions=scene.omissions + config.time.cut)
     if config.sensors is None:
         return recording(scene, config)
     return replace(scene, rig=Rig(scene.rig.path, tuple(_on_rig(one, config.sensors) for one in config.sensors)))

@@ -205,7 +205,6 @@ def _shaded(comparison, name, r, g, on) -> Candidates:
 def _edges(comparison, name, r, g, on) -> Candidates:
     plain = comparison.gpu[f"{name}_plain"].astype(np.float64)[on]
     yield "nothing is filtered: the picture is the unfiltered one", plain
-    yield "the correction at contour lines has the wrong sign", 2 * plain - r
 
 
 # ------------------------------------------------------------------------------------------------- motion

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 # picture, depths = frames of the pass that `edges` filters, read back pixels, crossings = Lines().in_pixels(moment,
 # items, width, height) filtered(picture, depths, pixels, crossings, 1 / focal, what the program wrote)
 
-GAP, COVER, SAME, NEARER, DIAGONAL, ALONG, SNAP, FEW, MANY = 3.0, 6.0, 0.25, 0.001, 0.25, 12, 1 / 128, 1.4, 2.0
+GAP, COVER, SAME, NEARER, DIAGONAL, ALONG, SNAP = 3.0, 6.0, 0.25, 0.001, 0.25, 12, 1 / 128
+SAMPLES, LINES, TANGLE, BORDER = 16, 12, 48, 0.4999
 _AROUND = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 
 
@@ -71,6 +72,43 @@ def filtered(
     return out
 
 
+class _Line:
+    """A line's part in a pixel. begin, end, room, left : as of a crossing (contours.py)."""
+
+    def __init__(self, begin: float, end: float, room: float, left: np.ndarray):
+        self.begin, self.end, self.room, self.left = begin, end, room, left
+        self.way = np.array([left[1], -left[0]])
+        self.ends = tuple(along * self.way - room * left for along in (begin, end))
+
+    def share_and_turn(self) -> tuple[float, float]:
+        """Return the area between the line and the square's boundary as seen from the centre, and the part of the
+        boundary, in half sides: the shorter way round, unless the centre lies on the other side of the line."""
+        p, q = self.ends
+        turn = _around(*q) - _around(*p)
+        turn -= 8 * np.rint(turn / 8)
+        if (self.room > 0) != (turn > 0) and abs(turn) > 2:
+            turn += 8 if self.room > 0 else -8
+        return float(0.5 * (p[0] * q[1] - p[1] * q[0]) - turn / 8), float(turn)
+
+    def cuts(self, a: np.ndarray, b: np.ndarray) -> bool:
+        """Return whether the line, continued where it leaves the pixel, lies between two places."""
+        off_a, off_b = self.left @ a + self.room, self.left @ b + self.room
+        if not off_a * off_b < 0:
+            return False
+        meet = (self.way @ a * off_b - self.way @ b * off_a) / (off_b - off_a)
+        low, high = (abs(place).max() > BORDER for place in self.ends)
+        return bool((low or meet > self.begin) and (high or meet < self.end))
+
+
+def _around(x: float, y: float) -> float:
+    """Return where a ray from a pixel's centre leaves its square, along the boundary, in half sides: 8 all round."""
+    if x == 0 and y == 0:
+        return 0.0
+    if abs(x) >= abs(y):
+        return y / x + (0.0 if x > 0 else 4.0)
+    return (2.0 if y > 0 else 6.0) - x / y
+
+
 class _Pixel:
     """The content of one pixel and its neighbours."""
 
@@ -91,19 +129,27 @@ class _Pixel:
 
     def mean(self, x: int, y: int, crossings: np.ndarray) -> float:
         plain, own = self._light(x, y), self._depth(x, y)
-        change, shares, sizes = 0.0, 0.0, 0.0
+        # Of silhouettes, by whether the centre is on the surface in front: shares, their sizes, what is on the other
+        # side.
+        parts, sizes, others = np.zeros(2), np.zeros(2), np.zeros(2)
         creases, bent, towards = 0.0, 0.0, np.zeros(2)
-        for share, turn, room, depth, lx, ly, further, kind in crossings.tolist():
+        # What the samples look at.
+        lines: list[_Line] = []
+        for begin, end, room, depth, lx, ly, kind, further in crossings[:TANGLE].tolist():
+            line = _Line(begin, end, room, np.array([lx, ly]))
+            if len(lines) < LINES and own <= depth * (1 + COVER * self.pixel):
+                lines.append(line)
+            share, turn = line.share_and_turn()
             # A crease or a seam: both sides are on one surface, so only their shares are summed here.
             if kind > 0.5:
                 seam = kind > 1.5
                 if depth * (1 - (GAP * self.pixel if seam else SAME)) <= own <= depth * (1 + COVER * self.pixel):
                     creases += share
-                    towards += share * np.array([lx, ly])
+                    towards += share * line.left
                     bent += 0.0 if seam else abs(share)
                 continue
             # A silhouette: its share moves light from the surface behind to the one in front.
-            found = self._sides(x, y, own, room, depth, np.array([lx, ly]), further, kind < -0.5)
+            found = self._sides(x, y, own, room, depth, line.left, further, kind < -0.5)
             if found is None:
                 continue
             front, back, inside = found
@@ -111,32 +157,51 @@ class _Pixel:
             # A centre on the line itself belongs to the side that was drawn there.
             if abs(room) < SNAP and on_left != ((kind < -0.5) != inside):
                 share += (turn - _turn(turn, not on_left)) / 8
-            change += share * (front - back)
-            shares += share
-            sizes += abs(share)
-        # Limit the sum to the whole; below minus one the sum starts from two.
-        if shares < -1:
-            change *= max(shares + 1, -1.0) / shares
-        elif shares > 1:
-            change /= shares
-        result = plain + change
-        # A tangle of lines: the nearer to MANY, the larger the part of the mean of the pixels around.
-        part = min(max((sizes - FEW) / (MANY - FEW), 0.0), 1.0)
-        around = sum((2 - abs(dx)) * (2 - abs(dy)) / 16 * self._light(x + dx, y + dy) for dx, dy in _AROUND)
-        result += part * part * (3 - 2 * part) * (around - result)
+            parts[int(inside)] += -share if inside else share
+            sizes[int(inside)] += abs(share)
+            others[int(inside)] += abs(share) * (back if inside else front)
+        # Limit the sum to the whole.
+        parts = np.clip(parts, 0, 1)
+        parts /= max(parts.sum(), 1)
+        result = plain
+        for part, size, other in zip(parts, sizes, others, strict=True):
+            result += part * (other / size - plain) if size > 0 else 0.0
         # Creases: towards the pixels on their other side, if these are of the same surface.
         if towards.any():
             level = (SAME if bent > 0 else COVER * self.pixel) * own
             towards /= np.hypot(*towards)
-            weights, others = 0.0, 0.0
+            total, beyond = 0.0, 0.0
             for dx, dy in _AROUND:
                 weight = max((dx * towards[0] + dy * towards[1]) / max(dx * dx + dy * dy, 1) - 0.3, 0.0)
                 if weight > 0 and abs(self._depth(x + dx, y + dy) - own) < level:
-                    weights += weight
-                    others += weight * self._light(x + dx, y + dy)
-            if weights > 0:
-                result += min(abs(creases), 1.0) * (others / weights - plain)
-        return max(result, min(0.0, plain))
+                    total += weight
+                    beyond += weight * self._light(x + dx, y + dy)
+            if total > 0:
+                result += min(abs(creases), 1 - parts.sum()) * (beyond / total - plain)
+        if len(lines) < 2:
+            return result
+        # What no centre shows is a surface between them: one of those in front.
+        between = others[0] / sizes[0] if sizes[0] > 0 else None
+        values = [v for k in range(SAMPLES) if (v := self._sample(x, y, k, lines, between)) is not None]
+        if not values:
+            return result
+        mean, least, most = float(np.mean(values)), min(plain, *values), max(plain, *values)
+        accuracy = (most - least) / SAMPLES
+        return min(max(result, mean - accuracy, least), mean + accuracy, most)
+
+    def _sample(self, x: int, y: int, k: int, lines: list[_Line], between: float | None) -> float | None:
+        """Return the value at the k-th place in the pixel: the mean of the centres around that no line cuts off, by
+        their distances; ``between`` if there is none."""
+        at = (np.array([k, 5 * k % SAMPLES]) + 0.5) / SAMPLES - 0.5
+        total, value = 0.0, 0.0
+        for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            to = np.sign(at).astype(int) * (right, down)
+            there = x + int(to[0]), y + int(to[1])
+            if there == self._inside(*there) and not any(line.cuts(to, at) for line in lines):
+                weight = float(np.hypot(*(to - at)) ** -3)
+                total += weight
+                value += weight * self._light(*there)
+        return value / total if total > 0 else between
 
     def _sides(
         self, x: int, y: int, own: float, room: float, depth: float, left: np.ndarray, further: float, back_again: bool

@@ -48,10 +48,14 @@ def speeds(drawn: Drawn, percent: float) -> Ranked:
     return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
 
 
-def changes(drawn: Drawn, response: Response, percent: float) -> Ranked:
-    """Return the statistics of |d(signal)/dt|, per second, of (h, w, 2) float32 luminances and their rates."""
-    picture = drawn.read()
-    return ranked(np.abs(response.change(picture[..., 0], picture[..., 1])), percent)
+def speeds_of_edges(drawn: Drawn, luminance: np.ndarray, response: Response, percent: float) -> Ranked:
+    """Return :func:`speeds` where neighbouring pixels of the (h, w) luminance differ by a threshold or more."""
+    signal, edge = response.signal(luminance), np.zeros(luminance.shape, bool)
+    for s, on in ((signal, edge), (signal.T, edge.T)):
+        step = np.abs(np.diff(s, axis=0)) >= response.threshold
+        on[1:] |= step
+        on[:-1] |= step
+    return ranked(np.linalg.norm(drawn.read(), axis=-1)[edge], percent) if edge.any() else STILL
 
 
 def ranked(values: np.ndarray, percent: float) -> Ranked:
@@ -149,12 +153,18 @@ class Displacement(Timeline):
 
 
 class Brightness(Timeline):
-    """Steps in which the emulator's signal changes by a fraction of its threshold."""
+    """Steps in which the emulator's signal changes by a fraction of its threshold, and edges move by that many pixels:
+    the signal changes there by all of the contrast within a pixel, also where the surfaces themselves have one colour
+    and no rate."""
 
     def pace(self, t_ns: int) -> float:
         c = self.config
-        seen = changes(self.pictures.brightness(t_ns, c.sample_every), self.response, c.percentile)
-        return seen.percentile / (c.max_fraction_of_threshold * self.response.threshold)
+        picture = self.pictures.brightness(t_ns, c.sample_every).read()
+        luminance, rate = picture[..., 0], picture[..., 1]
+        seen = ranked(np.abs(self.response.change(luminance, rate)), c.percentile)
+        moving = self.pictures.velocity_of_movers(t_ns, c.sample_every)
+        edges = speeds_of_edges(moving, luminance, self.response, c.percentile)
+        return max(seen.percentile / self.response.threshold, edges.largest) / c.max_fraction_of_threshold
 
 
 _KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness}

@@ -106,6 +106,7 @@ def suite_design() -> tuple[Setting, ...]:
     points += [Setting(s, "edges", o) for s in _displacement(2, 1) for o in _SHARPER]
     points += [Setting(s, "edges", sharp) for s in _displacement(4, 3, 1.5, 0.5)]
     points += [Setting(s, a, sharp) for s in _displacement(2, 1, 0.5) for a in ("ssaa2", "edges2")]
+    points += [Setting(s, "edges2", sharp) for s in _displacement(3, 1.5)]
     points += [Setting(_displacement(0.5)[0], "ssaa4", sharp)]
     points += [Setting(f"brightness {c} C", "edges", sharp) for c in (4, 2, 1)]
     return tuple(dict.fromkeys(points))

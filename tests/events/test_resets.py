@@ -11,7 +11,7 @@ from blinkgl.config.readout import FrameResetsConfig, ReadoutConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.events.resets import RISE_NS
+from blinkgl.events.resets import BEFORE, RISE_NS
 
 H, W, MS = 20, 30, 1_000_000
 EXACT = EsimConfig(contrast_threshold=0.2, contrast_threshold_off=0.17, threshold_sigma=0.0, log_eps=1e-6)
@@ -31,16 +31,24 @@ def still(times_ms):
 
 @pytest.mark.parametrize("times_ms", [[0, 40], np.arange(0, 40.01, 0.25), [0, 1.13, 7.2, 7.9, 30, 40]])
 def test_a_still_pixel_fires_as_the_jump_passes_its_levels_whenever_frames_come(times_ms):
-    """Up by 2.5 thresholds and down again: two events each way, at the crossings of straight lines."""
+    """Up by 2.5 thresholds and down again: one or two events each way, at the crossings of straight lines, from the
+    level at which the resets before the first frame have left the pixels."""
     resets = FrameResetsConfig(interval_ms=20, kick=0.5 / 0.17, length_ms=2, first_ms=5)
-    events = events_of(still(times_ms), resets)
-    assert len(events) == 2 * 4 * H * W
-    for reset, ups, downs in ((5000, (0.2, 0.4), (0.23, 0.06)), (25_000, (0.26, 0.46), (0.29, 0.12))):
-        part = events.window(reset - 1000, reset + 4000)
-        rises = [RISE_NS / 1000 * level / 0.5 for level in ups]
-        falls = [RISE_NS / 1000 + 2000 * (1 - level / 0.5) for level in downs]
-        assert (part.p == np.repeat([1, 1, 0, 0], H * W)).all()
-        assert np.abs(part.t - np.repeat(np.array(rises + falls) + reset, H * W)).max() <= 2
+    events, level, expected = events_of(still(times_ms), resets), 0.0, []
+    for number in range(-BEFORE, 2):
+        ups, downs = [], []
+        while level + 0.2 <= 0.5:
+            ups.append(level := level + 0.2)
+        while level - 0.17 >= 0:
+            downs.append(level := level - 0.17)
+        rises = [RISE_NS / 1000 * up / 0.5 for up in ups]
+        falls = [RISE_NS / 1000 + 2000 * (1 - down / 0.5) for down in downs]
+        if number >= 0:
+            reset = 5000 + 20_000 * number
+            expected += [(reset + t, p) for times, p in ((rises, 1), (falls, 0)) for t in times]
+    at, polarity = np.repeat(np.array(expected), H * W, axis=0).T
+    assert len(events) == len(at) > 4 * H * W and (events.p == polarity).all()
+    assert np.abs(events.t - at).max() <= 2
 
 
 def test_of_moving_pixels_the_share_fires_that_stands_within_the_jump_of_its_threshold():
@@ -73,20 +81,26 @@ def test_codes_and_rows_are_as_light_and_whole_frames():
     assert len(Events.concatenate(coded)) == 2 * H * W and codes.tensor_device is None
 
 
+SHARP = dict(preset="clean", threshold_sigma=0.0, contrast_threshold=0.2, contrast_threshold_off=0.26)
+
+
 @pytest.mark.parametrize("luminance", [0.1, 0.6])
 @pytest.mark.parametrize(
     ("config", "kick", "expected"),
     [
-        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=0.0), 1.2, 1.0),  # from the middle
-        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 1.2, 1.0),  # behind a low-pass
-        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 0.9, 0.0),
-        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 1.8, 1.0),
-        (V2eConfig(preset="clean", threshold_sigma=0.0, cutoff_hz=150.0), 2.2, 2.0),
-        (VoltmeterConfig(k1=5.0, k2=1.0), 1.5, 1.5),  # from anywhere between two levels
+        (V2eConfig(**SHARP, cutoff_hz=0.0), 2.2, 2.0),  # level before each: 0, 0.7, 0.4, 0.1 thresholds
+        (V2eConfig(**SHARP, cutoff_hz=150.0), 0.9, 0.0),  # behind a low-pass
+        (V2eConfig(**SHARP, cutoff_hz=150.0), 1.8, 0.0),  # 0, 1, 1, 1
+        (V2eConfig(**SHARP, cutoff_hz=150.0), 2.2, 2.0),
+        (V2eConfig(**SHARP, cutoff_hz=150.0), 3.2, 2.0),  # 0, 0.4, 1.1, 0.5
+        (VoltmeterConfig(k1=5.0, k2=1.0), 0.9, 0.0),
+        (VoltmeterConfig(k1=5.0, k2=1.0), 1.5, 0.5),  # from anywhere between two levels
+        (VoltmeterConfig(k1=5.0, k2=1.0), 2.5, 1.5),
     ],
 )
 def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(config, kick, expected, luminance):
-    """A low-pass that light has to go through takes nothing of it."""
+    """A low-pass that light has to go through takes nothing of it. The fourth jump counts, after those before the first
+    frame."""
     light = [(t * MS, np.full((H, W), luminance, np.float32)) for t in range(40)]
     events = events_of(light, FrameResetsConfig(interval_ms=100, kick=kick, length_ms=2, first_ms=10), config)
     quiet = events_of(light, None, config)
@@ -98,7 +112,7 @@ def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(config, kick, ex
 def test_the_highest_jump_stays_within_the_emulators_range():
     light = [(t * MS, np.full((H, W), 1e9, np.float32)) for t in range(20)]
     resets = FrameResetsConfig(interval_ms=100, kick=5, length_ms=2, first_ms=5)
-    config = EsimConfig(contrast_threshold=0.05, contrast_threshold_off=5.0)
+    config = EsimConfig(contrast_threshold=0.05, contrast_threshold_off=0.05)
     assert len(events_of(light, resets, config)) > 0
     high = EsimConfig(contrast_threshold=5.0)
     assert len(events_of([(t, one / 1e9) for t, one in light], resets, high)) > 0
@@ -107,3 +121,22 @@ def test_the_highest_jump_stays_within_the_emulators_range():
 def test_a_jump_that_lasts_into_the_next_is_refused():
     with pytest.raises(ConfigError, match="length_ms: the jump does not end before the next one .*at most 9,"):
         validate(ReadoutConfig, {"frame_resets": {"interval_ms": 10, "kick": 0.1, "length_ms": 10}})
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        EsimConfig(contrast_threshold=0.2, contrast_threshold_off=0.3),
+        V2eConfig(preset="clean", contrast_threshold=0.2, cutoff_hz=150.0, leak_rate_hz=0.5, start="stationary"),
+        VoltmeterConfig(k1=5.0, k3=0.0, k4=5e-7, k5=0.0, k6=0.0),
+    ],
+    ids=lambda config: config.emulator,
+)
+def test_a_still_scene_is_as_still_at_first_as_later(config):
+    """Resets bring pixels over their threshold that leak brings near it, and no others: as many per second from the
+    first frame on."""
+    frames = [(t * 10 * MS, np.full((H, W), 0.4, np.float32)) for t in range(401)]
+    events = events_of(frames, FrameResetsConfig(interval_ms=40, kick=0.4, first_ms=3), config)
+    early, late = (len(events.window(*span)) / (H * W) / 2 for span in ((0, 2_000_000), (2_000_000, 4_000_000)))
+    leak = {"esim": 0.0, "v2e": 0.5, "voltmeter": 0.5}[config.emulator]
+    assert abs(early - leak) < 0.08 and abs(late - leak) < 0.08

@@ -171,19 +171,23 @@ def test_what_the_reference_says():
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     pose = np.eye(4)
     pose[:3, :3] = turn
-    scene = SimpleNamespace(camera_path=SimpleNamespace(pose=lambda t: pose if t == 9 else None))
+    scene = SimpleNamespace(
+        camera_path=SimpleNamespace(pose=lambda t: pose if t == 9 else None),
+        camera=SimpleNamespace(rays=lambda xy: np.array([[0.0, 0, 1], [0, 0, 1]])),
+    )
     ways = Flow(np.ones((1, 2, 2)), hit, ~hit)
     frame = SimpleNamespace(
         t_ns=9,
         hit=hit,
-        normal=np.ones((1, 2, 3)) * (1, 2, 3),
+        normal=np.ones((1, 2, 3)) * (0, 0, -1) @ turn.T,
+        xy=np.zeros((1, 2, 2)),
         velocity=np.ones((1, 2, 2)),
         depth=3,
         instance=4,
         forward=ways,
     )
     says = lambda name, which=0: LABELS[name].views[which].reference(scene, frame)
-    assert says("normals").tolist() == [[(np.array([1, 2, 3]) @ turn).tolist(), [0, 0, 0]]]
+    assert says("normals").tolist() == [[[0, 0, -1], [0, 0, 0]]]
     assert says("velocity").tolist() == [[[1, 1], [0, 0]]] and says("depth") == 3 and says("ids") == 4
     assert says("flow_forward").tolist() == [[[1, 1], [0, 0]]] and says("flow_forward", 1) is hit
     assert np.array_equal(says("occlusion_forward"), ~hit)

@@ -97,6 +97,17 @@ def off_silhouettes(frame: reference.ReferenceFrame):
 # ------------------------------------------------------------------------------------------------- every buffer
 
 
+def test_smoothed_normals_face_the_camera(gl):
+    """Of a ball of 20 faces, whose smoothed normals at its silhouette look away by up to 37 degrees."""
+    world = scene([thing("ball", 1, sphere(1.0, 0), still((0, 4, 0)))])
+    with Renderer(gl, world, RenderConfig()) as renderer:
+        frame = renderer.labels(0, LabelRequest("ids", "normals"))
+    rays = world.camera.rays(casting.pixel_grid(world.camera)).reshape(frame.normals.shape)
+    towards = (frame.normals * rays).sum(axis=-1)[frame.ids > 0] / np.linalg.norm(rays, axis=-1)[frame.ids > 0]
+    assert (towards < 0).all() and (towards > -2e-4).sum() > 20
+    np.testing.assert_allclose(np.linalg.norm(frame.normals, axis=-1)[frame.ids > 0], 1, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["plane", "sphere", "cube", "everything"])
 def test_every_buffer_of_the_label_pass(gl, name):
     world = shapes()[name]

@@ -13,7 +13,7 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render import casting, reference
 from blinkgl.render.occlusion import HIDDEN, NARROW, REACH, SEEN, UNDECIDED, judged_by_samples, near_thin
 from blinkgl.render.renderer import Renderer
-from render_scenes import LEVEL, cube, drift, mixed_scene, quad, rig, scene, sphere, still, thing
+from render_scenes import LEVEL, cube, drift, mesh, mixed_scene, quad, rig, scene, sphere, still, thing
 
 MS = 1_000_000
 
@@ -51,7 +51,9 @@ def verdict(x, y, flow, z, ids, depth_there, ids_there, near) -> int:
     if all(not own and there > 0 and there * 1.001 < z for there, own in at):
         return HIDDEN
     weights = [(1 - (xt - left), xt - left)[dx] * (1 - (yt - top), yt - top)[dy] for _, _, dx, dy in corners]
-    if all(own for _, own in at) and z * sum(w / there for w, (there, _) in zip(weights, at)) <= 1.0003:
+    between = sum(w / there for w, (there, _) in zip(weights, at) if there)
+    steep = z * np.ptp([1 / there if there else 0 for there, _ in at]) > 0.05
+    if all(own for _, own in at) and abs(z * between - 1) <= 3e-4 and not steep:
         return UNDECIDED if thin_around(left, top, ids_there, depth_there) else SEEN
     return UNDECIDED
 
@@ -70,8 +72,8 @@ def test_samples_equal_their_slow_twin(shape):
         if rng.random() < 0.4:
             ids_there[:] = ids[:] = 1
         y, x = np.mgrid[: shape[0], : shape[1]]
-        plane = 1 / (0.3 + 0.02 * x - 0.01 * y)
-        part = rng.choice([0, 0, 0.0005, 0.03, 0.3], shape) * rng.choice([-1, 1], shape)
+        plane = 1 / (0.3 + 0.002 * x - 0.001 * y)
+        part = rng.choice([0, 0, 0, 0, 0, 0, 0.0005, 0.03, 0.3], shape) * rng.choice([-1, 1], shape)
         depth_there = (plane * (1 + part)).astype(np.float32)
         depth_there[ids_there == 0] = 0
         z = (plane * (1 + rng.choice([0, 0.0005, 0.01, 0.1, 0.5], shape) * rng.choice([-1, 1], shape))).astype(
@@ -85,7 +87,7 @@ def test_samples_equal_their_slow_twin(shape):
             expected = verdict(c, r, flow[r, c], float(z[r, c]), ids, depth_there, ids_there, 2.0)
             assert found[r, c] == expected, (r, c)
             answers.add(expected)
-    assert answers == ({SEEN, HIDDEN, UNDECIDED} if max(shape) > 1 else answers)
+    assert answers == ({SEEN, HIDDEN, UNDECIDED} if min(shape) > 2 else answers)
 
 
 # ------------------------------------------------------------------------------------------------- rays
@@ -148,6 +150,29 @@ def test_masks_beside_silhouettes_are_those_of_the_reference(gl, make):
     assert counted > 500 and wrong <= 0.005 * counted
 
 
+def test_a_part_hides_another_of_the_same_mesh(gl):
+    """A post before a wall, one mesh and one id; the camera slides by, and the post's side turns out of sight. Whether
+    something is between is a ray's interval in two boxes."""
+    boxes = np.array([[(-0.15, 2.0, -1), (0.15, 2.3, 1)], [(-2, 2.6, -1.5), (2, 2.7, 1.5)]])
+    solid = [cube(0.5).vertices * (high - low) + (high + low) / 2 for low, high in boxes]
+    count = len(cube().vertices)
+    shape = mesh(np.concatenate(solid), np.concatenate([cube().faces, cube().faces + count]))
+    camera = rig(path=drift((0.55, 0, 0.03), (-0.05, 0, 0.03), LEVEL, LEVEL))
+    world = scene([thing("both", 1, shape, still())], camera)
+    frame = reference.render(world, 0, forward_ns=900 * MS)
+    mask, flow, same = masks(gl, world, 0, 900 * MS)
+    points = np.array([0.55, 0, 0.03]) + (casting.rays_of(world.camera, frame.hits().xy) @ LEVEL.as_matrix().T) * (
+        frame.depth.reshape(-1, 1)
+    )
+    eye = np.array([0.01, 0, 0.03])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (boxes[:, :, None] - eye) / (points - eye)
+    enters, leaves = ends.min(axis=1).max(axis=-1), ends.max(axis=1).min(axis=-1)
+    hidden = ((enters < leaves) & (enters < 1 - 1e-4)).any(axis=0).reshape(mask.shape)
+    ask = same & ~flow.outside
+    assert (hidden & ask).sum() > 1000 and ((mask != hidden) & ask).sum() <= 0.001 * (hidden & ask).sum()
+
+
 def wires():
     """Five of a third of a pixel to two, at all angles, before a wall; the camera slides by."""
     facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
@@ -188,7 +213,7 @@ def test_rays_are_asked_where_samples_do_not_agree_and_matter_there(gl, monkeypa
     monkeypatch.setattr(casting, "is_hidden", lambda s, t, xy, z, e: asked.append(len(xy)) or true(s, t, xy, z, e))
     world = crowd()
     mask, flow, same = masks(gl, world, 300 * MS, 420 * MS)
-    assert 0 < asked[0] < 0.12 * mask.size
+    assert 0 < asked[0] < 0.2 * mask.size
     monkeypatch.setattr(casting, "is_hidden", lambda s, t, xy, z, e: np.zeros(len(xy), bool))
     without, _, _ = masks(gl, world, 300 * MS, 420 * MS)
     hidden = flow.occluded & ~flow.outside & same

@@ -16,7 +16,7 @@ from blinkgl.gl.shader import ShaderError
 from blinkgl.labels import LabelRequest
 from blinkgl.render import casting
 from blinkgl.render.canvas import DEPTH_BUFFER
-from blinkgl.render.moment import View, mat4_bytes
+from blinkgl.render.moment import View
 from blinkgl.render.passes import Geometry, Input, Output, ScenePass, ScreenPass
 from blinkgl.render.renderer import Renderer
 from render_scenes import SECOND, cube, drift, mixed_scene, quad, scene, still, thing
@@ -76,7 +76,7 @@ class Lamplight(ScenePass):
 
     def set(self, painter, uniforms, item, shot):
         lamp = shot.inputs["shadows"].moment
-        uniforms["lamp_from_local"].write(mat4_bytes(lamp.mvp[item.object_index]))
+        uniforms["lamp_from_local"].write(np.ascontiguousarray(lamp.mvp[item.object_index].T, np.float32).tobytes())
 
 
 def test_a_pass_reads_another(gl):

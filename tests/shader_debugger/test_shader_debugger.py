@@ -161,12 +161,12 @@ def test_what_edges_puts_together_is_what_its_twin_does(shader, config, tmp_path
 
 
 def test_a_mistake_in_edges_is_named_and_can_be_probed(shader, config, shaders):
-    edit(shaders / "edges.glsl", "change += share * (front", "change -= share * (front")
+    edit(shaders / "edges.glsl", "light.OF = result", "light.OF = plain")
     names = ("--pass", "depth", "--pass", "luminance_edges")
     status, out, _ = shader("diff", config, "--shaders", shaders, *names)
     lines = out.splitlines()
     assert status == 1 and lines[0].startswith("The first that is wrong: luminance, edges (edges.glsl), on ")
-    assert "it looks as if: the correction at contour lines has the wrong sign" in lines[1]
+    assert "it looks as if: nothing is filtered: the picture is the unfiltered one" in lines[1]
     pixel = re.search(r"1 of 2 buffers are over their tolerance; look closer with: probe --pixel (\d+,\d+)", out)[1]
     status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", pixel)
     assert status == 0 and any(line.startswith("!! luminance, edges") for line in out.splitlines())

@@ -21,7 +21,7 @@ from PIL import Image, ImageOps
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.reading import contents, reading
-from blinkgl.srgb import DECODE_8BIT, to_srgb8
+from blinkgl.srgb import DECODE_8BIT, LUMA, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr", ".exr")
 _EXR = b"v/1\x01"
@@ -208,9 +208,13 @@ def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, flo
 
 
 def exposure(image: np.ndarray) -> float:
-    """Return the factor that brings the 90th percentile of an image's radiance to 0.8."""
-    level = float(np.percentile(image.max(axis=2), 90))
-    return 0.8 / level if level > 0 else 1.0
+    """Return the factor that brings the luminance of a panorama below which 90 % of its solid angle lie to 0.8; where
+    that is black, its mean."""
+    luminance, height = image @ LUMA, len(image)
+    # Rows of equal solid angle: their heights above the horizon are equally far apart in the sine.
+    rows = np.floor(np.arccos(1 - (2 * np.arange(height) + 1) / height) / np.pi * height).astype(int)
+    level = float(np.percentile(luminance[rows], 90))
+    return 0.8 / (level if level > 0 else max(float(luminance.mean()), 1e-30))
 
 
 def _radiance(data: bytes, where: str) -> np.ndarray:

@@ -44,7 +44,8 @@ _HOMES = {
     "blinkgl.types.events": ("Events",),
     "blinkgl.tensors": ("TensorEsim", "TensorEvents", "TensorV2e"),
     "blinkgl.sequence.request": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
-    "blinkgl.labels.frames": ("Flow", "LabelFrame"),
+    "blinkgl.labels.frames": ("LabelFrame",),
+    "blinkgl.labels.values": ("Flow",),
     "blinkgl.online.samples": ("StreamSample", "WindowSample"),
     "blinkgl.online.stream": ("StreamStats",),
     "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
@@ -73,7 +74,8 @@ if TYPE_CHECKING:  # for type checkers and editors; a test compares it with the 
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, RigRecording, record, record_rig, simulate_rig, simulate_sequence
     from blinkgl.front.surfaces import Light, Material
-    from blinkgl.labels.frames import Flow, LabelFrame
+    from blinkgl.labels.frames import LabelFrame
+    from blinkgl.labels.values import Flow
     from blinkgl.online.samples import StreamSample, WindowSample
     from blinkgl.online.stream import StreamStats
     from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Picture

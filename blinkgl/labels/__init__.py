@@ -10,13 +10,14 @@ from blinkgl.labels.boxes import ObjectBoxes
 from blinkgl.labels.disparity import Disparity
 from blinkgl.labels.files import Form
 from blinkgl.labels.flow import FlowTo
-from blinkgl.labels.frames import Flow, LabelFrame, LabelRequest
+from blinkgl.labels.frames import LabelFrame, LabelRequest, asked_for
 from blinkgl.labels.intervals import FlowIntervals, Flows, OcclusionIntervals, Occlusions
 from blinkgl.labels.label import Label
 from blinkgl.labels.occlusion import OcclusionAt
 from blinkgl.labels.semantics import Semantics
 from blinkgl.labels.surface import Depth, Ids, Images, Normals, SceneFlow, Velocity
-from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
+from blinkgl.labels.table import LABELS, label_of, register, unregister
+from blinkgl.labels.values import Flow
 
 for _row in (
     Images(),

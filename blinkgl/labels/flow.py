@@ -10,11 +10,11 @@ import numpy as np
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Label, Towards, View
+from blinkgl.labels.values import Flow
 
 if TYPE_CHECKING:
-    from blinkgl.render.passes import Shot
+    from blinkgl.render.passes.base import Shot
 
 
 def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:

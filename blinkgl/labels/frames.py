@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels.table import LABELS, label_of
+from blinkgl.labels.values import Flow
 
 
 class LabelRequest:
@@ -77,22 +78,19 @@ class LabelRequest:
         return f"LabelRequest({', '.join([*said, f'intervals_ns={self.intervals_ns}'] if self.intervals_ns else said)})"
 
 
+def asked_for(labels: LabelsConfig) -> LabelRequest:
+    """Return the request of ``labels:``."""
+    asked = [name for name, label in LABELS.items() if label.asked(labels)]
+    intervals = {ns for name in asked for ns in LABELS[name].intervals(labels)}
+    categories = next((found for name in asked if (found := LABELS[name].categories(labels))), ())
+    return LabelRequest(*asked, intervals_ns=sorted(intervals), categories=categories)
+
+
 def ending_within(intervals_ns: Iterable[int], before_ns: int, after_ns: int) -> list[int]:
     """Return the intervals that end in [before_ns, after_ns], with a tolerance of 1 µs: label times are rounded to ns,
     and a multiple of 1/30 s differs from that of the label interval."""
     there = {min(max(ns, before_ns), after_ns) for ns in intervals_ns if before_ns - 1000 < ns < after_ns + 1000}
     return sorted(there - {0})
-
-
-@dataclass(frozen=True, eq=False)
-class Flow:
-    """flow : (H, W, 2) float32 px, +x right, +y down, from t to t' at reference t; 0 where not valid.
-    valid : (H, W) bool, something is hit and it is in front of the camera at t'.
-    occluded : (H, W) bool or None, valid but not visible at t' (hidden by a surface, or outside the image)."""
-
-    flow: np.ndarray
-    valid: np.ndarray
-    occluded: np.ndarray | None = None
 
 
 class LabelFrame:

@@ -12,8 +12,8 @@ import numpy as np
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels.files import Form
 from blinkgl.labels.flow import seconds_of
-from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Label
+from blinkgl.labels.values import Flow
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ from blinkgl.scene.types import Scene
 from blinkgl.types.boxes import Boxes
 
 if TYPE_CHECKING:
-    from blinkgl.labels.frames import Flow, LabelFrame
-    from blinkgl.render.passes import Shot
+    from blinkgl.labels.values import Flow
+    from blinkgl.render.passes.base import Shot
     from blinkgl.render.reference import ReferenceFrame
 
 Towards = Literal["forward", "backward"]
@@ -90,7 +90,7 @@ class Drawn(Protocol):
     t_ns: int
     end_ns: int | None
     categories: tuple[tuple[str, int], ...]
-    leading: Mapping[int, LabelFrame]
+    leading: Mapping[int, Any]
 
     def raw(self, name: str) -> np.ndarray: ...
 

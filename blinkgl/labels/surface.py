@@ -12,7 +12,7 @@ from blinkgl.labels.label import Drawn, Label, View
 from blinkgl.scene.types import FARTHEST, Scene
 
 if TYPE_CHECKING:
-    from blinkgl.render.passes import Shot
+    from blinkgl.render.passes.base import Shot
     from blinkgl.render.reference import ReferenceFrame
 
 

@@ -8,16 +8,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import Field
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Label
-
-if TYPE_CHECKING:
-    from blinkgl.labels.frames import LabelRequest
-
 
 LABELS: dict[str, Label] = {}
 """Labels by ``name``, in the order of registration, which all lists of labels use."""
@@ -58,16 +54,6 @@ def label_of(name: str) -> Label:
     if name not in LABELS:
         raise KeyError(f"no label '{name}'; there are {', '.join(LABELS)}")
     return LABELS[name]
-
-
-def asked_for(labels: LabelsConfig) -> LabelRequest:
-    """Return the request of ``labels:``."""
-    from blinkgl.labels.frames import LabelRequest
-
-    asked = [name for name, label in LABELS.items() if label.asked(labels)]
-    intervals = {ns for name in asked for ns in LABELS[name].intervals(labels)}
-    categories = next((found for name in asked if (found := LABELS[name].categories(labels))), ())
-    return LabelRequest(*asked, intervals_ns=sorted(intervals), categories=categories)
 
 
 def _checked(label: Any) -> None:

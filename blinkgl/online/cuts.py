@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from blinkgl.errors import ConfigError
-from blinkgl.labels.frames import Flow
+from blinkgl.labels.values import Flow
 from blinkgl.online.job import StreamJob
 from blinkgl.online.samples import StreamSample, WindowSample
 from blinkgl.sequence import Simulation

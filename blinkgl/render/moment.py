@@ -19,7 +19,8 @@ from blinkgl.camera.drawing import seen_through
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
-    from blinkgl.scene.types import PosePath, Scene
+    from blinkgl.scene.motion.pose_path import PosePath
+    from blinkgl.scene.types import Scene
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -25,9 +25,10 @@ from blinkgl.config.lights import (
     direction_of,
 )
 from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
-from blinkgl.scene.types import Lamp, Light, Panorama, PosePath
+from blinkgl.scene.types import Lamp, Light, Panorama
 
 MAX_LAMPS = 32
 """Largest number of lamps of a scene: every lit pixel evaluates each."""

@@ -17,7 +17,7 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath, SharedOriginPath
-from blinkgl.scene.types import PosePath
+from blinkgl.scene.motion.pose_path import PosePath
 
 
 @dataclass(frozen=True, eq=False)

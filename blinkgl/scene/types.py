@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,33 +20,9 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.lights import LightConfig
 
 if TYPE_CHECKING:
+    from blinkgl.scene.motion.pose_path import PosePath
     from blinkgl.scene.rig import Rig, Sensor
     from blinkgl.scene.shapes.deformer import Deformer
-
-
-@runtime_checkable
-class PosePath(Protocol):
-    """A rigid motion over [t0_ns, t1_ns]; outside it the end poses are held (and the derivative is zero)."""
-
-    t0_ns: int
-    t1_ns: int
-
-    @property
-    def is_static(self) -> bool:
-        """Return whether the pose is the same at all times (lets a renderer cache its picture)."""
-
-    def pose(self, t_ns: int) -> np.ndarray:
-        """Return T_world_body at t_ns, (4, 4) float64."""
-
-    def derivative(self, t_ns: int) -> np.ndarray:
-        """Return dT/dt in 1/s, analytic, (4, 4) float64; last row zero. With body rate w: dR/dt = R [w]x."""
-
-    def poses(self, t_ns: np.ndarray) -> np.ndarray:
-        """Return poses at (N,) int64 times, (N, 4, 4) float64; equals stacking :meth:`pose`."""
-
-    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
-        """Return upper bounds over [ta, tb] of (|velocity of the body's origin| in units/s, |angular rate| in
-        rad/s)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.over_time import ImuConfig, imu_times
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath
-from blinkgl.scene.types import PosePath
+from blinkgl.scene.motion.pose_path import PosePath
 
 _HALF_NS = 20_000
 _LOOK_NS = 1_000_000

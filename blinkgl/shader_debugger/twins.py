@@ -22,7 +22,7 @@ from blinkgl.render.passes.edged import SKY
 from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
-    from blinkgl.shader_debugger.session import DebugRenderer
+    from blinkgl.render import Renderer
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -303,12 +303,12 @@ def places_of(camera: CameraModel) -> np.ndarray | None:
     return np.floor(lens.places_of(camera, flat, camera.width, camera.height).places).astype(np.intp)
 
 
-def pass_of(renderer: DebugRenderer, what: str, samples: Samples = Samples()) -> Pass:
+def pass_of(renderer: Renderer, what: str, samples: Samples = Samples()) -> Pass:
     """Return the pass that draws "luminance" or "colour"."""
     return {"luminance": Luminance, "colour": Colour}[what](samples, renderer.maps)
 
 
-def _parts(renderer: DebugRenderer, name: str) -> tuple[str, Pass, Pass]:
+def _parts(renderer: Renderer, name: str) -> tuple[str, Pass, Pass]:
     """Return (what the picture is of, the pass that draws it before, the pass that makes ``name`` from it)."""
     what = name.partition("_")[0]
     if name in LENSED:
@@ -318,14 +318,14 @@ def _parts(renderer: DebugRenderer, name: str) -> tuple[str, Pass, Pass]:
     return what, of, Edged(of)
 
 
-def drawn(renderer: DebugRenderer, name: str, t_ns: int) -> np.ndarray:
+def drawn(renderer: Renderer, name: str, t_ns: int) -> np.ndarray:
     """Return the program's result, (H, W) or (H, W, 3) float32; behind a lens ``edges`` makes a flat picture. name : of
     :data:`TWINNED`, here and below."""
     what, _, pass_ = _parts(renderer, name)
     return renderer.draw(pass_, t_ns).read(what)
 
 
-def twin_of(renderer: DebugRenderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+def twin_of(renderer: Renderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (the picture that the program reads, float32; its expected result, float64)."""
     written = drawn(renderer, name, t_ns)
     what, of, _ = _parts(renderer, name)

@@ -12,7 +12,8 @@ from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.trade.measure import QUICK, Options
-from blinkgl.trade.run import convergence_line, trade, write
+from blinkgl.trade.run import trade, write
+from blinkgl.trade.words import convergence_line
 
 
 def run(

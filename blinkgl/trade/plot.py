@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from blinkgl.report.charts import data_uri, number, render
+from blinkgl.trade.words import NAMES, convergence_line
 
 COLOURS = {
     "none": "#d9552f",
@@ -157,8 +158,6 @@ def _label(ax, rows: list[dict], cost: str, renderer) -> list:
 
 def page(result: dict, picture: bytes) -> str:
     """Return the HTML text. picture : the PNG of the plot."""
-    from blinkgl.trade.run import NAMES, convergence_line
-
     size = result["sizes"][result["size"]]
     trust = []
     for name, judged in result["sizes"].items():

@@ -26,8 +26,9 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.trade.measure import Density, Options
-from blinkgl.trade.run import chosen, convergence_line, plain, trade
+from blinkgl.trade.run import chosen, plain, trade
 from blinkgl.trade.settings import Setting, excess, pareto_front, suite_design
+from blinkgl.trade.words import convergence_line
 
 OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=480.0, rounds=3, rounds_s=240.0, labels=False)
 FILE = "suite.json"

@@ -332,6 +332,7 @@ ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
     "camera moves, and what moves by itself",
     "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
+    "frames.flow_direction": "tests/sequence/test_flow_of_others.py: it has to go with `labels.flow`",
     "events.device": "tests/tensors/test_device_emulator.py: either device writes the same files",
     "imu": "tests/sequence/test_inertial.py, tests/dataset/test_over_time.py; here what is written and read",
     **RUN_LEVEL,

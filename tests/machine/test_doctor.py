@@ -103,7 +103,7 @@ def test_how_frames_go_to_torch(gl, monkeypatch, answer, status, value, remedy):
         return SimpleNamespace(way=answer[0], why=answer[1], read=lambda: None, release=lambda: None)
 
     monkeypatch.setattr("blinkgl.render.tensors.TextureReader", reader)
-    card = SimpleNamespace(is_software=False, framebuffer=gl.framebuffer)
+    card = SimpleNamespace(is_software=False, ctx=gl.ctx, function=gl.function, idle=gl.idle)
     check = doctor._to_torch(card, "OpenGL")
     assert (check.status, check.value) == (status, value)
     assert remedy in check.remedy and bool(check.remedy) == bool(remedy)

@@ -29,6 +29,7 @@ from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.surfaces.images import load_panorama
 from blinkgl.scene.types import Fog, Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.sky import panorama_light
 from blinkgl.shader_debugger.lamps import near_an_edge
@@ -193,7 +194,10 @@ def cases(panoramas: Path | None) -> Iterator[Case]:
     for smooth, kind in ((True, "metal"), (False, "metal, rough")):
         yield Case(f"{kind}, sun and sky", metal(plain, smooth), (1, 2, 3, 4, 5))
     for file in sorted(panoramas.glob("*.hdr")) if panoramas is not None else ():
-        light = panorama_light(file, 0.0, 1.0, Light(), file.name)
+        # The path tracer's pictures were metered by the brightest channel of each pixel.
+        image, metered = load_panorama(file)
+        then = 0.8 / float(np.percentile(image.max(axis=2), 90))
+        light = panorama_light(file, 0.0, then / metered, Light(), file.name)
         yield Case(f"panorama {file.stem}", matt(light), every)
         for smooth, kind in ((True, "metal"), (False, "metal, rough")):
             yield Case(f"{kind}, panorama {file.stem}", metal(light, smooth), (1, 2, 3, 4, 5))

@@ -20,8 +20,8 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.trade.matching import match_events
 from blinkgl.trade.measure import Bench, FineTiles, Level, Options
 from blinkgl.trade.metrics import SpeedMaps, event_errors
-from blinkgl.trade.run import convergence_line
 from blinkgl.trade.settings import Setting, pareto_front
+from blinkgl.trade.words import convergence_line
 from blinkgl.types.events import Events
 
 CONFIG = {

@@ -35,7 +35,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from blinkgl.scene.motion.paths import CutPath
-from blinkgl.scene.types import PosePath, SceneObject
+from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.scene.types import SceneObject
 
 CAMERA = "camera"
 _SUPPORTS = ("ground", "wall")

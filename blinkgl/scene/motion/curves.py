@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.trajectory import ObjectMotion
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, waypoints
-from blinkgl.scene.types import PosePath
 
 _LEGS = 4  # waypoints of a random way, besides its start
 _SMOOTHNESS = 0.8

@@ -44,7 +44,8 @@ from blinkgl.machine.extras import install
 from blinkgl.scene.motion.body_shapes import Barrier, Shape, damping_ratio, plane_of, quaternions, shapes_of
 from blinkgl.scene.motion.paths import HermitePath, StaticPath
 from blinkgl.scene.motion.piecewise import thin
-from blinkgl.scene.types import Dynamics, PosePath, SceneObject
+from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.scene.types import Dynamics, SceneObject
 
 IMPACT_S = 1.6e-3
 """Duration of an impact, s: longer is softer. At a low rate it lasts ``LEAST_STEPS`` steps, which is longer."""

@@ -1,4 +1,4 @@
-"""Rigid motions over time: the :class:`~blinkgl.scene.types.PosePath` implementations.
+"""Rigid motions over time: the :class:`~blinkgl.scene.motion.pose_path.PosePath` implementations.
 
 All of them hold their end pose outside ``[t0_ns, t1_ns]`` and have a zero derivative there. Times are int64 nanoseconds
 and are subtracted as integers before they become float seconds, so a path that starts at 10^6 s is as precise as (in
@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion import piecewise
-from blinkgl.scene.types import PosePath
+from blinkgl.scene.motion.pose_path import PosePath
 
 # Rounding in the bounds' own arithmetic is of order 1e-15; this margin keeps them upper bounds.
 _BOUND_MARGIN = 1.0 + 1e-9

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.config.trajectory import CameraMotion, MotionConfig, ObjectMotion
 from blinkgl.scene.motion.paths import KeyframePath, PausedPath, StaticPath, rigid
-from blinkgl.scene.types import PosePath
+from blinkgl.scene.motion.pose_path import PosePath
 
 _REDRAWS = 6  # whole paths; the one that leaves free space least is used
 _TRIES = 40  # directions per leg, after which the leg is halved

@@ -29,6 +29,7 @@ from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.curves import path_along_curve
 from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath, smoothed
+from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
@@ -36,7 +37,7 @@ from blinkgl.scene.shapes.deformer import gait
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.types import Gloss, Map, Mask, Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.types import Gloss, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
 

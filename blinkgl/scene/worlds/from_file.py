@@ -24,10 +24,11 @@ from blinkgl.scene.importing.animations import Animation, Motion, clip_names, pl
 from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import AffinePath, StaticPath, nearest_rotation
+from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.reading import reading
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import content_hash
-from blinkgl.scene.types import Light, Part, PosePath, Scene, SceneObject
+from blinkgl.scene.types import Light, Part, Scene, SceneObject
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment

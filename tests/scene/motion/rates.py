@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blinkgl.scene.types import PosePath
+from blinkgl.scene.motion.pose_path import PosePath
 
 
 def body_rate(T: np.ndarray, dT: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import CutPath, KeyframePath, OffsetPath, StaticPath, rigid
-from blinkgl.scene.types import PosePath
+from blinkgl.scene.motion.pose_path import PosePath
 from tests.scene.motion.rates import body_rate
 
 SECOND = 1_000_000_000

@@ -1,0 +1,32 @@
+"""What every path of a body offers."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class PosePath(Protocol):
+    """A rigid motion over [t0_ns, t1_ns]; outside it the end poses are held (and the derivative is zero)."""
+
+    t0_ns: int
+    t1_ns: int
+
+    @property
+    def is_static(self) -> bool:
+        """Return whether the pose is the same at all times (lets a renderer cache its picture)."""
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        """Return T_world_body at t_ns, (4, 4) float64."""
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        """Return dT/dt in 1/s, analytic, (4, 4) float64; last row zero. With body rate w: dR/dt = R [w]x."""
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        """Return poses at (N,) int64 times, (N, 4, 4) float64; equals stacking :meth:`pose`."""
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """Return upper bounds over [ta, tb] of (|velocity of the body's origin| in units/s, |angular rate| in
+        rad/s)."""

@@ -15,8 +15,8 @@ AUTO = "auto"
 CAMERA, BODIES = "real_small", "real_bodies"
 AFFINE = 0.33
 """Mean distance of the flow from its nearest affine field, as a share of its mean length, below which only the camera
-moves. Medians of three windows were .15 to .26 for eight recordings of moving cameras, and .42 to .88 for 24 simulated
-sequences of independent bodies (docs/results_eflow.md)."""
+moves. Medians of windows were .17 to .27 for seven recordings of moving cameras, .36 for a head that turns, and .42 to
+.88 for 24 simulated sequences of independent bodies (docs/results_eflow.md)."""
 _PLACES = (0.25, 0.5, 0.75)
 
 

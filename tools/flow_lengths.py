@@ -19,15 +19,10 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
-from blinkgl.io.frames import read_any_image
 from blinkgl.machine.terminal import plain_console, say
-from blinkgl.recordings.simulation import emulator_config, frames_to_events
-from blinkgl.scene.surfaces.images import photographs
-from blinkgl.tools.real_recordings import cut, table
-from blinkgl.types.events import Events
+from blinkgl.tools.real_recordings import PANS, of_pans, table
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
 from eflow.data.window import RawSample
@@ -36,15 +31,6 @@ from eflow.models import FlowModel
 
 BINS = (0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 24.0)
 """Edges of the bins of true length, px."""
-PANS = ("astronaut", "gravel", "brick", "grass"), (40.0, 150.0, 600.0), (0.5, 1.0, 2.0, 4.0, 6.0)
-"""Photographs; speeds, px/s; lengths of windows, px."""
-EMULATORS = (
-    {"emulator": "esim", "contrast_threshold": 0.2},
-    {"emulator": "esim", "contrast_threshold": 0.5},
-    {"emulator": "v2e"},
-)
-HEIGHT, WIDTH = 180, 240
-DIRECTION = np.array([-0.825, -0.565])
 LEAST_EVENTS = 50
 Judged = tuple[float, float, float, float, float]
 """True length; predicted over true length and error over true length, of the flow as it is and sharpened."""
@@ -59,28 +45,6 @@ def of_pool(path: str) -> Iterator[tuple[StreamWindow, np.ndarray]]:
             StreamWindow(sample.new.t0, sample.old, sample.new),
             np.where(sample.valid[..., None], sample.flow, np.nan),
         )
-
-
-def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
-    """The same of photographs that move as one, at most half a pixel a frame."""
-    files = photographs()
-    for name, speed, emulator in itertools.product(*PANS[:2], EMULATORS):
-        image = read_any_image(files[name])
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        soft = cv2.GaussianBlur(cv2.resize(grey, (512, 512)).astype(np.float32) / 255, (0, 0), 0.6)
-        fps = max(100.0, 2 * speed)
-        frames = []
-        for k in range(int(13 / speed * fps) + 1):
-            x, y = DIRECTION * speed * k / fps - 40
-            moved = cv2.warpAffine(
-                soft, np.float32([[1, 0, x], [0, 1, y]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
-            )
-            frames.append(0.9 * moved**2.2 + 0.02)
-        events = Events.concatenate([*frames_to_events(frames, fps=fps, emulator=emulator_config(emulator))])
-        for length in PANS[2]:
-            span = round(1e6 * length / speed)
-            flow = np.broadcast_to(DIRECTION * speed * span * 1e-6, (HEIGHT, WIDTH, 2))
-            yield cut(events, int(events.t[-1]) - 1000 - span, span), flow
 
 
 def enlarged(sample: RawSample, factor: int) -> RawSample:

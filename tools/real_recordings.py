@@ -23,23 +23,28 @@ flow (which know the truth); at pixels with events, and over all. ``NAME+sharp``
 makes the events sharpest, which is what `eflow predict` gives. ``--changed`` adds their share of zero flow's error when
 only a part of the events is left (means of ten draws), and when the burst lies in the middle of a larger sensor.
 ``--sets`` adds the same table for data sets with labels (configs/eflow/independent_data.yaml is one): means over up to
-``--windows`` samples of each, evenly spaced.
+``--windows`` samples of each, evenly spaced; ``--pans`` that of four photographs that pass by, of 0.5 to 6 px a window.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.formats import open_events
+from blinkgl.io.frames import read_any_image
 from blinkgl.machine.terminal import plain_console, say
+from blinkgl.recordings.simulation import emulator_config, frames_to_events
+from blinkgl.scene.surfaces.images import photographs
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
@@ -57,6 +62,7 @@ MOVES = 1.1
 LONGEST_MS = 120.0
 MIDDLE = (260, 346)
 """Height and width, px, that are looked at of a large sensor."""
+PANNED = "pans across photographs"
 Answer = Callable[[StreamWindow], np.ndarray]
 
 
@@ -280,21 +286,63 @@ def row_of(judged: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]) 
 def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float]]:
     """The same of a data set with labels: its samples as pairs of windows, at most ``most``, evenly spaced."""
     source = open_source(path)
+    samples = (source[int(i)] for i in np.unique(np.linspace(0, len(source) - 1, most).round().astype(int)))
+    told = (s for s in samples if s.flow is not None and s.valid is not None and s.valid.any())
+    pairs = ((StreamWindow(s.new.t0, s.old, s.new), np.where(s.valid[..., None], s.flow, np.nan)) for s in told)
+    return of_pairs(pairs, names, str(path))
+
+
+def of_pairs(
+    pairs: Iterable[tuple[StreamWindow, np.ndarray]], names: list[str], where: str
+) -> dict[str, dict[str, float]]:
+    """The same of pairs of windows with their true flow, (H, W, 2) px, NaN where there is none."""
     answers: dict[str, Answer] = {}
     judged: dict[str, list] = {}
-    for i in np.unique(np.linspace(0, len(source) - 1, most).round().astype(int)):
-        s = source[int(i)]
-        if s.flow is None or s.valid is None or not s.valid.any():
-            continue
+    for pair, flow in pairs:
+        size = flow.shape[:2]
+        valid = np.isfinite(flow).all(-1)
         for name in names:
-            answers.setdefault(name, answer_of(name, s.height, s.width))
-        pair, truth = StreamWindow(s.new.t0, s.old, s.new), s.flow.astype(np.float64)
-        flows = best_of(truth, s.valid) | {name: answer(pair) for name, answer in answers.items()}
-        for name, flow in flows.items():
-            judged.setdefault(name, []).append((np.asarray(flow, np.float64), truth, s.valid, s.hit))
+            answers.setdefault(name, answer_of(name, *size))
+        hit, truth = hit_pixels((pair.old, pair.new), *size), np.where(valid[..., None], flow, 0.0).astype(np.float64)
+        for name, said in (best_of(truth, valid) | {name: answer(pair) for name, answer in answers.items()}).items():
+            judged.setdefault(name, []).append((np.asarray(said, np.float64), truth, valid, hit))
     if not judged:
-        raise BlinkGLError("no labelled sample", where=str(path))
+        raise BlinkGLError("no labelled sample", where=where)
     return {name: row_of(rows) for name, rows in judged.items()}
+
+
+PANS = ("astronaut", "gravel", "brick", "grass"), (40.0, 150.0, 600.0), (0.5, 1.0, 2.0, 4.0, 6.0)
+"""Photographs; speeds, px/s; lengths of windows, px."""
+EMULATORS = (
+    {"emulator": "esim", "contrast_threshold": 0.2},
+    {"emulator": "esim", "contrast_threshold": 0.5},
+    {"emulator": "v2e"},
+)
+HEIGHT, WIDTH = 180, 240
+DIRECTION = np.array([-0.825, -0.565])
+
+
+def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
+    """Pairs of windows and their true flow, (H, W, 2) px, of photographs that move as one, at most half a pixel a
+    frame."""
+    files = photographs()
+    for name, speed, emulator in itertools.product(*PANS[:2], EMULATORS):
+        image = read_any_image(files[name])
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        soft = cv2.GaussianBlur(cv2.resize(grey, (512, 512)).astype(np.float32) / 255, (0, 0), 0.6)
+        fps = max(100.0, 2 * speed)
+        frames = []
+        for k in range(int(13 / speed * fps) + 1):
+            x, y = DIRECTION * speed * k / fps - 40
+            moved = cv2.warpAffine(
+                soft, np.float32([[1, 0, x], [0, 1, y]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+            )
+            frames.append(0.9 * moved**2.2 + 0.02)
+        events = Events.concatenate([*frames_to_events(frames, fps=fps, emulator=emulator_config(emulator))])
+        for length in PANS[2]:
+            span = round(1e6 * length / speed)
+            flow = np.broadcast_to(DIRECTION * speed * span * 1e-6, (HEIGHT, WIDTH, 2))
+            yield cut(events, int(events.t[-1]) - 1000 - span, span), flow
 
 
 def table(title: str, heads: list[str], rows: list[list[Any]]) -> str:
@@ -312,6 +360,7 @@ def main() -> None:
     parser.add_argument("--bursts", action="store_true", help=f"the recordings of {TEST}, whose flow is known")
     parser.add_argument("--changed", action="store_true", help="with --bursts: fewer events, larger sensors")
     parser.add_argument("--sets", type=Path, nargs="*", default=[], help="data sets with labels, with --bursts")
+    parser.add_argument("--pans", action="store_true", help=f"with --bursts: {PANNED}")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     if a.sets and not a.bursts:
@@ -321,6 +370,7 @@ def main() -> None:
         known = {folder.name: burst(folder, a.answers) for folder in sorted((a.recordings / TEST).iterdir())}
         try:
             known |= {path.as_posix(): of_set(path, a.answers, a.windows) for path in a.sets}
+            known |= {PANNED: of_pairs(of_pans(), a.answers, PANNED)} if a.pans else {}
         except BlinkGLError as error:
             parser.error(str(error))
         for title, rows in known.items():

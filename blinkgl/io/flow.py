@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from blinkgl.config.frames import FLOW_FORMATS
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.images import encode_npy, encode_png, read_npy, read_pfm, read_png
@@ -118,13 +119,12 @@ def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 ENDINGS = (".png", ".flo", ".npy")
 """Endings of the files that are written."""
-FORMS = ("dsec", "kitti", "vkitti2", "tartanair2", "flo", "pfm", "flo5", "npy")
 READ_ENDINGS = (".png", ".flo", ".npy", ".pfm", ".flo5")
 
 
 def flow_form(path: str | os.PathLike) -> tuple[str, str | None]:
-    """Return the form of a flow file, one of ``FORMS``, and the line that says a guess, or None: 16-bit PNGs do not say
-    whose they are. Raises AssetError: unreadable."""
+    """Return the form of a flow file, one of ``FLOW_FORMATS``, and the line that says a guess, or None: 16-bit PNGs do
+    not say whose they are. Raises AssetError: unreadable."""
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix != ".png":
@@ -137,7 +137,7 @@ def flow_form(path: str | os.PathLike) -> tuple[str, str | None]:
         form = "vkitti2"
     else:
         form = "kitti" if any(part in ("flow_occ", "flow_noc") for part in path.parts) else "dsec"
-    return form, f"{path.name}: 16-bit flow taken as {form}'s (flow_format: {', '.join(FORMS[:4])})"
+    return form, f"{path.name}: 16-bit flow taken as {form}'s (flow_format: {', '.join(FLOW_FORMATS[:4])})"
 
 
 def _sixteen_bits(path: Path) -> np.ndarray:
@@ -150,7 +150,8 @@ def _sixteen_bits(path: Path) -> np.ndarray:
 def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool.
 
-    form : one of ``FORMS``; None: by the ending, DSEC's for .png.   Raises AssetError: missing, damaged, not flow."""
+    form : one of ``FLOW_FORMATS``; None: by the ending, DSEC's for .png.   Raises AssetError: missing, damaged, not
+    flow."""
     path = Path(path)
     if path.suffix.lower() not in READ_ENDINGS:
         accepted = ", ".join(READ_ENDINGS)

@@ -49,9 +49,9 @@ def load_plugins(files: Iterable[str | os.PathLike] = ()) -> None:
     os.environ[_VARIABLE] = os.pathsep.join(map(str, _PATHS.values()))
     for point in entry_points(group=GROUP):
         if point.name not in _LOADED:
-            module = _guarded(f"{GROUP}: {point.name}", point.load)
-            source = Path(getattr(module, "__file__", None) or __file__)
-            _LOADED[point.name] = hashlib.sha256(source.read_bytes()).hexdigest()[:16]
+            _guarded(f"{GROUP}: {point.name}", point.load)
+            source = sys.modules[point.module].__file__
+            _LOADED[point.name] = hashlib.sha256(Path(source or "").read_bytes()).hexdigest()[:16]
 
 
 def _guarded(where: str, load):

@@ -39,7 +39,7 @@ class _Lender:
         "blinkgl.dataset.deep",
         "blinkgl.sequence.rendered",
         "blinkgl.sequence.rig",
-        "blinkgl.trade.run",
+        "blinkgl.tools.trade.run",
     )
 
     def __init__(self):

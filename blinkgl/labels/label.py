@@ -21,7 +21,6 @@ from blinkgl.types.boxes import Boxes
 
 if TYPE_CHECKING:
     from blinkgl.labels.values import Flow
-    from blinkgl.render.passes.base import Shot
 
 Towards = Literal["forward", "backward"]
 
@@ -47,6 +46,18 @@ BUFFERS = {
 VARYINGS = ("local", "normal", "rate", "forward", "backward")
 _NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
+
+
+class Shot(Protocol):
+    """What is drawn, as a label's uniforms see it: :class:`blinkgl.render.passes.base.Shot`. ends : moments at other
+    times, by name ("forward", "backward")."""
+
+    @property
+    def moment(self) -> Any: ...
+    @property
+    def ends(self) -> Mapping[str, Any]: ...
+    @property
+    def scene(self) -> Scene: ...
 
 
 class ReferenceFrame(Protocol):

@@ -15,7 +15,7 @@ import numpy as np
 from blinkgl.render.casting import Hits, by_part, nearest, rays_of, scene_parts
 from blinkgl.scene.geometry.tangents import tangents
 from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, quartic_of, shadowing, surroundings_of
-from blinkgl.scene.shapes.deformer import normals_at
+from blinkgl.scene.shapes.sweep import normals_at
 from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.types import REPEAT, Lamp, Map, Material, Part, Scene, Texture
 from blinkgl.srgb import linear_from_srgb

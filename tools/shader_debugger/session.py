@@ -17,7 +17,7 @@ from blinkgl.config.sequence import NS_PER_S, SequenceConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import Uniforms, shader_folder
-from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.frames import DEPTH_BUFFER
 from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Luminance, Output, ScenePass
 from blinkgl.render.passes.shadow import ShadowMap

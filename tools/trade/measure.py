@@ -24,8 +24,8 @@ from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.grids import masked
 from blinkgl.gl import GLContext
-from blinkgl.render.canvas import Rectangle
 from blinkgl.render.cutouts import Cutouts, lattice, mask_of
+from blinkgl.render.frames import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene

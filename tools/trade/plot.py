@@ -177,7 +177,7 @@ def page(result: dict, picture: bytes) -> str:
         if isinstance(v, float) and k.startswith(("contrast", "threshold_sigma"))
     )
     return render(
-        "trade/trade.html",
+        "tools.trade/trade.html",
         title="Cost of accuracy",
         result=result,
         settings=result["settings"],

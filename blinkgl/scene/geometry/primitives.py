@@ -21,9 +21,8 @@ from numpy.typing import ArrayLike
 from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import closedness, make_mesh, weld
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.gait import CLIPS
-from blinkgl.scene.types import Mesh
+from blinkgl.scene.types import Deformer, Mesh
 
 PARAMETERS = {
     "size": "edge length, m",

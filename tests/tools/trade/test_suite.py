@@ -18,7 +18,7 @@ from blinkgl.config.quality import QUALITIES
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
-from blinkgl.render.canvas import Rectangle
+from blinkgl.render.frames import Rectangle
 from blinkgl.scene.build import sequence_scene
 from blinkgl.tools.quality_presets import meaning, preset_text, rows_of
 from blinkgl.tools.trade.measure import Density, FineTiles, Options

@@ -1,24 +1,11 @@
-"""Base of the deformers: a shape ``q(p, t)`` replaces ``p``, in the frame of its object.
-
-A rigid body's point is at ``T(t) p``, a deforming one's at ``T(t) q(p, t)``. With the clip matrix ``MVP`` the motion
-from t to t' is
-
-    MVP' (q' - q) + (MVP' - MVP) q,
-
-in which neither difference is one of rounded numbers: the second is composed in float64, and every deformer computes
-the first in its own form (:meth:`Deformer.changes`), so a motion of 1e-6 px is as exact as one of 10 px. Likewise for
-rates: ``MVP dq/dt + dMVP/dt q``.
-
-Everything here is plain float64 data; ``shaders/include/deform/`` has the vertex stage that uses the same numbers.
-"""
+"""Regions that deforming shapes fill over time: boxes, hulls, and their margins."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -27,115 +14,13 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from blinkgl.machine.kernels import kernel
 
 if TYPE_CHECKING:
-    from blinkgl.config.deform import DeformConfig
-    from blinkgl.scene.types import Mesh
+    from blinkgl.scene.types import Deformer, Mesh
 
 _SAMPLES = 32
 """Smallest number of times at which a shape is sampled to find its bounds."""
 _MAX_SAMPLES = 256
 _STEP_NS = 50_000_000
 _MARGIN = 1.25
-
-
-class Deformer(ABC):
-    """Deformation of one mesh. It belongs to a mesh (``Mesh.deformer``), whose vertices are the shape at rest.
-
-    For the vertex stage
-        glsl : name of the source, ``shaders/include/deform/NAME.glsl``, or of ``source`` where that is given.
-        source : the text itself: the five functions that ``shaders/include/deform.glsl`` names.
-        rows : numbers per time, as vec4.   attributes : further vertex attributes, (V, 1 to 4) float32 by GLSL name.
-        textures : (h, w, 4) float32 by sampler name.   sizes : further macros, whole numbers.
-
-    examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
-
-    goes : orientation of a moving body: "anyhow"; "upright" on the ground, "level" above it, both along its x axis.
-    speed : units/s that fit the motion, such as steps; 0: it may stay in place.
-
-    mirrors : whether the shape is a mirror image at some time (:meth:`side`).
-
-    Config : its model in ``deform:``; None: none.   period_ns : period of the shape; None: not periodic.   span_ns :
-    time from 0 after which the shape no longer changes."""
-
-    glsl: ClassVar[str]
-    source: ClassVar[str | None] = None
-    Config: ClassVar[type[DeformConfig] | None] = None
-
-    attributes: Mapping[str, np.ndarray] = {}
-    textures: Mapping[str, np.ndarray] = {}
-    sizes: Mapping[str, int] = {}
-    period_ns: int | None = None
-    span_ns: int = 0
-    goes: str = "anyhow"
-    speed: float = 0.0
-    mirrors: bool = False
-    examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
-
-    @classmethod
-    def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Deformer:
-        """Return the deformer of a ``deform:`` configuration, for an object whose box at rest is (3,) low to high. Only
-        for classes with a ``Config``."""
-        raise NotImplementedError
-
-    @property
-    @abstractmethod
-    def rows(self) -> int:
-        """Return the rows of the arrays of :meth:`numbers`, :meth:`rates` and :meth:`changes`."""
-
-    @property
-    def is_static(self) -> bool:
-        """Return whether the shape is the same at all times."""
-        return False
-
-    def side(self, t_ns: int) -> int:
-        """Return 1; where faces are mirrored at a time, -1; 0 where some are and others are not."""
-        return 1
-
-    # ---- the shape, on the CPU -----------------------------------------------------------------------------------
-
-    @abstractmethod
-    def positions(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        """Return q(p, t) of the mesh's vertices, (V, 3) float64."""
-
-    @abstractmethod
-    def velocity(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        """Return dq/dt, analytic, (V, 3) float64, units/s."""
-
-    @abstractmethod
-    def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        """Return directions of the normals, not normalised, (V, 3) float64."""
-
-    def sweep(self, mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
-        """Return the region that the shape fills over [t0, t1]. It is stored with the mesh."""
-        if self.period_ns is not None and t1_ns - t0_ns >= self.period_ns:
-            t0_ns, t1_ns = 0, self.period_ns
-        kept = _sweeps.setdefault(mesh, {})
-        if (t0_ns, t1_ns) not in kept:
-            kept[t0_ns, t1_ns] = Sweep.of(self, mesh, t0_ns, t1_ns)
-        return kept[t0_ns, t1_ns]
-
-    def bounds(self, mesh: Mesh, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the box that contains the shape over [t0, t1], ((3,), (3,))."""
-        swept = self.sweep(mesh, t0_ns, t1_ns)
-        return swept.low, swept.high
-
-    def transformed(self, matrix: np.ndarray) -> Deformer:
-        """Return the deformer of the mesh under an affine (4, 4) map A: q_A(A p) = A q(p). Raises TypeError where that
-        would be another kind of deformer."""
-        raise TypeError(f"{type(self).__name__} cannot be transformed")
-
-    # ---- the shape, for the vertex stage -------------------------------------------------------------------------
-
-    @abstractmethod
-    def numbers(self, t_ns: int) -> np.ndarray:
-        """Return the numbers of the shape at t for GLSL, (rows, 4) float64."""
-
-    @abstractmethod
-    def rates(self, t_ns: int) -> np.ndarray:
-        """Return the further numbers for dq/dt at t, (rows, 4) float64."""
-
-    @abstractmethod
-    def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
-        """Return the further numbers for q(p, there) - q(p, t), (rows, 4) float64."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,13 +135,25 @@ def _directions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 _sweeps: WeakKeyDictionary[Mesh, dict[tuple[int, int], Sweep]] = WeakKeyDictionary()
 
 
+def sweep(mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
+    """Return the region that a deforming mesh fills over [t0, t1]. It is kept as long as the mesh."""
+    deformer = mesh.deformer
+    assert deformer is not None
+    if deformer.period_ns is not None and t1_ns - t0_ns >= deformer.period_ns:
+        t0_ns, t1_ns = 0, deformer.period_ns
+    kept = _sweeps.setdefault(mesh, {})
+    if (t0_ns, t1_ns) not in kept:
+        kept[t0_ns, t1_ns] = Sweep.of(deformer, mesh, t0_ns, t1_ns)
+    return kept[t0_ns, t1_ns]
+
+
 def filled(mesh: Mesh) -> tuple[np.ndarray, float]:
     """Return ((K, 3) points, largest distance of the mesh from their hull): its vertices, or for a deforming mesh the
     corners of its region's hull."""
     if mesh.deformer is None:
         return mesh.vertices[np.unique(mesh.faces)], 0.0
-    sweep = mesh.deformer.sweep(mesh, 0, mesh.deformer.span_ns)
-    return sweep.hull[0], sweep.margin
+    swept = sweep(mesh, 0, mesh.deformer.span_ns)
+    return swept.hull[0], swept.margin
 
 
 def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:

@@ -1,19 +1,18 @@
-"""What users are told when something is wrong, as golden files that a person reads as a text.
-
-``tests/golden/messages.txt`` has every sentence of the sources (``python -m blinkgl.tools.messages`` makes it again);
-``tests/golden/commands.txt`` what the commands really print for some fifty mistakes (``BLINKGL_UPDATE_GOLDEN=1`` makes
-it again). A change of wording is a change of these files, to be reviewed there.
+"""What users are told when something is wrong: the form of every sentence in the sources, and the exact words that the
+commands print for a hundred mistakes, as a golden file that a person reads as a text (``BLINKGL_UPDATE_GOLDEN=1`` makes
+``tests/golden/commands.txt`` again).
 """
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
+from sentences import sentences
 
 from blinkgl import cli
-from blinkgl.tools import messages
 
 GOLDEN = Path(__file__).parent / "golden" / "commands.txt"
 
@@ -193,10 +192,37 @@ EFLOW_COMMANDS = [
 ][1:-1]
 
 
-def test_every_sentence_is_reviewed():
-    assert messages.text() == messages.GOLDEN.read_text(), (
-        "python -m blinkgl.tools.messages writes the file anew: read what has changed"
-    )
+LONGEST = 240
+FORM = {
+    "two sentences, or none": r"[.!]$|\. [A-Z]",
+    "two lines, or double spaces": r"\n|  ",
+    "no word of a person": r"(?i)\b(invalid|illegal|please|sorry|oops|unable to|failed to|you|we)\b",
+    "said twice": r"expected (expected|should|must)|; expected [^;]*; expected",
+    "an empty part": r": \(got|: ;|expected $|\(got …\)\S*\(got",
+}
+"""What is wrong with a sentence that matches."""
+PROPER = ("Blender", "Ray", "MuJoCo", "PyAV", "HDF5", "OpenGL", "EGL", "NumPy", "Renderer", "PNG")
+
+
+def test_every_sentence_has_the_form():
+    """WHERE: problem (got VALUE); expected WHAT, or a command: one line, no sentence, which begins in lower case."""
+    wrong, count = [], 0
+    for path, lines in sentences().items():
+        for line in lines:
+            count += 1
+            wrong += [f"{path}: {what}: {line}" for what, pattern in FORM.items() if re.search(pattern, line)]
+            problem = line.partition(": ")[2] if re.match(r"[^ ]+: ", line) else line
+            capital = (
+                re.match(r"[A-Z][a-z]", problem) and not problem.startswith(PROPER) and "." not in problem.split()[0]
+            )
+            wrong += [f"{path}: a capital: {line}"] * bool(capital)
+            wrong += [f"{path}: {len(line)} characters: {line}"] * (len(line) > LONGEST)
+    assert count > 800 and not wrong, "\n".join(wrong)
+
+
+def test_the_form_is_seen():
+    for line in ("Invalid value.", "x: ; expected a number", "a: b (got …); expected expected c", "a: please do"):
+        assert any(re.search(pattern, line) for pattern in FORM.values()), line
 
 
 def _said(run, capsys, words: str, folder: Path) -> str:

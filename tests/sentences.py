@@ -1,30 +1,17 @@
-"""Every sentence that a user can be refused with, in one file, to be read and reviewed as a text.
-
-    python -m blinkgl.tools.messages            # writes tests/golden/messages.txt
-    python -m blinkgl.tools.messages --check    # exit status 1 when that file is not what the sources say
-
-Collected from the sources, not by provoking them, so none is missing: every BlinkGLError that is made, and what the
-configuration's validators say. ``{…}`` stands where a value goes. Errors made by a helper that is given its sentence
-are listed where the helper is called.
+"""Every sentence that a user can be refused with, collected from the sources, so that none is missing: every
+BlinkGLError that is made, and what the configuration's validators say. ``{…}`` stands where a value goes. Errors made
+by a helper that is given its sentence are listed where the helper is called.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
-import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-GOLDEN = ROOT / "tests" / "golden" / "messages.txt"
 PACKAGES = ("blinkgl", "eflow", "tools")
-HEAD = """\
-# Every sentence that BlinkGL and eflow refuse something with. Made by `python -m blinkgl.tools.messages`; a test
-# compares.
-# {…} stands where a value goes. Reading this file is reviewing the messages: would a stranger know what to do?
-"""
 
 
 def error_classes(nodes: dict[str, list[ast.AST]]) -> set[str]:
@@ -153,24 +140,3 @@ def sentences() -> dict[str, list[str]]:
         if lines:
             found[path] = list(dict.fromkeys(line for _, line in sorted(lines)))
     return found
-
-
-def text() -> str:
-    return HEAD + "".join(
-        f"\n[{path}]\n" + "".join(f"{line}\n" for line in lines) for path, lines in sentences().items()
-    )
-
-
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare, write nothing")
-    options = parser.parse_args(arguments)
-    if options.check:
-        return int(not GOLDEN.exists() or GOLDEN.read_text() != text())
-    GOLDEN.parent.mkdir(exist_ok=True)
-    GOLDEN.write_text(text())
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -161,7 +161,8 @@ class Config(BaseModel):
         return data
 
     @model_validator(mode="after")
-    def _keep_rules(self):
+    def check_rules(self) -> Config:
+        """Return the model itself. Raises Refused where a rule is broken."""
         for one in self.rules:
             one(self)
         return self

@@ -164,11 +164,13 @@ def check_one_lens(tree: dict[str, Any]) -> None:
 
 
 def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
-    """Return ``tree`` with every sensor of its rig complete: the sensor's own keys over the preset's, both over the top
+    """Return ``tree`` with every sensor of its rig, if it is one, complete: the sensor's own keys over the preset's, both over the top
     level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes nothing.
 
     Raises ConfigError for an unknown rig, no list of sensors or an empty one, two sensors of one name, or sections that
     a sensor cannot have."""
+    if not is_rig(tree):
+        return tree
     for key in ("images", "imu", "tracks"):
         if tree.get(key) is not None:
             raise ConfigError(
@@ -296,8 +298,10 @@ def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
             )
 
 
-def baseline_of(one: RigSensorConfig, other: RigSensorConfig) -> float | None:
+def baseline_of(one: RigSensorConfig, other: RigSensorConfig | None) -> float | None:
     """Return the distance along the x axis of ``one`` to ``other``, m; None where the two are not a rectified pair."""
+    if other is None:
+        return None
     a, b = one.camera.model, other.camera.model
     if a != replace(b, near=a.near) or not isinstance(a, PinHole):
         return None

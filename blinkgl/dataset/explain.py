@@ -31,7 +31,7 @@ from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.types import Light, Scene
-from blinkgl.sequence import SequenceRequest, Simulation, simulate_sequence
+from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
 from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import surfaces_at
@@ -156,7 +156,7 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
     """Explain a sequence of recorded frames: nothing is rendered; the first few frames are converted and timed."""
     frames = config.frames
-    probe = simulate_sequence(SequenceRequest(config, index, base, labels=False))
+    probe = simulate_sequence(SequenceRequest(config, index, base, labels=False)).alone
     files, flows, masks, way = probe.files, probe.flow.files, probe.flow.masks, probe.flow.direction
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
@@ -277,7 +277,7 @@ def _timed(run, times) -> float:
 def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, result: Explanation) -> None:
     """Add every kind of drawing, a few of each timed."""
     times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
-    probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer))
+    probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer)).alone
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short part of the real sequence
     event_s = _timed(lambda t: renderer.luminance(t).view(), times)
     result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
@@ -298,7 +298,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     result.add("event kernel", said, result.frames, each)
 
 
-def _event_frames(config: SequenceConfig, probe: Simulation, times: list[int], duration: float) -> int:
+def _event_frames(config: SequenceConfig, probe: SensorSimulation, times: list[int], duration: float) -> int:
     """Return the number of event frames, from the pace at a few times."""
     timeline = config.timeline
     if timeline.kind == "uniform":

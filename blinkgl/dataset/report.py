@@ -13,7 +13,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.version import __version__
 
 if TYPE_CHECKING:
-    from blinkgl.sequence.rig import RigSequence
+    from blinkgl.sequence import Simulation
 
 STAGES = ("scene", "render", "read-back", "events", "images", "write", "preview")
 """The stages of a sequence's time; the rest is "other"."""
@@ -43,7 +43,7 @@ class SequenceReport:
     notes: tuple[str, ...] = ()
     """what was guessed, left out or not drawn of the files, a line each"""
 
-    def count(self, sequence: RigSequence) -> None:
+    def count(self, sequence: Simulation) -> None:
         """Count the items so far."""
         self.frames, self.events, self.labels, self.seconds = (
             sequence.frames,
@@ -53,7 +53,7 @@ class SequenceReport:
         )
         self.causes, self.notes = sequence.causes, tuple(sequence.notes)
 
-    def finish(self, sequence: RigSequence, flushed_s: float) -> None:
+    def finish(self, sequence: Simulation, flushed_s: float) -> None:
         """Complete the report when the files exist. flushed_s : time to close them."""
         self.count(sequence)
         self.seconds["write"] += flushed_s

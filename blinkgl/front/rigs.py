@@ -116,7 +116,7 @@ def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Rig(Piece):
-    """Sensors that move together: ``record_rig(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
+    """Sensors that move together: ``record(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
 
     sensors : :class:`RigSensor`, with different names.   preset : "stereo", "davis", "dsec" or "mvsec": its sensors
     come first, changed by those of ``sensors`` with the same names (docs/rigs.md).
@@ -127,7 +127,7 @@ class Rig(Piece):
             check.one_of(one, f"Rig.sensors[{k}]", RigSensor, "a RigSensor")
         self.sensors = sensors
         # both keys: a rig replaces the one of a configuration
-        self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors] or None}
+        self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors]}
         try:
             spelled_out(self.tree, ())
         except ConfigError as error:

@@ -103,7 +103,7 @@ def generate(
     source : :class:`Scene` or the result of :func:`load`.   num : number of sequences (of each group at most).
     workers : processes; 1: this one.
     resume : continue where ``out`` contains sequences of this run.   settings : emulator, sensor, timeline, quality,
-    labels, images, imu, tracks as of :func:`record`, rig as of :func:`record_rig`.
+    labels, images, imu, tracks as of :func:`record`, rig as of :func:`record`.
     Returns the counts (``made.events``, ``made.labels`` …) and the sequences set aside.
     Raises BlinkGLError: ConfigError (also for a scene with arrays: save them to files
     first), AssetError, GLError, OutputError."""

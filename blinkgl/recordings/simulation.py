@@ -389,8 +389,8 @@ def file_to_events(
         done = 0
         for step in steps:
             if video is not None:
-                video.add_events(step.events)
-                if video.due(step.t_ns // 1000):
+                video.panels[0].add_events(step.events)
+                if video.panels[0].due(step.t_ns // 1000):
                     video.frame(step.t_ns // 1000, step.luminance())
             out.append(step.events)
             if progress is not None and report.frames > done:
@@ -420,15 +420,12 @@ def _preview(
 ) -> Iterator[PreviewWriter]:
     """Return a video of frames and events, at the frames' rate up to 100 Hz, which appears completely or not at all."""
     from blinkgl.io.atomic import atomic_file
-    from blinkgl.sequence_files.preview import PreviewWriter
+    from blinkgl.sequence_files.preview import Panels, PreviewWriter
 
     rate = min(1e9 / gap_ns, 100.0)
-    with (
-        atomic_file(path, overwrite=overwrite) as temporary,
-        PreviewWriter(
-            temporary, height, width, t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)
-        ) as writer,
-    ):
+    fps = min(rate, 25.0)
+    panels = Panels(height, width, t0_us=start_us, flow=False, rate_hz=rate, fps=fps)
+    with atomic_file(path, overwrite=overwrite) as temporary, PreviewWriter(temporary, [panels], fps) as writer:
         yield writer
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Family, Members, Refused, Removed, rule
+from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.trajectory import as_pair, ordered
 
 if TYPE_CHECKING:
@@ -25,11 +25,12 @@ PeriodRange = Annotated[tuple[_Period, _Period], BeforeValidator(as_pair), After
 Phase = Annotated[float, Field(ge=-360, le=360, description="phase of the oscillation at time 0, degrees")]
 
 
-class DeformConfig(Family):
+class DeformConfig(Config):
     """Base of the deformer configurations. A member declares its ``kind: Literal["..."] = "..."``; all its other keys
     have defaults."""
 
-    members: ClassVar[Members[DeformConfig]] = Members("kind", default="wave")
+    members: ClassVar[dict[str, type[DeformConfig]]] = {}
+    tag, default_member = "kind", "wave"
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
@@ -198,14 +199,19 @@ class RandomDeformConfig(Config):
     @rule("kinds")
     def _known(kinds: tuple[str, ...]):
         for number, kind in enumerate(kinds):
-            if kind not in DeformConfig.members.models:
+            if kind not in DeformConfig.members:
                 raise Refused(
                     "no such kind of deformation",
                     where=f"kinds.{number}",
                     value=kind,
-                    accepted="one of: " + ", ".join(DeformConfig.members.models),
+                    accepted="one of: " + ", ".join(DeformConfig.members),
                 )
 
 
-for _member in (WaveConfig, FlagConfig, TwistConfig, BendConfig, BreatheConfig):
-    DeformConfig.members.add(_member)
+DeformConfig.members |= {
+    "wave": WaveConfig,
+    "flag": FlagConfig,
+    "twist": TwistConfig,
+    "bend": BendConfig,
+    "breathe": BreatheConfig,
+}

@@ -164,8 +164,9 @@ def check_one_lens(tree: dict[str, Any]) -> None:
 
 
 def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
-    """Return ``tree`` with every sensor of its rig, if it is one, complete: the sensor's own keys over the preset's, both over the top
-    level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes nothing.
+    """Return ``tree`` with every sensor of its rig, if it is one, complete: the sensor's own keys over the preset's,
+    both over the top level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes
+    nothing.
 
     Raises ConfigError for an unknown rig, no list of sensors or an empty one, two sensors of one name, or sections that
     a sensor cannot have."""

@@ -8,9 +8,10 @@ read (:mod:`blinkgl.config.draw`).
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic.fields import FieldInfo
 
 from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.camera import CameraConfig, camera_radius
@@ -28,10 +29,6 @@ from blinkgl.config.rig import (
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import Sensor
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
-
-if TYPE_CHECKING:
-    pass
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The ``gl:`` section: the OpenGL implementation that renders.
@@ -423,3 +420,10 @@ class SequenceConfig(Config):
                 accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
                 "plane's corners: camera.near and camera.fov)",
             )
+
+
+def add_label(name: str, about: str) -> None:
+    """Add a key to ``labels:``, true or false, for a label of a plug-in."""
+    LabelsConfig.model_fields[name] = FieldInfo(annotation=bool, default=False, description=about)
+    for model in (LabelsConfig, RigSensorConfig, SequenceConfig):  # pydantic has frozen the keys of the present ones
+        model.model_rebuild(force=True)

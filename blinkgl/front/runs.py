@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
@@ -31,8 +31,6 @@ from blinkgl.front.sections import (
 from blinkgl.scene.types import Scene as SceneData
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
     from blinkgl.sequence.request import SequenceRequest
@@ -48,7 +46,7 @@ class Timeline:
     values : keys of that kind, see ``timeline:`` in docs/configuration.md.
     Raises ConfigError."""
 
-    @check.public
+    @check.public()
     def __init__(self, kind: str = "displacement", **values: Any):
         self.tree = {"kind": check.plain(kind), **check.plain(values)}
         try:
@@ -61,7 +59,7 @@ class Timeline:
         return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
 
 
-@check.public
+@check.public()
 def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
     """Read and check the run of a YAML file, for :func:`generate`, :func:`record`, :func:`render_frame`.
 
@@ -87,7 +85,7 @@ class Settings(TypedDict, total=False):
     tracks: TrackSettings | None
 
 
-@check.public
+@check.public(Settings)
 def generate(
     source: Source,
     out: str | os.PathLike,
@@ -124,7 +122,7 @@ def generate(
     return run_dataset(template, check.path(out, "out"), executor, num=num, resume=bool(resume))
 
 
-@check.public
+@check.public()
 def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
     """Check a data set; ``.clean`` tells whether it has no problem, ``.problems`` lists them by sequence.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, Unpack, cast
 
 import numpy as np
 
@@ -27,14 +27,10 @@ from blinkgl.sequence.inertial import Inertial
 from blinkgl.srgb import to_srgb8
 from blinkgl.types.events import Events
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-
 _no_times = partial(np.zeros, 0, np.int64)
 
 
-@check.public
+@check.public(Settings)
 def simulate_sequence(
     source: Source,
     rig: Rig | str | None = None,
@@ -139,7 +135,7 @@ class Recording:
         return flows
 
 
-@check.public
+@check.public(Settings)
 def record(source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
     """Return events, images and ground truth of one sequence as arrays, as :func:`generate` writes them.
 

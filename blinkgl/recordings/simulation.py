@@ -125,7 +125,7 @@ def frames_to_events(
     fps: float | None = None,
     unit: str = "ns",
     zero_time: bool = False,
-    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    emulator: str | EmulatorConfig = EmulatorConfig.default_member,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     report: SimulationReport | None = None,
@@ -210,7 +210,7 @@ def simulated_steps(
     fps: float | None = None,
     unit: str = "ns",
     zero_time: bool = False,
-    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    emulator: str | EmulatorConfig = EmulatorConfig.default_member,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     fitting: Fitting | None = None,
@@ -342,7 +342,7 @@ def file_to_events(
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
     use: FrameUse = FrameUse(),
-    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    emulator: str | EmulatorConfig = EmulatorConfig.default_member,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     progress: Callable[[SimulationReport, float | None], None] | None = None,
@@ -434,11 +434,10 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     if isinstance(emulator, EmulatorConfig):
         return emulator
     data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
-    members = EmulatorConfig.members
-    kind = data.get("emulator", members.default)
-    if not isinstance(kind, str) or kind not in members.models:
-        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members.models))
-    return validate(members.models[kind], data, where=kind)
+    kind, members = data.get("emulator", EmulatorConfig.default_member), EmulatorConfig.members
+    if not isinstance(kind, str) or kind not in members:
+        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members))
+    return validate(members[kind], data, where=kind)
 
 
 def timed(

@@ -218,6 +218,14 @@ class CameraOnRig(NamedTuple):
     gives_events: bool
 
 
+_NOT_OF_FRAMES = {
+    "sensors": "have only one camera",
+    "images": "are already images",
+    "imu": "do not tell where their camera was",
+    "tracks": "do not tell where their surfaces are",
+}
+
+
 class SequenceConfig(Config):
     """One sequence; all values are plain and final."""
 
@@ -290,14 +298,12 @@ class SequenceConfig(Config):
         preview = self.preview.model_copy(update={"enabled": False})
         return self.model_copy(update={**own, "rig": None, "sensors": None, "preview": preview})
 
-    @rule("?sensors", "?frames")
-    def _frames_have_no_rig(sensors: bool, frames: bool):
-        if sensors and frames:
-            raise Refused(
-                "recorded frames have only one camera",
-                where="sensors",
-                accepted="null, or a scene instead of frames",
-            )
+    @rule("?frames", "?sensors", "?images", "?imu", "?tracks")
+    def _frames_have_no_others(frames: bool, *others: bool):
+        instead = "null, or a scene instead of frames"
+        for (key, problem), there in zip(_NOT_OF_FRAMES.items(), others, strict=True):
+            if frames and there:
+                raise Refused(f"recorded frames {problem}", where=key, accepted=instead)
 
     @rule("?sensors", "scene.intrinsics")
     def _own_intrinsics(sensors: bool, intrinsics: str | None):
@@ -349,25 +355,6 @@ class SequenceConfig(Config):
                     where="labels.flow",
                     value=one,
                     accepted=f"intervals of at most {most:.6g} s, or a longer time.duration",
-                )
-
-    @rule("?images", "?frames")
-    def _frames_have_no_camera(images: bool, frames: bool):
-        if images and frames:
-            raise Refused(
-                "recorded frames are already images",
-                where="images",
-                accepted="null, or a scene instead of frames",
-            )
-
-    @rule("?imu", "?tracks", "?frames")
-    def _frames_have_no_path(imu: bool, tracks: bool, frames: bool):
-        for key, there, what in (("imu", imu, "their camera was"), ("tracks", tracks, "their surfaces are")):
-            if there and frames:
-                raise Refused(
-                    f"recorded frames do not tell where {what}",
-                    where=key,
-                    accepted="null, or a scene instead of frames",
                 )
 
     @rule("imu.rate", "time.duration", "time.label_rate")

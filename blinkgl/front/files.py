@@ -16,7 +16,7 @@ from blinkgl.front.event_files import EventOptions, checked_size, event_reading
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
-    from blinkgl.front.sections import EmulatorSettings
+    from blinkgl.front.sections import Section
     from blinkgl.io.frames import Declared
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
@@ -175,7 +175,7 @@ def calibrate(
     recording: str | os.PathLike,
     frames: str | os.PathLike | None = None,
     *,
-    emulator: EmulatorSettings = "esim",
+    emulator: Section = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
     starts: int = 3,
@@ -232,7 +232,7 @@ class FrameOptions(TypedDict, total=False):
     zero_time: bool
     white_level: float | None
     range: str | None
-    emulator: EmulatorSettings
+    emulator: Section
     gamma: str | float | None
     interpolate: str
     max_px: float
@@ -318,7 +318,7 @@ def _options(
     zero_time: bool = False,
     white_level: float | None = None,
     range: str | None = None,
-    emulator: EmulatorSettings = "esim",
+    emulator: Section = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
     max_px: float = 1.0,

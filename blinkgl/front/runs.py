@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
@@ -18,16 +17,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig, rig_of
 from blinkgl.front.scenes import Scene
-from blinkgl.front.sections import (
-    NAMED,
-    EmulatorSettings,
-    ImageSettings,
-    ImuSettings,
-    TrackSettings,
-    events_tree,
-    labels_tree,
-    section_tree,
-)
+from blinkgl.front.sections import SECTIONS, Section, sections
 from blinkgl.scene.types import Scene as SceneData
 
 if TYPE_CHECKING:
@@ -75,14 +65,14 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 class Settings(TypedDict, total=False):
     """Values that replace those of a run's source; :func:`blinkgl.record` describes them. None keeps the source's."""
 
-    emulator: EmulatorSettings | None
+    emulator: Section | None
     sensor: str | None
     timeline: Timeline | None
     quality: str | None
     labels: Sequence[str | float] | None
-    images: ImageSettings | None
-    imu: ImuSettings | None
-    tracks: TrackSettings | None
+    images: Section | None
+    imu: Section | None
+    tracks: Section | None
 
 
 @check.public(Settings)
@@ -133,25 +123,18 @@ def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verifi
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))
 
 
-_SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "emulator": ("events", events_tree),
-    "labels": ("labels", labels_tree),
-    **{key: (key, partial(section_tree, key)) for key in NAMED},
+_READERS = {
+    **SECTIONS,
     "timeline": ("timeline", lambda given: check.one_of(given, "timeline", Timeline, "a Timeline").tree),
-    "sensor": ("sensor", check.plain),
     "quality": ("quality", check.plain),
 }
-"""Argument -> key of the configuration, and the function that reads it."""
 
 
 def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[Settings]) -> RunTemplate:
     """Return ``source`` as a run, with the given values replacing its own. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load(path) gives")
     template = source.template() if isinstance(source, Scene) else source
-    own: dict[str, Any] = {}
-    for name, (key, read) in _SECTIONS.items():
-        if (value := settings.get(name)) is not None:
-            own[key] = read(value)
+    own = sections(_READERS, settings)
     if rig is not None:
         own |= rig_of(rig).tree
     own = expanded(own, Path.cwd())

@@ -185,10 +185,6 @@ class RenderedSequence(SensorSimulation):
         return self.scene.camera if self.scene.camera.coefficients else None
 
     @property
-    def rectifies(self) -> bool:
-        return self._rectified is not None
-
-    @property
     def _rectified(self) -> PinHole | None:
         """Return the camera whose pixels labels use; None: the sensor's own."""
         asked = self.config.labels.pixels == "rectified"

@@ -187,11 +187,6 @@ class SensorSimulation(ABC):
         """Return the camera if it has distortion."""
         return None
 
-    @property
-    def rectifies(self) -> bool:
-        """Return whether its labels and tracks are in other pixels than its pictures: those of the rectified camera."""
-        return False
-
     def imu(self) -> Inertial | None:
         """Return the measurements of the inertial unit of ``imu:``; None: there is none. Raises ConfigError where the
         camera's velocity jumps."""

@@ -28,7 +28,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +62,6 @@ from blinkgl.labels import Form, Label, label_of
 from blinkgl.sequence_files.manifest import MODEL, RIG_MODEL
 from blinkgl.types.events import Events
 
-Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
 """File in the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
@@ -135,7 +134,7 @@ class SequenceWriter:
         own.info["sensor"], own._whole = name, self
         return own
 
-    def __enter__(self: Self) -> Self:
+    def __enter__(self) -> SequenceWriter:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)

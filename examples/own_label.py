@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 
 from blinkgl import Camera, Material, Pose, Primitive, Renderer, Scene, generate, look_at, verify
-from blinkgl.labels import Label, register, unregister
+from blinkgl.labels import Label, register
 from blinkgl.render.casting import scene_parts
 
 matplotlib.use("Agg")
@@ -46,7 +46,6 @@ def main(out: Path) -> None:
         image, frame = renderer.image(0.1), renderer.frame(0.1, ["position"])
     made = generate(scene, out / "data", labels=["position"])
     assert verify(out / "data", deep=1).clean
-    unregister("position")  # a program of yours need not
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     axes[0].imshow(image)

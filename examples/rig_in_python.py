@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from blinkgl import Camera, Keyframes, Material, Primitive, Rig, RigSensor, Scene, look_at, record_rig
+from blinkgl import Camera, Keyframes, Material, Primitive, Rig, RigSensor, Scene, look_at, record
 
 FOCAL, BASELINE = 180.0, 0.12
 
@@ -28,14 +28,14 @@ def main(out: Path) -> None:
         RigSensor("fisheye", camera=fisheye, position=(0.06, -0.03, 0), images={"rate": 20, "exposure_us": 8000}),
         RigSensor("imu", imu={"preset": "ideal", "rate": 500}, position=(0.06, 0.02, 0), euler=(0, 0, 90)),
     )
-    flown = record_rig(scene, rig)  # generate(scene, "out/rig", rig=rig) writes the same as files
+    flown = record(scene, rig)  # generate(scene, "out/rig", rig=rig) writes the same as files
 
     left = flown["left"].labels[0]
     seen = left.disparity > 0
     depth = FOCAL * BASELINE / left.disparity[seen]
     views = [flown["left"].images[0], flown["right"].images[0], flown["fisheye"].camera[1].image]
     Image.fromarray(np.hstack(views)).save(out / "views.png")
-    gyro = flown.imu["imu"]
+    gyro = flown.units["imu"]
     # What the unit's own rates make of its first attitude, beside where the rig in fact ended.
     turned = rotation_of(gyro.rate, 1 / 500)
     to_rig = flown.T_rig_sensor["imu"][:3, :3]

@@ -37,8 +37,7 @@ class _Lender:
         "blinkgl.dataset.generate",
         "blinkgl.dataset.work",
         "blinkgl.dataset.deep",
-        "blinkgl.sequence.rendered",
-        "blinkgl.sequence.rig",
+        "blinkgl.sequence.simulate",
         "blinkgl.tools.trade.run",
     )
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import blinkgl
-from blinkgl import Camera, Rig, RigSensor, Timeline, record_rig
+from blinkgl import Camera, Rig, RigSensor, Timeline, record
 from blinkgl.errors import ConfigError
 from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.imu import read_imu
-from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.rig_dir import read_sensors
 from tests.test_front import box_scene
 
 TURNED = np.array([[0.0, 0, 1, 0.02], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
@@ -28,7 +28,7 @@ TIMELINE = Timeline("uniform", fps=60)
 
 @pytest.fixture(scope="module")
 def recorded():
-    return record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["forward"])
+    return record(box_scene(), RIG, timeline=TIMELINE, labels=["forward"])
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def written(tmp_path_factory):
 
 
 def test_arrays_are_what_the_files_hold(recorded, written):
-    assert list(recorded.cameras) == ["left", "right", "fish", "rgb"] and set(recorded.imu) == {"rgb", "imu"}
+    assert list(recorded.cameras) == ["left", "right", "fish", "rgb"] and set(recorded.units) == {"rgb", "imu"}
     for name in ("left", "right", "fish"):
         events, mine = blinkgl.read_events(written / name / "events.h5"), recorded[name].events
         assert len(mine) > 100 and all(np.array_equal(getattr(events, k), getattr(mine, k)) for k in "xytp"), name
@@ -49,8 +49,8 @@ def test_arrays_are_what_the_files_hold(recorded, written):
     assert len(recorded["rgb"].camera) == len(read_exposures(written / "rgb")) > 0
     np.testing.assert_array_equal(np.load(written / "left/disparity/000000.npy"), recorded["left"].labels[0].disparity)
     for folder, name in ((written / "rgb", "rgb"), (written / "imu", "imu")):
-        np.testing.assert_array_equal(read_imu(folder)["acceleration"], recorded.imu[name].acceleration)
-    places = read_rig(written)
+        np.testing.assert_array_equal(read_imu(folder)["acceleration"], recorded.units[name].acceleration)
+    places = read_sensors(written)
     for name, T in recorded.T_rig_sensor.items():
         np.testing.assert_array_equal(places[name]["T_rig_sensor"], T)
 
@@ -73,9 +73,8 @@ def test_arrays_are_what_the_files_hold(recorded, written):
         (lambda: Rig("left"), "Rig.sensors\\[0\\]: not accepted: str"),
         (lambda: Rig(RigSensor("a"), RigSensor("A")), "Rig.sensors.1.name: two sensors have the same name"),
         (lambda: Rig(preset="kitti"), "Rig.preset: unknown rig"),
-        (lambda: record_rig(box_scene()), "rig: the source has a single camera"),
-        (lambda: record_rig(box_scene(), 7), "rig: not accepted: int"),
-        (lambda: record_rig(box_scene(), Rig(RigSensor("a", pair="b"))), "sensors.0.pair: no such camera on the rig"),
+        (lambda: record(box_scene(), 7), "rig: not accepted: int"),
+        (lambda: record(box_scene(), Rig(RigSensor("a", pair="b"))), "sensors.0.pair: no such camera on the rig"),
         (lambda: blinkgl.generate(box_scene(), "x", rig="stereo", imu="ideal"), "imu: belongs to a sensor"),
     ],
 )
@@ -87,3 +86,27 @@ def test_wrong_rigs_say_which_argument(call, said):
 def test_a_camera_that_is_not_there(recorded):
     with pytest.raises(ConfigError, match="no such camera on the rig.*left, right, fish, rgb"):
         recorded["imu"]
+
+
+def test_what_is_said_of_one_camera_is_the_firsts(recorded):
+    assert recorded.events is recorded["left"].events and recorded.flow.shape == recorded["left"].flow.shape
+    assert recorded.imu is None and recorded.config.sensors is not None
+    assert recorded.rig_t_us.tolist() == [0, *recorded.image_t_us.tolist()] and len(recorded.T_world_rig) > 2
+    alone = record(box_scene(), labels=["forward"])
+    assert list(alone.cameras) == [""] and alone[""].events is alone.events
+    np.testing.assert_array_equal(alone.T_world_rig, recorded.T_world_rig)
+
+
+def test_items_name_their_sensor():
+    with blinkgl.simulate_sequence(box_scene(), RIG, timeline=TIMELINE, labels=[]) as sequence:
+        assert {item.sensor for item in sequence} == {"left", "right", "fish", "rgb"}
+        assert [name for name, _, _ in sequence.inertial_units()] == ["imu"] and sequence.height > 0
+    assert {item.sensor for item in blinkgl.simulate_sequence(box_scene(), labels=[])} == {""}
+
+
+def test_former_names_stay_for_one_release(recorded):
+    former = blinkgl.record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["forward"])
+    assert isinstance(former, blinkgl.RigRecording) and set(former.imu) == {"rgb", "imu"}
+    np.testing.assert_array_equal(former.t_us, recorded.rig_t_us)
+    with blinkgl.simulate_rig(box_scene(), RIG, timeline=TIMELINE, labels=[]) as sequence:
+        assert {member.name for member, _ in sequence} == {member.name for member in sequence.members}

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import yaml
+from plugged import forget_label
 from pydantic import Field
 
 from blinkgl.cli import run
@@ -20,7 +21,7 @@ from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events import Emulator, Events, register
 from blinkgl.events.response import Response
-from blinkgl.events.table import EMULATORS, unregister
+from blinkgl.events.table import EMULATORS
 from blinkgl.gl import ShaderError, create_context
 from blinkgl.io.formats import open_events
 from blinkgl.labels import (
@@ -28,7 +29,6 @@ from blinkgl.labels import (
     Label,
     LabelRequest,
     register as register_label,
-    unregister as unregister_label,
 )
 from blinkgl.labels.files import npy
 from blinkgl.render.casting import scene_parts
@@ -111,7 +111,7 @@ SMALL = {
 def toy():
     register(Toy)
     yield Toy
-    unregister("toy")
+    del EMULATORS["toy"], EmulatorConfig.members["toy"]
 
 
 def written(folder, **changes):
@@ -171,9 +171,7 @@ def toy_with(part, line=None):
 def refused(emulator, match):
     with pytest.raises(TypeError, match=match):
         register(emulator)
-    assert list(EMULATORS) == list(EmulatorConfig.members.models) == ["esim", "v2e", "voltmeter"], (
-        "nothing is half registered"
-    )
+    assert list(EMULATORS) == list(EmulatorConfig.members) == ["esim", "v2e", "voltmeter"], "nothing is half registered"
 
 
 @pytest.mark.parametrize(
@@ -261,7 +259,7 @@ PLAIN = {**SMALL, "events": {"emulator": "esim"}, "labels": {"position": True, "
 @pytest.fixture
 def position():
     yield register_label(Position())
-    unregister_label("position")
+    forget_label("position")
 
 
 def labelled(folder, **changes):
@@ -391,7 +389,7 @@ def test_a_part_of_a_label_that_is_forgotten_is_named(part, said):
         (dict(name="float_flow"), "label 'float_flow': `name` is taken: `labels:` has such a key for something else"),
         (
             dict(name="copy", glsl=Position.glsl.replace("position", "copy")),
-            "label 'copy': `name`: 'copy' cannot be a key",
+            "label 'copy': `name` cannot be a key",
         ),
         (dict(kind="vectors"), "`kind` is 'vectors' and none of scalar, depth"),
         (dict(buffer="RGB32F"), "`buffer` is 'RGB32F' and none of R32F, RG32F, RGBA32F, R32UI"),
@@ -487,5 +485,5 @@ def test_what_shows_only_when_a_label_is_drawn_is_named_then(changes, error, sai
             renderer.labels(t_ns, LabelRequest("position"))
         assert said in str(caught.value)
     finally:
-        unregister_label("position")
+        forget_label("position")
         renderer.forget()

@@ -1,6 +1,6 @@
 """The tests on every Python that setup.cfg admits and this machine has, and with the oldest libraries: make matrix.
 
-    nox -f tools/noxfile.py [-s tests-3.12 | -s oldest] [-- tests/io]
+nox -f tools/noxfile.py [-s tests-3.12 | -s oldest] [-- tests/io]
 """
 
 from __future__ import annotations

@@ -222,16 +222,16 @@ def main() -> None:
     parser.add_argument("--recordings", type=Path, required=True)
     parser.add_argument("--evbench", type=Path, help="folder of evbench's sequences, for its third")
     parser.add_argument("--camera", choices=("davis240c", "davis346"), action="append")
-    parser.add_argument("--emulator", choices=tuple(EmulatorConfig.members.models), action="append")
+    parser.add_argument("--emulator", choices=tuple(EmulatorConfig.members), action="append")
     parser.add_argument("--picture", type=Path, help="no fits: draw events recorded and simulated, as PNG")
     a = parser.parse_args()
     np.seterr(divide="ignore")
     found = cameras(a.recordings, a.evbench)
     found = {name: one for name, one in found.items() if not a.camera or name in a.camera}
     if a.picture is not None:
-        picture(found, a.emulator or list(EmulatorConfig.members.models), a.picture)
+        picture(found, a.emulator or list(EmulatorConfig.members), a.picture)
         return
-    for line in lines(found, a.emulator or list(EmulatorConfig.members.models)):
+    for line in lines(found, a.emulator or list(EmulatorConfig.members)):
         say(plain_console(), line)
 
 

@@ -11,9 +11,9 @@ from blinkgl.camera.equidistant import Equidistant
 from blinkgl.camera.model import CameraModel
 from blinkgl.camera.pinhole import PinHole, focal_length
 from blinkgl.camera.radtan import Radtan
-from blinkgl.camera.table import CAMERA_MODELS, register, unregister
+from blinkgl.camera.table import CAMERA_MODELS, register
 
 for _model in (PinHole, Radtan, Equidistant):
     register(_model)
 
-__all__ = ["CAMERA_MODELS", "CameraModel", "Equidistant", "PinHole", "Radtan", "focal_length", "register", "unregister"]
+__all__ = ["CAMERA_MODELS", "CameraModel", "Equidistant", "PinHole", "Radtan", "focal_length", "register"]

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from blinkgl.camera.model import CameraModel
+from blinkgl.camera.model import CameraModel, planes_of
 from blinkgl.errors import ConfigError
 
 STEPS = 100
@@ -152,9 +152,7 @@ class DistortedModel(CameraModel):
         """(5, 3): of the smallest pin-hole picture that contains this one; (0, 3) if this one shows half of space."""
         if self.plane_edges is None:
             return np.zeros((0, 3))
-        left, right, top, bottom = self.plane_edges
-        planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
-        return planes / np.linalg.norm(planes, axis=1, keepdims=True)
+        return planes_of(*self.plane_edges)
 
 
 def largest_stretch(J: np.ndarray) -> np.ndarray:

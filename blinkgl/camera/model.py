@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, TypeVar
+from typing import ClassVar, Self
 
 import numpy as np
 
 from blinkgl.errors import ConfigError
-
-Self = TypeVar("Self", bound="CameraModel")
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ class CameraModel(ABC):
         points = rays * (depth / rays[:, 2])[:, None]
         return self.project(points + change) - self.project(points)
 
-    def part(self: Self, x0: int, y0: int, x1: int, y1: int, scale: int = 1) -> Self:
+    def part(self, x0: int, y0: int, x1: int, y1: int, scale: int = 1) -> Self:
         """Return the camera of the pixels x0 <= x < x1, y0 <= y < y1 alone, ``scale`` times finer in x and y."""
         # Pixel x is [x - 0.5, x + 0.5): its left edge, not its centre, is a multiple of the scale.
         return replace(
@@ -163,7 +161,7 @@ class CameraModel(ABC):
             cy=(self.cy - y0 + 0.5) * scale - 0.5,
         )
 
-    def resized(self: Self, width: int, height: int) -> Self:
+    def resized(self, width: int, height: int) -> Self:
         """Return the camera with the same view and width x height pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
@@ -175,3 +173,10 @@ class CameraModel(ABC):
             cx=(self.cx + 0.5) * sx - 0.5,
             cy=(self.cy + 0.5) * sy - 0.5,
         )
+
+
+def planes_of(left: float, right: float, top: float, bottom: float) -> np.ndarray:
+    """Return (5, 3) inward unit normals of a pin-hole picture with these edges on the image plane, and of the plane
+    through the centre."""
+    planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
+    return planes / np.linalg.norm(planes, axis=1, keepdims=True)

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from blinkgl.camera.model import CameraModel
+from blinkgl.camera.model import CameraModel, planes_of
 
 
 def focal_length(size: float, angle: float) -> float:
@@ -90,8 +90,7 @@ class PinHole(CameraModel):
         """(5, 3): left, right, top, bottom and the plane through the centre."""
         left, right = (-0.5 - self.cx) / self.fx, (self.width - 0.5 - self.cx) / self.fx
         top, bottom = (-0.5 - self.cy) / self.fy, (self.height - 0.5 - self.cy) / self.fy
-        planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
-        return planes / np.linalg.norm(planes, axis=1, keepdims=True)
+        return planes_of(left, right, top, bottom)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
         """Return (x0, y0, x1, y1): the convex hull of (n, 3) points can touch only pixels x0 <= x < x1, y0 <= y < y1,

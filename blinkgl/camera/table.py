@@ -29,11 +29,6 @@ def register(model: type[CameraModel]) -> type[CameraModel]:
     return model
 
 
-def unregister(kind: str) -> None:
-    """Remove the model of this name. Raises KeyError if there is none."""
-    del CAMERA_MODELS[kind]
-
-
 def _checked(model: Any) -> str:
     if not (isinstance(model, type) and issubclass(model, CameraModel)):
         raise TypeError(f"{model!r} is not a subclass of CameraModel")

@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Annotated, Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import (
     BaseModel,
@@ -97,7 +97,9 @@ class Config(BaseModel):
     presets : defaults of the other keys for each value of the key ``preset``.
     instead : key -> the key that it replaces; the replaced key is then null unless it is given itself.
     removed : keys of earlier versions; see :class:`Removed`.
-    fixed : keys of earlier versions whose value is now a constant of the class."""
+    fixed : keys of earlier versions whose value is now a constant of the class.
+    members : of a base model, which as a field's annotation accepts any of them: models by the value of their key
+    ``tag``, in the order in which they were added; ``default_member`` where it is not given. Plug-ins may add some."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
@@ -107,6 +109,17 @@ class Config(BaseModel):
     removed: ClassVar[Mapping[str, Removed]] = {}
     fixed: ClassVar[tuple[str, ...]] = ()
     rules: ClassVar[tuple[Rule, ...]] = ()
+    members: ClassVar[dict[str, type[Any]]]
+    tag: ClassVar[str]
+    default_member: ClassVar[str]
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
+        if "members" not in vars(cls):
+            return handler(source)
+        # A function instead of a schema, because pydantic would freeze the present members.
+        union = lambda: _union(cls.tag, cls.default_member, *cls.members.values())
+        return core_schema.no_info_plain_validator_function(lambda data: union().validate_python(data))
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -161,7 +174,8 @@ class Config(BaseModel):
         return data
 
     @model_validator(mode="after")
-    def _keep_rules(self):
+    def check_rules(self) -> Config:
+        """Return the model itself. Raises Refused where a rule is broken."""
         for one in self.rules:
             one(self)
         return self
@@ -188,116 +202,13 @@ def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
     return Annotated[union, Discriminator(tag), BeforeValidator(partial(_with_tag, tag, default))]
 
 
+@lru_cache
+def _union(tag: str, default: str, *models: type[Config]) -> TypeAdapter:
+    return TypeAdapter(one_of(tag, *models, default=default))
+
+
 def _with_tag(tag: str, default: str, data: Any) -> Any:
     return {tag: default, **data} if isinstance(data, dict) and tag not in data else data
-
-
-M = TypeVar("M", bound=Config)
-
-
-class Members(Generic[M]):
-    """Models distinguished by the value of their key ``tag`` (``default`` where it is not given), in the order in which
-    they were added. More may be added at any time: see :class:`Family`."""
-
-    def __init__(self, tag: str, default: str):
-        self.tag, self.default = tag, default
-        self.models: dict[str, type[M]] = {}
-        """The models by the value of their tag."""
-        self._adapter: TypeAdapter | None = None
-
-    def add(self, model: type[M]) -> None:
-        """Add a model. Raises TypeError for a model without the tag, or with a value of it that another model has."""
-        tag = tag_of(model)
-        if tag is None or tag[0] != self.tag:
-            raise TypeError(f"{model.__name__} has no key `{self.tag}: Literal[...]` of one name")
-        if self.models.get(tag[1], model) is not model:
-            raise TypeError(f"there is another {self.tag} '{tag[1]}'")
-        # The union is rebuilt when it is needed next.
-        self.models[tag[1]], self._adapter = model, None
-
-    def remove(self, value: str) -> None:
-        """Remove the model of this tag value. Raises KeyError where there is none."""
-        del self.models[value]
-        self._adapter = None
-
-    def adapter(self) -> TypeAdapter:
-        """Return the validator of the union of the present models."""
-        if self._adapter is None:
-            self._adapter = TypeAdapter(one_of(self.tag, *self.models.values(), default=self.default))
-        return self._adapter
-
-
-def stands_for_many(annotation: Any) -> bool:
-    """Return whether ``annotation`` is the base model of a :class:`Family` and not one of its members."""
-    return isinstance(annotation, type) and isinstance(vars(annotation).get("members"), Members)
-
-
-class Family(Config):
-    """A base model that accepts any of its ``members`` as a field annotation. The members are looked up when a value is
-    validated and when the models are listed (:func:`members`), not when the field's model is defined, so members may be
-    added later. Members are subclasses of it and share the keys that it declares."""
-
-    members: ClassVar[Members[Any]]
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
-        # A function instead of a schema, because pydantic would freeze the present members.
-        if not stands_for_many(cls):
-            return handler(source)
-        return core_schema.no_info_plain_validator_function(lambda data: cls.members.adapter().validate_python(data))
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, schema: core_schema.CoreSchema, handler: Any) -> dict[str, Any]:
-        return handler(cls.members.adapter().core_schema if stands_for_many(cls) else schema)
-
-
-class Growing(Config):
-    """A model whose keys may be added and removed at any time. The keys are looked up when a value is validated, so
-    that models with a field of it (``labels: Labels = Field(default_factory=Labels)``) need not be rebuilt."""
-
-    _made: ClassVar[bool] = False
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **more: Any) -> None:
-        super().__pydantic_init_subclass__(**more)
-        cls._made = True
-
-    @classmethod
-    def add_key(cls, name: str, annotation: Any, info: FieldInfo, before: str | None = None) -> None:
-        """Add a key before the key ``before``, or at the end. Raises TypeError for a name that is in use or cannot be a
-        key."""
-        if name in cls.model_fields or not name.isidentifier() or name.startswith("_") or hasattr(BaseModel, name):
-            raise TypeError(f"'{name}' " + ("is a key already" if name in cls.model_fields else "cannot be a key"))
-        fields = {**cls.model_fields, name: FieldInfo.from_annotated_attribute(annotation, info)}
-        # Pages, manifests and error messages list keys in the order of the fields.
-        later = list(cls.model_fields)[list(cls.model_fields).index(before) :] if before in cls.model_fields else []
-        cls._regrown({key: fields[key] for key in (*(key for key in fields if key not in later), *later)})
-
-    @classmethod
-    def remove_key(cls, name: str) -> None:
-        """Remove a key. Raises KeyError where there is none."""
-        fields = dict(cls.model_fields)
-        del fields[name]
-        cls._regrown(fields)
-
-    @classmethod
-    def _regrown(cls, fields: dict[str, FieldInfo]) -> None:
-        cls.__pydantic_fields__, cls._made = fields, False
-        try:
-            cls.model_rebuild(force=True)
-        finally:
-            cls._made = True
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
-        # While the class is being defined it needs its own schema; afterwards a call that looks it up.
-        if not vars(cls).get("_made", False):
-            return handler(source)
-        return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))  # noqa: PLW0108
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, schema: core_schema.CoreSchema, handler: Any) -> dict[str, Any]:
-        return handler(cls.__pydantic_core_schema__ if schema["type"] == "function-plain" else schema)
 
 
 def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
@@ -314,9 +225,10 @@ def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
 
 
 def members(annotation: Any) -> list[Any]:
-    """Return the members of a union (through Annotated) or of a family, without null; another annotation alone."""
-    if stands_for_many(annotation):
-        return list(annotation.members.models.values())
+    """Return the members of a union (through Annotated), or those of a base model, without null; another annotation
+    alone."""
+    if is_model(annotation) and "members" in vars(annotation):
+        return list(annotation.members.values())
     origin = typing.get_origin(annotation)
     if origin is Annotated:
         return members(typing.get_args(annotation)[0])

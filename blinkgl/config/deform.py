@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Family, Members, Refused, Removed, rule
-from blinkgl.config.trajectory import as_pair, ordered
+from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.values import as_pair, ordered
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,11 +25,12 @@ PeriodRange = Annotated[tuple[_Period, _Period], BeforeValidator(as_pair), After
 Phase = Annotated[float, Field(ge=-360, le=360, description="phase of the oscillation at time 0, degrees")]
 
 
-class DeformConfig(Family):
+class DeformConfig(Config):
     """Base of the deformer configurations. A member declares its ``kind: Literal["..."] = "..."``; all its other keys
     have defaults."""
 
-    members: ClassVar[Members[DeformConfig]] = Members("kind", default="wave")
+    members: ClassVar[dict[str, type[DeformConfig]]] = {}
+    tag, default_member = "kind", "wave"
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
@@ -48,7 +49,19 @@ def _across(along: str, towards: str) -> None:
         raise Refused("must be another axis than along", where="towards", value=towards)
 
 
-class WaveConfig(DeformConfig):
+class _Waving(DeformConfig):
+    wavelengths: ClassVar[tuple[float, float]]
+    """Of a random world."""
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        (along, towards), wavelength = _two_axes(rng), float(rng.uniform(*cls.wavelengths))
+        given = super().drawn(rng, strength, period).model_dump()
+        amplitude = min(cls.model_fields["amplitude"].default * strength, 1.0)
+        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+
+
+class WaveConfig(_Waving):
     """A wave travels along one axis and moves the surface along another."""
 
     kind: Literal["wave"] = "wave"
@@ -61,15 +74,10 @@ class WaveConfig(DeformConfig):
 
     _axes = rule("along", "towards")(_across)
 
-    @classmethod
-    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
-        (along, towards), wavelength = _two_axes(rng), float(rng.uniform(0.5, 1.5))
-        given = super().drawn(rng, strength, period).model_dump()
-        amplitude = min(0.08 * strength, 1.0)
-        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+    wavelengths = 0.5, 1.5
 
 
-class FlagConfig(DeformConfig):
+class FlagConfig(_Waving):
     """Cloth in wind, held at one end: the motion grows with the distance from that end, and a second, shorter wave
     crosses it."""
 
@@ -88,12 +96,7 @@ class FlagConfig(DeformConfig):
 
     _axes = rule("along", "towards")(_across)
 
-    @classmethod
-    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
-        (along, towards), wavelength = _two_axes(rng), float(rng.uniform(0.6, 1.2))
-        given = super().drawn(rng, strength, period).model_dump()
-        amplitude = min(0.12 * strength, 1.0)
-        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+    wavelengths = 0.6, 1.2
 
 
 class TwistConfig(DeformConfig):
@@ -198,14 +201,19 @@ class RandomDeformConfig(Config):
     @rule("kinds")
     def _known(kinds: tuple[str, ...]):
         for number, kind in enumerate(kinds):
-            if kind not in DeformConfig.members.models:
+            if kind not in DeformConfig.members:
                 raise Refused(
                     "no such kind of deformation",
                     where=f"kinds.{number}",
                     value=kind,
-                    accepted="one of: " + ", ".join(DeformConfig.members.models),
+                    accepted="one of: " + ", ".join(DeformConfig.members),
                 )
 
 
-for _member in (WaveConfig, FlagConfig, TwistConfig, BendConfig, BreatheConfig):
-    DeformConfig.members.add(_member)
+DeformConfig.members |= {
+    "wave": WaveConfig,
+    "flag": FlagConfig,
+    "twist": TwistConfig,
+    "bend": BendConfig,
+    "breathe": BreatheConfig,
+}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
-from blinkgl.config.base import Family, Members, Refused, Removed, rule
+from blinkgl.config.base import Config, Refused, Removed, rule
 
 _MAX_EVENTS = Field(
     2**25,
@@ -94,11 +94,12 @@ _VOLTMETER_FITTED = {
 }
 
 
-class EmulatorConfig(Family):
+class EmulatorConfig(Config):
     """Base of the emulator configurations; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its
     name, ``emulator: Literal["..."] = "..."``, gives every key a default, and defines the attributes below."""
 
-    members: ClassVar[Members[EmulatorConfig]] = Members("emulator", default="esim")
+    members: ClassVar[dict[str, type[EmulatorConfig]]] = {}
+    tag, default_member = "emulator", "esim"
 
     if TYPE_CHECKING:
 
@@ -147,6 +148,11 @@ class _TwoThresholds:
 
     if TYPE_CHECKING:
         model_fields: ClassVar[dict[str, Any]]
+
+    @property
+    def thresholds(self: Any) -> tuple[float, float]:
+        """Return C+ and C-, ln units."""
+        return self.contrast_threshold, self.contrast_threshold_off or self.contrast_threshold
 
     @classmethod
     def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
@@ -407,5 +413,4 @@ class VoltmeterConfig(EmulatorConfig):
         return {**common, "k4": leak * 1e-6, "k5": 0.0, "k6": noise}
 
 
-for _model in (EsimConfig, V2eConfig, VoltmeterConfig):
-    EmulatorConfig.members.add(_model)
+EmulatorConfig.members |= {"esim": EsimConfig, "v2e": V2eConfig, "voltmeter": VoltmeterConfig}

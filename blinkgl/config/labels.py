@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Growing, Refused
+from blinkgl.config.base import Config, Refused
 from blinkgl.config.events import EmulatorConfig
 
 _ACCEPTED = (
@@ -58,7 +58,7 @@ def _a_table(value: Any) -> Any:
     return value
 
 
-class LabelsConfig(Growing):
+class LabelsConfig(Config):
     """Ground truth at label times. A pass that no label needs is not compiled, allocated or run."""
 
     settings: ClassVar[Any] = ("events", "pixels", "flow", "float_flow", "occlusion")
@@ -117,6 +117,6 @@ class LabelsConfig(Growing):
 
 def fill_causes(events: bool | None, emulator: str | None) -> dict[str, Any]:
     """Return ``causes: true`` for emulators that know their events' causes where ``labels.events`` is on."""
-    name = EmulatorConfig.members.default if emulator is None else emulator
-    model = EmulatorConfig.members.models.get(name) if isinstance(name, str) else None
+    name = EmulatorConfig.default_member if emulator is None else emulator
+    model = EmulatorConfig.members.get(name) if isinstance(name, str) else None
     return {"events": {"causes": True}} if events is True and model and "causes" in model.model_fields else {}

@@ -18,7 +18,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, Removed, rule
-from blinkgl.config.trajectory import RateRange, SpeedRange, as_pair, ordered
+from blinkgl.config.trajectory import RateRange, SpeedRange
+from blinkgl.config.values import as_pair, ordered
 
 _Acceleration = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Velocity = Annotated[float, Field(ge=-1e4, le=1e4)]

@@ -50,6 +50,13 @@ def rigid_matrix(matrix: Any) -> np.ndarray:
     return T
 
 
+@rule("quaternion")
+def SOME_ROTATION(quaternion: tuple[float, ...] | None):
+    """A rule of the key ``quaternion``."""
+    if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
+        raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
+
+
 class PoseConfig(Config):
     """A position, and at most one kind of orientation."""
 
@@ -68,10 +75,7 @@ class PoseConfig(Config):
         if len(given) > 1:
             raise Refused("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
 
-    @rule("quaternion")
-    def _some_rotation(quaternion: tuple[float, ...] | None):
-        if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
-            raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
+    _some_rotation = SOME_ROTATION
 
     @rule("look_at", "position")
     def _some_direction(look_at, position):

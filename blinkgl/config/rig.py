@@ -28,7 +28,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.over_time import ImuConfig, TracksConfig
-from blinkgl.config.poses import Matrix, check_rigid, rigid_matrix
+from blinkgl.config.poses import SOME_ROTATION, Matrix, check_rigid, rigid_matrix
 from blinkgl.config.reader import merge, shipped, shipped_names
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import Sensor
@@ -65,10 +65,7 @@ class PlaceConfig(Config):
         if matrix is not None and any(position):
             raise Refused("the matrix contains the position", where="position", value=list(position))
 
-    @rule("quaternion")
-    def _some_rotation(quaternion: tuple[float, ...] | None):
-        if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
-            raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
+    _some_rotation = SOME_ROTATION
 
     @rule("matrix")
     def _rigid(matrix):
@@ -164,11 +161,14 @@ def check_one_lens(tree: dict[str, Any]) -> None:
 
 
 def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
-    """Return ``tree`` with every sensor of its rig complete: the sensor's own keys over the preset's, both over the top
-    level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes nothing.
+    """Return ``tree`` with every sensor of its rig, if it is one, complete: the sensor's own keys over the preset's,
+    both over the top level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes
+    nothing.
 
     Raises ConfigError for an unknown rig, no list of sensors or an empty one, two sensors of one name, or sections that
     a sensor cannot have."""
+    if not is_rig(tree):
+        return tree
     for key in ("images", "imu", "tracks"):
         if tree.get(key) is not None:
             raise ConfigError(
@@ -263,11 +263,9 @@ _FOCAL = (("fov",), ("focal",), ("fx", "fy"))
 def _drop_other_focal(above: Any, own: Any) -> None:
     """Drop the top level's focal length where a sensor gives its own in another way."""
     if isinstance(above, dict) and isinstance(own, dict):
-        said = [keys for keys in _FOCAL if any(own.get(key) is not None for key in keys)]
-        for keys in _FOCAL:
-            for key in keys:
-                if said and keys not in said:
-                    above.pop(key, None)
+        said = {key for keys in _FOCAL if any(own.get(key) is not None for key in keys) for key in keys}
+        for key in {key for keys in _FOCAL for key in keys} - said if said else ():
+            above.pop(key, None)
 
 
 def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
@@ -296,8 +294,10 @@ def check_pairs(sensors: Sequence[RigSensorConfig]) -> None:
             )
 
 
-def baseline_of(one: RigSensorConfig, other: RigSensorConfig) -> float | None:
+def baseline_of(one: RigSensorConfig, other: RigSensorConfig | None) -> float | None:
     """Return the distance along the x axis of ``one`` to ``other``, m; None where the two are not a rectified pair."""
+    if other is None:
+        return None
     a, b = one.camera.model, other.camera.model
     if a != replace(b, near=a.near) or not isinstance(a, PinHole):
         return None

@@ -31,7 +31,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.base import remembering
+from blinkgl.config.base import Refused, remembering
 from blinkgl.config.draw import Fill, corners, draw, is_distribution, sites
 from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
@@ -41,7 +41,6 @@ from blinkgl.config.reader import apply_overrides, merge, read_table, run_file
 from blinkgl.config.rig import (
     SECTIONS,
     check_pairs,
-    is_rig,
     spelled_out as with_whole_sensors,
     with_preset,
 )
@@ -215,43 +214,29 @@ def _plain(node: Any) -> Any:
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
     """Return the SequenceConfig of plain data; the values of a named quality and sensor fill in the keys that are not
-    given."""
-    tree = with_default(tree)
-    if is_rig(tree):
-        return _validated_rig(tree)
+    given. Each of several sensors keeps the rules of a single camera."""
+    tree = with_whole_sensors(with_default(tree), FILLS)
     for fill in FILLS:
         tree = fill(tree)
     config = validate(SequenceConfig, tree)
-    if config.labels.disparity:  # type: ignore[missing-attribute]
+    for k, one in enumerate(config.sensors or ()):
+        try:
+            config.of_sensor(k).check_rules()
+        except Refused as refused:
+            inside = refused.where.split(".")[0] in SECTIONS
+            raise ConfigError(
+                refused.problem if inside else f"{refused.problem} (of sensor '{one.name}')",
+                where=f"sensors.{k}.{refused.where}" if inside else refused.where,
+                value=refused.value,
+                accepted=refused.accepted,
+            ) from None
+    check_pairs(config.sensors or ())
+    if config.sensors is None and config.labels.disparity:  # type: ignore[missing-attribute]
         raise ConfigError(
             "a single camera has no disparity",
             where="labels.disparity",
             accepted="false, or rig: stereo, or sensors with a `pair` (docs/rigs.md)",
         )
-    return config
-
-
-def _validated_rig(tree: dict[str, Any]) -> SequenceConfig:
-    """Return the SequenceConfig of a rig. Each sensor is validated by the rules of a single camera."""
-    tree = with_whole_sensors(tree, FILLS)
-    for fill in FILLS:
-        tree = fill(tree)
-    config = validate(SequenceConfig, tree)
-    common = {key: value for key, value in tree.items() if key not in ("rig", "sensors", *SECTIONS)}
-    for k, one in enumerate(tree["sensors"]):
-        own = {key: one[key] for key in SECTIONS if one.get(key) is not None}
-        try:
-            validate(SequenceConfig, {**common, **own})
-        except ConfigError as error:
-            inside = (error.where or "").split(".")[0] in SECTIONS
-            where = f"sensors.{k}.{error.where}" if inside else error.where
-            raise ConfigError(
-                error.problem if inside else f"{error.problem} (of sensor '{one.get('name')}')",
-                where=where,
-                value=error.value,
-                accepted=error.accepted,
-            ) from None
-    check_pairs(config.sensors or ())
     return config
 
 

@@ -38,7 +38,7 @@ from blinkgl.errors import ConfigError
 
 def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Check the keys of each emulator by a field validator: a rule would combine the keys of all emulators."""
-    models = EmulatorConfig.members.models
+    models = EmulatorConfig.members
     for name, keys in tables.items():
         if name not in models:
             raise Refused("unknown emulator", value=name, accepted="one of " + ", ".join(models))
@@ -114,7 +114,7 @@ class SensorConfig(Config):
 
     def values(self, emulator: Any) -> dict[str, Any]:
         """Return the sensor's values for the keys of the emulator of this name; none for an unknown one."""
-        models = EmulatorConfig.members.models
+        models = EmulatorConfig.members
         if not isinstance(emulator, str) or emulator not in models:
             return {}
         said = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
@@ -123,7 +123,7 @@ class SensorConfig(Config):
     def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
         """Return the configuration of the emulator of this name with this sensor's values, then ``overrides``. Raises
         ConfigError."""
-        models = EmulatorConfig.members.models
+        models = EmulatorConfig.members
         if not isinstance(emulator, str) or emulator not in models:
             raise ConfigError(
                 "unknown emulator", where="events.emulator", value=emulator, accepted="one of " + ", ".join(models)
@@ -212,7 +212,7 @@ def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
         return {}
     said = {
         "camera": {"width": camera.width, "height": camera.height},
-        "events": camera.values(EmulatorConfig.members.default if emulator is None else emulator),
+        "events": camera.values(EmulatorConfig.default_member if emulator is None else emulator),
     }
     return said if camera.readout is None else {**said, "readout": camera.readout.model_dump()}
 

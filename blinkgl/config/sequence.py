@@ -8,9 +8,10 @@ read (:mod:`blinkgl.config.draw`).
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic.fields import FieldInfo
 
 from blinkgl.config.base import Config, Refused, Removed, rule
 from blinkgl.config.camera import CameraConfig, camera_radius
@@ -28,10 +29,6 @@ from blinkgl.config.rig import (
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import Sensor
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
-
-if TYPE_CHECKING:
-    pass
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The ``gl:`` section: the OpenGL implementation that renders.
@@ -221,6 +218,14 @@ class CameraOnRig(NamedTuple):
     gives_events: bool
 
 
+_NOT_OF_FRAMES = {
+    "sensors": "have only one camera",
+    "images": "are already images",
+    "imu": "do not tell where their camera was",
+    "tracks": "do not tell where their surfaces are",
+}
+
+
 class SequenceConfig(Config):
     """One sequence; all values are plain and final."""
 
@@ -293,14 +298,12 @@ class SequenceConfig(Config):
         preview = self.preview.model_copy(update={"enabled": False})
         return self.model_copy(update={**own, "rig": None, "sensors": None, "preview": preview})
 
-    @rule("?sensors", "?frames")
-    def _frames_have_no_rig(sensors: bool, frames: bool):
-        if sensors and frames:
-            raise Refused(
-                "recorded frames have only one camera",
-                where="sensors",
-                accepted="null, or a scene instead of frames",
-            )
+    @rule("?frames", "?sensors", "?images", "?imu", "?tracks")
+    def _frames_have_no_others(frames: bool, *others: bool):
+        instead = "null, or a scene instead of frames"
+        for (key, problem), there in zip(_NOT_OF_FRAMES.items(), others, strict=True):
+            if frames and there:
+                raise Refused(f"recorded frames {problem}", where=key, accepted=instead)
 
     @rule("?sensors", "scene.intrinsics")
     def _own_intrinsics(sensors: bool, intrinsics: str | None):
@@ -354,25 +357,6 @@ class SequenceConfig(Config):
                     accepted=f"intervals of at most {most:.6g} s, or a longer time.duration",
                 )
 
-    @rule("?images", "?frames")
-    def _frames_have_no_camera(images: bool, frames: bool):
-        if images and frames:
-            raise Refused(
-                "recorded frames are already images",
-                where="images",
-                accepted="null, or a scene instead of frames",
-            )
-
-    @rule("?imu", "?tracks", "?frames")
-    def _frames_have_no_path(imu: bool, tracks: bool, frames: bool):
-        for key, there, what in (("imu", imu, "their camera was"), ("tracks", tracks, "their surfaces are")):
-            if there and frames:
-                raise Refused(
-                    f"recorded frames do not tell where {what}",
-                    where=key,
-                    accepted="null, or a scene instead of frames",
-                )
-
     @rule("imu.rate", "time.duration", "time.label_rate")
     def _measurements_fit(rate: float | None, duration: float, label_rate: float):
         if rate is not None:
@@ -423,3 +407,10 @@ class SequenceConfig(Config):
                 accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
                 "plane's corners: camera.near and camera.fov)",
             )
+
+
+def add_label(name: str, about: str) -> None:
+    """Add a key to ``labels:``, true or false, for a label of a plug-in."""
+    LabelsConfig.model_fields[name] = FieldInfo(annotation=bool, default=False, description=about)
+    for model in (LabelsConfig, RigSensorConfig, SequenceConfig):  # pydantic has frozen the keys of the present ones
+        model.model_rebuild(force=True)

@@ -16,20 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config
-
-
-def as_pair(value: Any) -> Any:
-    """Return a range; a number is both of its ends."""
-    # Text too: YAML 1.1 reads 1e-1 as text, and pydantic converts it later.
-    return (value, value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else value
-
-
-def ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    """Return the range. Raises ValueError if its lower end is above its upper one."""
-    if pair[0] > pair[1]:
-        raise ValueError("the lower end of the range is above the upper end")
-    return pair
-
+from blinkgl.config.values import as_pair, ordered
 
 # Far beyond anything filmed; a larger value almost certainly has the wrong unit (float64 geometry would still be fine).
 _Speed = Annotated[float, Field(ge=0, le=1e4)]

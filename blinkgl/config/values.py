@@ -9,14 +9,17 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from blinkgl.config.materials import Radiance
 
 
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
+def as_pair(value: Any) -> Any:
+    """Return a range; a number is both of its ends."""
+    # Text too: YAML 1.1 reads 1e-1 as text, and pydantic converts it later.
+    return (value, value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else value
+
+
+def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """Return the range. Raises ValueError if its lower end is above its upper one."""
+    if pair[0] > pair[1]:
         raise ValueError("the range must be [smallest, largest]")
-    return value
-
-
-def _as_pair(value: Any) -> Any:
-    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+    return pair
 
 
 def _as_list(value: Any) -> Any:
@@ -80,7 +83,7 @@ Positive = Annotated[float, Field(gt=0, le=1e9)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_as_pair), AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(as_pair), AfterValidator(ordered)]
 
 
 Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]

@@ -31,7 +31,7 @@ from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.types import Light, Scene
-from blinkgl.sequence import SequenceRequest, Simulation, simulate_sequence
+from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
 from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.recorded import RECORDED
 from blinkgl.sequence.rendered import surfaces_at
@@ -112,6 +112,16 @@ class Explanation:
         """Add one more pass, from the time of a single one."""
         self.passes.append(Pass(name, why, count, each_s * count))
 
+    def leave_out(self, *parts: tuple[str, Any, str]) -> None:
+        """List those parts, (name, whether it is there, why not), that are not there."""
+        self.left_out += [(name, why) for name, there, why in parts if not there]
+
+    def ended(self, duration: float) -> Explanation:
+        """Return itself with the sums over all passes. duration : s of the sequence."""
+        self.seconds = sum(one.seconds for one in self.passes)
+        self.seconds_per_simulated_second = self.seconds / duration
+        return self
+
 
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     """Explain one sequence (default: the first), of a recipe its first group's. Raises the errors of generating it."""
@@ -137,10 +147,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
                     one.passes.append(_frame_camera(own.images, renderer, seen))
                 _left_out(own, seen, one)
             _join(result, name, one)
-    simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
-    result.seconds = sum(p.seconds for p in result.passes)
-    result.seconds_per_simulated_second = result.seconds / simulated
-    return result
+    return result.ended((scene.t1_ns - scene.t0_ns) * 1e-9)
 
 
 def _join(result: Explanation, name: str, one: Explanation) -> None:
@@ -156,7 +163,7 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
     """Explain a sequence of recorded frames: nothing is rendered; the first few frames are converted and timed."""
     frames = config.frames
-    probe = simulate_sequence(SequenceRequest(config, index, base, labels=False))
+    probe = simulate_sequence(SequenceRequest(config, index, base, labels=False)).alone
     files, flows, masks, way = probe.files, probe.flow.files, probe.flow.masks, probe.flow.direction
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
@@ -182,7 +189,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     seconds = each * (len(files) - 1)
     result.passes.append(Pass("frames and event kernel", said, result.frames, seconds))
     request = asked_for(config.labels)
-    for name, on, why in (
+    result.leave_out(
         ("images", "images" in request, "labels.images: false"),
         (f"{way} flow", flows and f"flow_{way}" in request, "frames.flow: null, or not in labels.flow"),
         (
@@ -192,16 +199,12 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         ),
         ("preview", config.preview.enabled, "preview.enabled: false"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
-    ):
-        if not on:
-            result.left_out.append((name, why))
+    )
     brought = {LABELS[name].heading for name in RECORDED}
     headings = [*(label.heading for label in LABELS.values()), "what made each event"]
     others = dict.fromkeys(heading for heading in headings if heading not in brought)
     result.left_out.append((", ".join(others), "recorded frames bring none"))
-    result.seconds = sum(p.seconds for p in result.passes)
-    result.seconds_per_simulated_second = result.seconds / duration
-    return result
+    return result.ended(duration)
 
 
 def _living(scene: Scene) -> dict[str, str]:
@@ -277,7 +280,7 @@ def _timed(run, times) -> float:
 def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, result: Explanation) -> None:
     """Add every kind of drawing, a few of each timed."""
     times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
-    probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer))
+    probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer)).alone
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short part of the real sequence
     event_s = _timed(lambda t: renderer.luminance(t).view(), times)
     result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
@@ -298,7 +301,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     result.add("event kernel", said, result.frames, each)
 
 
-def _event_frames(config: SequenceConfig, probe: Simulation, times: list[int], duration: float) -> int:
+def _event_frames(config: SequenceConfig, probe: SensorSimulation, times: list[int], duration: float) -> int:
     """Return the number of event frames, from the pace at a few times."""
     timeline = config.timeline
     if timeline.kind == "uniform":
@@ -395,12 +398,10 @@ def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pas
 
 
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
-    add = lambda what, why: result.left_out.append((what, why))
-    images = config.images
-    request = asked_for(config.labels)
-    there = {LABELS[name].heading for name in request}
+    images, render, timeline = config.images, config.render, config.timeline.kind
+    there = {LABELS[name].heading for name in asked_for(config.labels)}
     labels = {label.heading: label.off or f"labels.{label.name}: false" for label in LABELS.values()}
-    for name, on, key in (
+    result.leave_out(
         *((heading, heading in there, why) for heading, why in labels.items()),
         ("preview", config.preview.enabled, "preview.enabled: false"),
         ("inertial unit", config.imu is not None, "imu: null"),
@@ -408,41 +409,42 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         ("what made each event", config.labels.events, "labels.events: false"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
         ("frame camera: motion blur, noise, lens", images is not None, "images: null"),
-    ):
-        if not on:
-            add(name, key)
+    )
     if images is not None:
-        for name, on, key in (
+        result.leave_out(
             ("frame camera: rolling shutter", images.row_us > 0, "images.row_us: 0"),
             ("frame camera: noise", images.noisy, "images.photon_noise: false, images.read_noise: 0"),
             ("frame camera: defocus", images.lens is not None, "images.lens: null"),
             ("frame camera: automatic exposure", images.auto_exposure is not None, "images.auto_exposure: null"),
-        ):
-            if not on:
-                add(name, key)
-    if config.render.antialiasing == "none":
-        add(
+        )
+    filters = render.antialiasing
+    lit = any(not p.material.unlit for o in scene.objects for p in o.parts)
+    zero = [name for name, value in config.events.model_dump().items() if value in (0, 0.0, False) and name != "seed"]
+    shadows = config.scene.light.shadows != "off"
+    result.leave_out(
+        (
             "anti-aliasing of event frames",
+            filters != "none",
             "render.antialiasing: none (mip-maps filter textures; edges are not filtered)",
-        )
-    if config.render.antialiasing == "taps4":
-        add(
+        ),
+        (
             "anti-aliasing of silhouettes",
+            filters != "taps4",
             "render.antialiasing: taps4 (textures are super-sampled; edges are not filtered)",
-        )
-    if config.render.anisotropy == 1:
-        add("anisotropic filtering", "render.anisotropy: 1")
-    if all(p.material.unlit for o in scene.objects for p in o.parts):
-        add("light", "every material is unlit: no normals in the vertex stream, no light in the shader")
-    if scene.fog is None:
-        add("fog", "scene.fog: null")
-    if config.timeline.kind == "uniform":
-        add("velocity pass", "timeline: uniform does not look at motion")
-    for name, value in config.events.model_dump().items():
-        if value in (0, 0.0, False) and name != "seed":
-            add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
-    if config.scene.light.shadows == "off":
-        add("shadows", "scene.light.shadows: off")
-    elif config.timeline.kind == "brightness":
-        add("the motion of shadows in rates of change", "dL/dt is that of the lit share of a surface: no edge is in it")
-    add("inter-reflection", "BlinkGL does not model it")
+        ),
+        ("anisotropic filtering", render.anisotropy != 1, "render.anisotropy: 1"),
+        ("light", lit, "every material is unlit: no normals in the vertex stream, no light in the shader"),
+        ("fog", scene.fog is not None, "scene.fog: null"),
+        ("velocity pass", timeline != "uniform", "timeline: uniform does not look at motion"),
+        *(
+            (f"{config.events.emulator}: {name}", False, f"events.{name}: {getattr(config.events, name)}".lower())
+            for name in zero
+        ),
+        ("shadows", shadows, "scene.light.shadows: off"),
+        (
+            "the motion of shadows in rates of change",
+            not shadows or timeline != "brightness",
+            "dL/dt is that of the lit share of a surface: no edge is in it",
+        ),
+        ("inter-reflection", False, "BlinkGL does not model it"),
+    )

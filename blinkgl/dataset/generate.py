@@ -1,4 +1,4 @@
-"""Generation of sequences: writes the items of :func:`~blinkgl.sequence.rig.simulate_rig`, in a simple loop."""
+"""Generation of sequences: writes the items of :func:`~blinkgl.sequence.simulate_sequence`, in a simple loop."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,12 +22,21 @@ from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.machine.plugins import plugin_versions
-from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, Simulation
+from blinkgl.sequence import (
+    CameraImage,
+    EventChunk,
+    GroundTruth,
+    Item,
+    Picture,
+    SensorSimulation,
+    SequenceRequest,
+    Simulation,
+    simulate_sequence,
+)
 from blinkgl.sequence.request import StageClock
-from blinkgl.sequence.rig import RigSequence, simulate_rig
-from blinkgl.sequence_files.preview import Panels, RigPreviewWriter
-from blinkgl.sequence_files.rig_dir import RigWriter, write_lens
-from blinkgl.sequence_files.sequence_dir import SequenceWriter, refuse_existing
+from blinkgl.sequence_files.preview import Panels, PreviewWriter
+from blinkgl.sequence_files.rig_dir import sensors_yaml, write_lens
+from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter, refuse_existing
 from blinkgl.version import __version__
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -39,9 +49,9 @@ class PreviewRecorder:
 
     sequences : of one camera, or of those of a rig, shown one below the other by their names."""
 
-    def __init__(self, config: PreviewConfig, sequences: Sequence[Simulation], writer: SequenceWriter):
+    def __init__(self, config: PreviewConfig, sequences: Sequence[SensorSimulation], writer: SequenceWriter):
         self._shown = {id(one): k for k, one in enumerate(one for one in sequences if one.pictures_hz is not None)}
-        self._video: RigPreviewWriter | None = None
+        self._video: PreviewWriter | None = None
         shown = [one for one in sequences if id(one) in self._shown]
         if not shown:
             return
@@ -60,9 +70,9 @@ class PreviewRecorder:
             )
             for one in shown
         ]
-        self._video = RigPreviewWriter(writer.path("preview.mp4"), panels, rate / config.slowdown)
+        self._video = PreviewWriter(writer.path("preview.mp4"), panels, rate / config.slowdown)
 
-    def take(self, sequence: Simulation, item: Item) -> None:
+    def take(self, sequence: SensorSimulation, item: Item) -> None:
         """Add the items of a sequence, in order."""
         if self._video is None or (number := self._shown.get(id(sequence))) is None:
             return
@@ -73,7 +83,7 @@ class PreviewRecorder:
             with sequence.clock("preview"):
                 if item.velocity is not None:
                     self._video.panels[number].set_flow(item.velocity * self._interval_s)
-                self._video.frame(number, item.t_ns // 1000, item.image)
+                self._video.frame(item.t_ns // 1000, item.image, number)
 
     def __enter__(self) -> PreviewRecorder:
         return self
@@ -124,67 +134,57 @@ def generate_sequence(
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     pictures_hz = config.preview.rate if config.preview.enabled else None
     request = SequenceRequest(config, index, base, pictures_hz=pictures_hz)
-    with simulate_rig(request, gl) as rig, folder_of(rig, report.path) as folder:
-        units = list(rig.inertial_units())  # a velocity that jumps is refused before anything is drawn
-        with PreviewRecorder(config.preview, rig.members, folder) as preview, ExitStack() as stack:
-            writers = _writers(rig, folder, stack)
-            for member, item in rig:
+    with simulate_sequence(request, gl) as sequence, _folder(sequence, report.path) as folder:
+        units = list(sequence.inertial_units())  # a velocity that jumps is refused before anything is drawn
+        with PreviewRecorder(config.preview, sequence.members, folder) as preview, ExitStack() as stack:
+            writers = {
+                member.name: stack.enter_context(folder.of_camera(member.name, **_settings(member)))
+                if member.name
+                else folder
+                for member in sequence.members
+            }
+            for member, item in sequence.by_sensor():
                 write_item(writers[member.name], member, item)
                 preview.take(member, item)
                 if isinstance(item, EventChunk) and progress is not None:
-                    report.count(rig)
-                    progress(report, (item.t_ns - rig.t0_ns) / (rig.t1_ns - rig.t0_ns))
-            for member in rig.members:
+                    report.count(sequence)
+                    progress(report, (item.t_ns - sequence.t0_ns) / (sequence.t1_ns - sequence.t0_ns))
+            for member in sequence.members:
                 write_end(writers[member.name], member)
-        if isinstance(folder, RigWriter):
-            with rig.clock("write"):
-                for member in rig.members:
-                    folder.adopt(member.name)
+        if config.sensors is not None:
+            with sequence.clock("write"):
                 for name, unit_config, inertial in units:
                     folder.imu(unit_config, vars(inertial), f"{name}/")
-                folder.info.update(_shared_info(rig))
-        report.count(rig)
+                folder.text(RIG, sensors_yaml(config.sensors))
+                folder.info.update(_shared_info(sequence))
+        report.count(sequence)
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
-    report.finish(rig, flushing.total)
+    report.finish(sequence, flushing.total)
     return report
 
 
-def folder_of(rig: RigSequence, path: Path) -> SequenceWriter:
-    """Return the writer of the sequence's own folder."""
-    text = config_yaml(rig.config, rig.index)
-    if rig.config.sensors is None:
-        return writer_of(rig.members[0], path, text)
-    return RigWriter(path, rig.config.sensors, config_yaml=text, t_offset_us=rig.t0_ns // 1000)
+def _folder(sequence: Simulation, path: Path) -> SequenceWriter:
+    """Return the writer of the sequence's own folder, which is that of a single camera, too."""
+    text, several = config_yaml(sequence.config, sequence.index), sequence.config.sensors is not None
+    if several:
+        return SequenceWriter(path, None, None, config_yaml=text, t_offset_us=sequence.t0_ns // 1000, events=False)
+    return SequenceWriter(path, config_yaml=text, **_settings(sequence.members[0]))
 
 
-def _writers(rig: RigSequence, folder: SequenceWriter, stack: ExitStack) -> dict[str, SequenceWriter]:
-    """Return the writer of each camera, by name: a folder below ``folder``; a single camera uses ``folder`` itself."""
-    if not isinstance(folder, RigWriter):
-        return {rig.members[0].name: folder}
-    writers = {}
-    for member in rig.members:
-        writer = writer_of(member, folder.folder(member.name), folder.config_yaml)
-        writer.info["sensor"] = member.name
-        writers[member.name] = stack.enter_context(writer)
-    return writers
+def _settings(sequence: SensorSimulation) -> dict[str, Any]:
+    """Return the arguments of a camera's writer."""
+    return {
+        "height": sequence.height,
+        "width": sequence.width,
+        "t_offset_us": sequence.t0_ns // 1000,
+        "labels": sequence.config.labels,
+        "events": sequence.camera is not None,
+        "truth": sequence.tells,
+        "codec": sequence.config.output.compression,
+    }
 
 
-def writer_of(sequence: Simulation, path: Path, config_text: str) -> SequenceWriter:
-    """Return the writer of a sequence to ``path``. config_text : of its config.yaml."""
-    return SequenceWriter(
-        path,
-        sequence.height,
-        sequence.width,
-        config_yaml=config_text,
-        t_offset_us=sequence.t0_ns // 1000,
-        labels=sequence.config.labels,
-        events=sequence.camera is not None,
-        truth=sequence.tells,
-        codec=sequence.config.output.compression,
-    )
-
-
-def write_item(writer: SequenceWriter, sequence: Simulation, item: Item) -> None:
+def write_item(writer: SequenceWriter, sequence: SensorSimulation, item: Item) -> None:
     """Write an item, except pictures for display."""
     if isinstance(item, Picture):
         return
@@ -198,7 +198,7 @@ def write_item(writer: SequenceWriter, sequence: Simulation, item: Item) -> None
             writer.image(item.pictures, exposure_line(item))
 
 
-def write_end(writer: SequenceWriter, sequence: Simulation) -> None:
+def write_end(writer: SequenceWriter, sequence: SensorSimulation) -> None:
     """Write what is known only at the end."""
     with sequence.clock("write"):
         if poses := sequence.poses():
@@ -232,50 +232,47 @@ def exposure_line(image: CameraImage) -> ExposureLine:
     )
 
 
-def manifest_info(sequence: Simulation) -> dict:
-    """Return the manifest's entries about a sequence's source; no clock times (same seed, same manifest)."""
-    config = sequence.config
-    opencv = {} if config.frames is None else {"opencv": cv2.__version__}
+def manifest_info(sequence: SensorSimulation) -> dict:
+    """Return the manifest's entries about a camera's source; no clock times (same seed, same manifest)."""
+    camera, opencv = sequence.camera, {} if sequence.config.frames is None else {"opencv": cv2.__version__}
+    emulator = {}
+    if camera is not None:
+        emulator = {"emulator": sequence.config.events.emulator, "events_device": camera.emulator.device}
     return {
-        **made_by(config, sequence.index, {**opencv, **sequence.libraries}),
-        **(
-            {}
-            if (camera := sequence.camera) is None
-            else {"emulator": config.events.emulator, "events_device": camera.emulator.device}
-        ),
-        "frames": sequence.frames,
-        "labels": sequence.labels,
-        # between whole microseconds, as every time in the files
-        "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,
+        **_made_by(sequence, {**opencv, **sequence.libraries}),
+        **emulator,
         **losses(*sequence.losses),
         **({"events_by_cause": sequence.causes} if sequence.causes else {}),
         **sequence.facts(),
     }
 
 
-def _shared_info(rig: RigSequence) -> dict:
-    """Return :func:`manifest_info` of what the sensors of a rig have in common."""
-    facts = rig.members[0].facts() if rig.members else {}
+def _shared_info(rig: Simulation) -> dict:
+    """Return :func:`manifest_info` of what several sensors have in common."""
+    facts, sensors = rig.members[0].facts() if rig.members else {}, rig.config.sensors or ()
     common = ("opengl", "timeline", "triangles", "objects", "scene_log", "not_drawn", "dynamics")
     return {
-        **made_by(rig.config, rig.index, rig.libraries),
-        "frames": rig.frames,
-        "labels": rig.labels,
-        "duration_us": rig.t1_ns // 1000 - rig.t0_ns // 1000,
+        **_made_by(rig, rig.libraries),
+        "sensors": [one.name for one in sensors],
+        "cameras": [one.name for one in sensors if one.sees],
         **{key: facts[key] for key in common if key in facts},
     }
 
 
-def made_by(config: SequenceConfig, index: int, libraries: Mapping[str, str]) -> dict:
-    """Return a manifest's entries: which sequence it is, and what made it. libraries : versions besides those always
-    used."""
+def _made_by(sequence: Simulation | SensorSimulation, libraries: Mapping[str, str]) -> dict:
+    """Return a manifest's entries: which sequence it is, what made it, and how much. libraries : versions besides those
+    always used."""
     import numba
 
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
     return {
         "blinkgl": __version__,
         "versions": {**versions, **libraries, **plugin_versions()},
-        "seed": config.seed,
-        "sequence": index,
-        "split": config.output.split,
+        "seed": sequence.config.seed,
+        "sequence": sequence.index,
+        "split": sequence.config.output.split,
+        "frames": sequence.frames,
+        "labels": sequence.labels,
+        # between whole microseconds, as every time in the files
+        "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.version import __version__
 
 if TYPE_CHECKING:
-    from blinkgl.sequence.rig import RigSequence
+    from blinkgl.sequence import Simulation
 
 STAGES = ("scene", "render", "read-back", "events", "images", "write", "preview")
 """The stages of a sequence's time; the rest is "other"."""
@@ -43,17 +44,12 @@ class SequenceReport:
     notes: tuple[str, ...] = ()
     """what was guessed, left out or not drawn of the files, a line each"""
 
-    def count(self, sequence: RigSequence) -> None:
+    def count(self, sequence: Simulation) -> None:
         """Count the items so far."""
-        self.frames, self.events, self.labels, self.seconds = (
-            sequence.frames,
-            sequence.events,
-            sequence.labels,
-            sequence.seconds,
-        )
-        self.causes, self.notes = sequence.causes, tuple(sequence.notes)
+        for key in ("frames", "events", "labels", "seconds", "causes", "notes"):
+            setattr(self, key, getattr(sequence, key))
 
-    def finish(self, sequence: RigSequence, flushed_s: float) -> None:
+    def finish(self, sequence: Simulation, flushed_s: float) -> None:
         """Complete the report when the files exist. flushed_s : time to close them."""
         self.count(sequence)
         self.seconds["write"] += flushed_s
@@ -81,8 +77,8 @@ class Totals:
     frames: int = 0
     events: int = 0
     labels: int = 0
-    causes: dict[str, int] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
+    causes: Counter[str] = field(default_factory=Counter)
+    seconds: Counter[str] = field(default_factory=Counter)
     total_s: float = 0.0
     compile_s: float = 0.0
 
@@ -92,16 +88,11 @@ class Totals:
     def add(self, report: SequenceReport) -> Totals:
         self.count += 1
         self.first = self.first or report
-        self.simulated_s += report.simulated_s
-        self.frames += report.frames
-        self.events += report.events
-        self.labels += report.labels
-        self.total_s += report.total_s
+        for key in ("simulated_s", "frames", "events", "labels", "total_s"):
+            setattr(self, key, getattr(self, key) + getattr(report, key))
         self.compile_s = max(self.compile_s, report.compile_s)  # workers compile at the same time
-        for cause, events in report.causes.items():
-            self.causes[cause] = self.causes.get(cause, 0) + events
-        for stage, seconds in report.seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        self.causes.update(report.causes)
+        self.seconds.update(report.seconds)
         return self
 
     def summary(self) -> dict[str, float]:

@@ -99,12 +99,12 @@ def not_asked_for(wanted: set[str], manifest: dict[str, Any]) -> list[str]:
     return missing + [f"{shown(file)}: config.yaml does not ask for it" for file in sorted(there - wanted)[:5]]
 
 
-def files_of_rig(config: SequenceConfig) -> Iterator[str]:
-    """Yield the names of the files of a rig's sequence, without its manifest."""
+def files_of_sensors(config: SequenceConfig) -> Iterator[str]:
+    """Yield the names of the files of a sequence of several sensors, without its manifest."""
     yield from ("config.yaml", RIG)
-    for _, name, own, gives_events in config.cameras():
-        yield f"{name}/{MANIFEST}"
-        yield from (f"{name}/{file}" for file in files_of_sequence(own, gives_events))
+    for camera in config.cameras():
+        yield f"{camera.name}/{MANIFEST}"
+        yield from (f"{camera.name}/{file}" for file in files_of_sequence(camera.config, camera.gives_events))
     for one in config.sensors or ():
         if one.imu is not None and not one.sees:
             yield from (f"{one.name}/{file}" for file in IMU_FILES)
@@ -175,11 +175,9 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
             return missing
         config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
         if manifest["format"] == "blinkgl-rig":
-            problems = look_at_rig(folder, name, manifest, config)
-        elif config.sensors is not None:
-            problems = look_at_sensor(manifest, config)
+            problems = look_at_sensors(folder, name, manifest, config)
         else:
-            problems = bound(name, manifest, config)
+            problems = look_at_camera(name, manifest, config)
         # Last: other findings say more than that something was edited.
         problems = problems or manifest_problems(folder)
         if not problems:
@@ -189,28 +187,26 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
     return guarded(check), found[0] if found else None
 
 
-def look_at_rig(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def look_at_sensors(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
     """Return the problems of a rig's folder whose files are complete: its own, and those of each camera's folder."""
     if config.sensors is None:
         return ["config.yaml: a single camera's, but the manifest is a rig's"]
     said = [("sensors", [one.name for one in config.sensors]), *said_of(config), *times_of(config)]
-    if problems := [*unlike(manifest, said), *misnamed(name, manifest, config)]:
+    problems = [*unlike(manifest, said), *misnamed(name, manifest, config)]
+    if problems := problems or not_asked_for(set(files_of_sensors(config)), manifest):
         return problems
-    if problems := not_asked_for(set(files_of_rig(config)), manifest):
-        return problems
-    names = [name for _, name, _, _ in config.cameras()]
+    names = [camera.name for camera in config.cameras()]
     for name in names:
-        inside = guarded(lambda name=name: look_at_sensor(read_manifest(folder / name), config))
+        inside = guarded(lambda name=name: look_at_camera(name, read_manifest(folder / name), config))
         problems += [f"{name}/{line}" for line in inside]
-    total = sum(read_manifest(folder / name)["events"] for name in names)
-    return problems or unlike(manifest, [("events", total)])
+    return problems or unlike(manifest, [("events", sum(read_manifest(folder / name)["events"] for name in names))])
 
 
-def look_at_sensor(manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
-    """Return the problems of the folder of one camera of a rig, whose configuration is the rig's."""
-    for _, name, own, gives_events in config.cameras():
-        if name == manifest.get("sensor"):
-            return bound(".", manifest, own, gives_events)
+def look_at_camera(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Return the problems of the folder of a camera, of a rig's if the configuration has several sensors."""
+    for camera in config.cameras():
+        if camera.name == (manifest.get("sensor") or ""):
+            return bound("." if camera.name else name, manifest, camera.config, camera.gives_events)
     return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
 
 

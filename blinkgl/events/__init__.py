@@ -20,5 +20,5 @@ from blinkgl.types.events import Events
 __all__ = ["DvsVoltmeter", "Emulator", "Esim", "Events", "V2e", "emulator_of", "make_emulator", "register"]
 
 # Every kind that a configuration may name has a module of that name, which registers its class.
-for _kind in tuple(EmulatorConfig.members.models):
+for _kind in tuple(EmulatorConfig.members):
     import_module(f"blinkgl.events.{_kind}")

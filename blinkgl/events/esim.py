@@ -27,7 +27,7 @@ from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.packing import T_SHIFT, compact_flags, copy_block, lookup_block
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters
-from blinkgl.events.response import Response, smallest_threshold
+from blinkgl.events.response import Response
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.machine.kernels import kernel
@@ -256,7 +256,7 @@ class Esim(Emulator):
 
     @classmethod
     def response(cls, config: EsimConfig) -> Response:
-        return Response(smallest_threshold(config), 1.0, config.log_eps)
+        return Response(min(config.thresholds), 1.0, config.log_eps)
 
     @classmethod
     def noiseless(cls, config: EsimConfig) -> EsimConfig:
@@ -270,7 +270,7 @@ class Esim(Emulator):
         super().__init__(height, width, seed)
         self.config = config = config or EsimConfig()
         pixels = self.height * self.width
-        on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        on, off = config.thresholds
         # Thresholds become fixed point here. Without spread one pair of integers serves all pixels.
         self._on_all, self._off_all = int(to_q25(on)), int(to_q25(off))
         self._on = self._off = np.empty(0, np.int32)

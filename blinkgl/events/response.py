@@ -2,21 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-
-
-class Thresholds(Protocol):
-    """A configuration with a contrast threshold and, if OFF differs, another one."""
-
-    contrast_threshold: float
-    contrast_threshold_off: float | None
-
-
-def smallest_threshold(config: Thresholds) -> float:
-    """Return the smallest of ``contrast_threshold`` and ``contrast_threshold_off``."""
-    return min(config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold)
 
 
 class Response(NamedTuple):

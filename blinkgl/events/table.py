@@ -15,7 +15,7 @@ docs/extending.md has a complete example. ``Config`` holds what configuration ne
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from blinkgl.config.base import tag_of
 from blinkgl.config.events import EmulatorConfig
@@ -24,9 +24,6 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import SensorConfig
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.response import Response
-
-if TYPE_CHECKING:
-    pass
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """Emulators by ``Config``'s key ``emulator``."""
@@ -55,15 +52,8 @@ def register(emulator: type[Emulator]) -> type[Emulator]:
     kind = _checked(emulator)
     if EMULATORS.get(kind, emulator) is not emulator:
         raise TypeError(f"emulator '{kind}': there is one already, {EMULATORS[kind].__name__}")
-    EmulatorConfig.members.add(emulator.Config)
-    EMULATORS[kind] = emulator
+    EmulatorConfig.members[kind], EMULATORS[kind] = emulator.Config, emulator
     return emulator
-
-
-def unregister(kind: str) -> None:
-    """Remove the emulator of this name. Raises KeyError where there is none."""
-    del EMULATORS[kind]
-    EmulatorConfig.members.remove(kind)
 
 
 def emulator_of(config: EmulatorConfig) -> type[Emulator]:

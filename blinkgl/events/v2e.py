@@ -30,7 +30,7 @@ from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulato
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import compact_flags, copy_block, lookup_block, scale_block
-from blinkgl.events.response import Response, smallest_threshold
+from blinkgl.events.response import Response
 from blinkgl.events.table import register
 from blinkgl.events.threads import take_part
 from blinkgl.events.v2e_blocks import (
@@ -232,7 +232,7 @@ class V2e(Emulator):
     def response(cls, config: V2eConfig) -> Response:
         """Return the lin-log response: linear up to 20 digital numbers."""
         return Response(
-            smallest_threshold(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale
+            min(config.thresholds), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale
         )
 
     @classmethod
@@ -249,7 +249,7 @@ class V2e(Emulator):
         pixels = self.height * self.width
         # Arrays of features that are off have size 0, which the kernels test.
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
-        on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        on, off = config.thresholds
         self._on, self._off = (
             c.astype(np.float32) for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
         )

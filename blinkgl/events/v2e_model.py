@@ -212,7 +212,7 @@ def noise_place(k: float) -> tuple[int, float]:
 
 def noise_threshold(config: V2eConfig) -> float:
     """Return the threshold to which the size of the noise refers: the mean of ON and OFF, as in v2e."""
-    return 0.5 * (config.contrast_threshold + (config.contrast_threshold_off or config.contrast_threshold))
+    return 0.5 * sum(config.thresholds)
 
 
 # --- what is drawn once ------------------------------------------------------------------------------------
@@ -280,13 +280,13 @@ def _start_of(
         offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
     if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
         return Start(offset, leak, dead_ns, age_ns, by_noise)
-    nominal_off = config.contrast_threshold_off or config.contrast_threshold
+    nominal_on, nominal_off = config.thresholds
     shot = np.zeros(len(on))
     if config.shot_noise_rate_hz and not config.photoreceptor_noise:
         # Shot noise per second of both polarities: half the rate each, less in bright light, more at
         # low thresholds.
         level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
-        each = config.contrast_threshold / on.astype(np.float64) + nominal_off / off.astype(np.float64)
+        each = nominal_on / on.astype(np.float64) + nominal_off / off.astype(np.float64)
         shot = 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
     moving = np.flatnonzero(leak > 0) if leak.size else np.empty(0, np.int64)
     # between: mean time from one event to the next, s.

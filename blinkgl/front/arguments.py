@@ -7,7 +7,6 @@ import inspect
 import math
 import numbers
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -20,22 +19,24 @@ Given = ParamSpec("Given")
 Made = TypeVar("Made")
 
 
-def public(function: Callable[Given, Made]) -> Callable[Given, Made]:
-    """Decorate a public function: an argument that is unknown, missing or one too many raises ConfigError."""
+def public(keywords: type | None = None) -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
+    """Decorate a public function: an argument that is unknown, missing or one too many raises ConfigError.
+
+    keywords : the TypedDict of its ``**keywords``; None: there are none, or it checks those itself."""
+    return lambda function: _checked(function, keywords)
+
+
+def _checked(function: Callable[Given, Made], keywords: type | None) -> Callable[Given, Made]:
     signature = inspect.signature(function)
     name = function.__qualname__.removesuffix(".__init__")
     prefix = f"{name}." if function.__name__ == "__init__" else ""
     known = [key for key, one in signature.parameters.items() if key != "self" and one.kind is not one.VAR_KEYWORD]
-    more = [str(one.annotation) for one in signature.parameters.values() if one.kind is one.VAR_KEYWORD]
-    for options in (re.fullmatch(r"Unpack\[(\w+)\]", text) for text in more):
-        if options is not None:
-            known += inspect.unwrap(function).__globals__[options[1]].__annotations__
-            more = []
+    any_more = keywords is None and any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values())
+    known += [] if keywords is None else keywords.__annotations__
 
     @functools.wraps(function)
     def called(*args: Given.args, **kwargs: Given.kwargs) -> Made:
-        # A function with ``**keywords`` checks those itself.
-        for key in () if more else kwargs:
+        for key in () if any_more else kwargs:
             if key not in known:
                 raise unknown_argument(key, known, prefix)
         try:
@@ -53,7 +54,7 @@ def unknown_argument(name: str, known: Iterable[str], prefix: str = "") -> Confi
     from blinkgl.config.events import EmulatorConfig
     from blinkgl.config.problems import nearest
 
-    for kind, model in EmulatorConfig.members.models.items():
+    for kind, model in EmulatorConfig.members.items():
         if name in model.model_fields and "emulator" in known:
             accepted = f"emulator={{'emulator': '{kind}', '{name}': …}}"
             break

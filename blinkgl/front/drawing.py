@@ -31,7 +31,7 @@ class Renderer:
     outside them nothing moves.
     Raises ConfigError, AssetError, GLError."""
 
-    @check.public
+    @check.public()
     def __init__(self, source: Source, *, index: int = 0, quality: str | None = None):
         self.config = configured(source, quality=quality).sequence(check.whole(index, "index", 0, MAX_INDEX))
         if self.config.frames is not None:
@@ -109,7 +109,7 @@ def _ns(seconds: float, where: str) -> int:
     return math.floor(check.number(seconds, where, least=-_LATEST_S, most=_LATEST_S) * 1e9 + 0.5)
 
 
-@check.public
+@check.public()
 def render_frame(
     source: Source, t: float, labels: Sequence[str | float] = ("images",), *, index: int = 0, to: float | None = None
 ) -> LabelFrame:

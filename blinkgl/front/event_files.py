@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict, Unpack
 
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
@@ -13,9 +13,6 @@ from blinkgl.io import formats
 from blinkgl.io.formats import EventFile
 from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 _SIDE = 65535
 
@@ -41,7 +38,7 @@ def event_reading(declared: Mapping[str, Any]) -> EventReading:
     return EventReading.of(**given)
 
 
-@check.public
+@check.public(EventOptions)
 def open_events(path: str | os.PathLike, **declared: Unpack[EventOptions]) -> EventFile:
     """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
     ``height``, ``width`` in px, None if the file does not contain them (``file.sized()`` computes them), times in µs.
@@ -56,7 +53,7 @@ def open_events(path: str | os.PathLike, **declared: Unpack[EventOptions]) -> Ev
     return formats.open_events(check.path(path, "path"), event_reading(declared))
 
 
-@check.public
+@check.public(EventOptions)
 def read_events(path: str | os.PathLike, *, truth: bool = False, **declared: Unpack[EventOptions]) -> Events:
     """Return all :class:`Events` of a file, t in µs, in memory. A guess, or something left out, is a warning.
 
@@ -77,7 +74,7 @@ def _warn(file: EventFile) -> None:
         warnings.warn(f"{file.path}: {line}", stacklevel=4)
 
 
-@check.public
+@check.public()
 def write_events(
     path: str | os.PathLike,
     events: Events | Iterable[Events],
@@ -123,7 +120,7 @@ def _chunks(events: Any) -> Iterator[Events]:
     return checked()
 
 
-@check.public
+@check.public(EventOptions)
 def convert(
     source: str | os.PathLike,
     target: str | os.PathLike,

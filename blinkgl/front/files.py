@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from blinkgl.front.event_files import EventOptions, checked_size, event_reading
 from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from blinkgl.front.sections import EmulatorSettings
+    from blinkgl.front.sections import Section
     from blinkgl.io.frames import Declared
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
@@ -36,7 +34,7 @@ def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
     return camera.height, camera.width
 
 
-@check.public
+@check.public()
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
     of a .png (DSEC), .flo or .npy file.
@@ -47,7 +45,7 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     return flow_files.read_flow(check.path(path, "path"))
 
 
-@check.public
+@check.public()
 def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> int:
     """Write flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16
     bit), .flo or .npy, by the ending.
@@ -67,7 +65,7 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
     return flow_files.write_flow(check.path(path, "path"), field.astype(np.float32), mask.astype(bool))
 
 
-@check.public
+@check.public()
 def read_trajectory(
     path: str | os.PathLike,
     *,
@@ -96,7 +94,7 @@ def read_trajectory(
     return trajectories.read_trajectory(check.path(path, "path"), declared, notes)
 
 
-@check.public
+@check.public()
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
     """Write poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw. A sequence's
     ``poses.npz`` has them as ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
@@ -122,7 +120,7 @@ class DeclaredBoth(EventOptions, total=False):
     background: str | None
 
 
-@check.public
+@check.public(DeclaredBoth)
 def compare(
     a: str | os.PathLike,
     b: str | os.PathLike | None = None,
@@ -172,12 +170,12 @@ class ReadingOptions(DeclaredBoth, total=False):
     frame_delay_ms: float | None
 
 
-@check.public
+@check.public(ReadingOptions)
 def calibrate(
     recording: str | os.PathLike,
     frames: str | os.PathLike | None = None,
     *,
-    emulator: EmulatorSettings = "esim",
+    emulator: Section = "esim",
     fixed: Iterable[str] = (),
     still: bool = False,
     starts: int = 3,
@@ -234,7 +232,7 @@ class FrameOptions(TypedDict, total=False):
     zero_time: bool
     white_level: float | None
     range: str | None
-    emulator: EmulatorSettings
+    emulator: Section
     gamma: str | float | None
     interpolate: str
     max_px: float
@@ -243,7 +241,7 @@ class FrameOptions(TypedDict, total=False):
     sensor: str | None
 
 
-@check.public
+@check.public(FrameOptions)
 def simulate(
     frames: Iterable, *, unit: str = "ns", report: SimulationReport | None = None, **frame_options: Unpack[FrameOptions]
 ) -> Iterator[Events]:
@@ -274,7 +272,7 @@ def simulate(
     return simulation.frames_to_events(_frames(frames), use, unit=unit, report=report, **options)
 
 
-@check.public
+@check.public(FrameOptions)
 def simulate_file(
     source: str | os.PathLike,
     target: str | os.PathLike,
@@ -320,7 +318,7 @@ def _options(
     zero_time: bool = False,
     white_level: float | None = None,
     range: str | None = None,
-    emulator: EmulatorSettings = "esim",
+    emulator: Section = "esim",
     gamma: str | float | None = None,
     interpolate: str = "linear",
     max_px: float = 1.0,

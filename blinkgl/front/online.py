@@ -56,7 +56,7 @@ class OnlineSequences:
     Raises ConfigError (a bad recipe, or bad arguments here; a recipe that gives no samples, at the sample), AssetError,
     GLError; EventDataError: a sample that was taken before, or after :meth:`close`."""
 
-    @check.public
+    @check.public()
     def __init__(
         self,
         source: str | RunTemplate,

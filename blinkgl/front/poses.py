@@ -27,7 +27,7 @@ class Piece:
 
     def __init_subclass__(cls) -> None:
         if "__init__" in vars(cls):
-            cls.__init__ = check.public(cls.__init__)
+            cls.__init__ = check.public()(cls.__init__)
 
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
         """Return ``tree`` unchanged if the model accepts it. renamed : arguments of the model's keys
@@ -105,7 +105,7 @@ class Pose(Piece):
         return cls(matrix[:3, 3], quaternion=(w, x, y, z))
 
 
-@check.public
+@check.public()
 def look_at(position: Vector, target: Vector) -> Pose:
     """Return a :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
     horizon is level. Raises ConfigError."""

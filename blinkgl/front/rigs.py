@@ -26,15 +26,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.poses import Piece, Vector
 from blinkgl.front.scenes import Camera
-from blinkgl.front.sections import (
-    EmulatorSettings,
-    ImageSettings,
-    ImuSettings,
-    TrackSettings,
-    events_tree,
-    labels_tree,
-    section_tree,
-)
+from blinkgl.front.sections import SECTIONS, Section, sections
 
 
 class RigSensor(Piece):
@@ -62,38 +54,31 @@ class RigSensor(Piece):
         pair: str | None = None,
         camera: Camera | Mapping[str, Any] | None = None,
         events: bool | None = None,
-        emulator: EmulatorSettings | None = None,
+        emulator: Section | None = None,
         sensor: str | os.PathLike | None = None,
         readout: Mapping[str, Any] | Config | None = None,
         labels: Sequence[str | float] | None = None,
-        images: ImageSettings | None = None,
-        imu: ImuSettings | None = None,
-        tracks: TrackSettings | None = None,
+        images: Section | None = None,
+        imu: Section | None = None,
+        tracks: Section | None = None,
     ):
         if matrix is not None:
             matrix = check.array(matrix, "RigSensor.matrix", (4, 4), "an array (4, 4) of numbers, T_rig_sensor")
         place = check.given(position=position, euler=euler, quaternion=quaternion, matrix=matrix)
-        tree = check.given(name=name, pair=pair, sensor=sensor)
+        given = dict(emulator=emulator, sensor=sensor, labels=labels, images=images, imu=imu, tracks=tracks)
+        tree = {**check.given(name=name, pair=pair), **sections(SECTIONS, given)}
         tree["place"] = self._checked(PlaceConfig, place)
         if camera is not None:
             tree["camera"] = _camera_tree(camera)
         if events is not None:
             check.one_of(events, "RigSensor.events", bool, "True, False or None")
-        if emulator is not None:
-            if events is False:
+            if emulator is not None and not events:
                 raise ConfigError("the sensor has no events", where="RigSensor.emulator", value=emulator)
-            tree["events"] = events_tree(emulator)
-        elif events is not None:
-            tree["events"] = {} if events else None
+            tree.setdefault("events", {} if events else None)
         if readout is not None:
-            given = readout.model_dump(exclude_unset=True) if isinstance(readout, Config) else readout
-            check.one_of(given, "RigSensor.readout", Mapping, "a table of readout:")
-            tree["readout"] = self._checked(ReadoutConfig, check.given(**given))
-        if labels is not None:
-            tree["labels"] = labels_tree(labels)
-        for key, given in (("images", images), ("imu", imu), ("tracks", tracks)):
-            if given is not None:
-                tree[key] = section_tree(key, given)
+            table = readout.model_dump(exclude_unset=True) if isinstance(readout, Config) else readout
+            check.one_of(table, "RigSensor.readout", Mapping, "a table of readout:")
+            tree["readout"] = self._checked(ReadoutConfig, check.given(**table))
         said = {key: value for key, value in tree.items() if key not in ("events", "sensor", "camera")}
         self._checked(RigSensorConfig, said)  # these three are complete after merging with the run's
         self.tree = tree
@@ -116,7 +101,7 @@ def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Rig(Piece):
-    """Sensors that move together: ``record_rig(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
+    """Sensors that move together: ``record(scene, Rig(RigSensor("left"), RigSensor("imu", imu="adis16448")))``.
 
     sensors : :class:`RigSensor`, with different names.   preset : "stereo", "davis", "dsec" or "mvsec": its sensors
     come first, changed by those of ``sensors`` with the same names (docs/rigs.md).
@@ -127,7 +112,7 @@ class Rig(Piece):
             check.one_of(one, f"Rig.sensors[{k}]", RigSensor, "a RigSensor")
         self.sensors = sensors
         # both keys: a rig replaces the one of a configuration
-        self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors] or None}
+        self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors]}
         try:
             spelled_out(self.tree, ())
         except ConfigError as error:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
@@ -18,21 +17,10 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig, rig_of
 from blinkgl.front.scenes import Scene
-from blinkgl.front.sections import (
-    NAMED,
-    EmulatorSettings,
-    ImageSettings,
-    ImuSettings,
-    TrackSettings,
-    events_tree,
-    labels_tree,
-    section_tree,
-)
+from blinkgl.front.sections import SECTIONS, Section, sections
 from blinkgl.scene.types import Scene as SceneData
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
     from blinkgl.sequence.request import SequenceRequest
@@ -48,7 +36,7 @@ class Timeline:
     values : keys of that kind, see ``timeline:`` in docs/configuration.md.
     Raises ConfigError."""
 
-    @check.public
+    @check.public()
     def __init__(self, kind: str = "displacement", **values: Any):
         self.tree = {"kind": check.plain(kind), **check.plain(values)}
         try:
@@ -61,7 +49,7 @@ class Timeline:
         return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
 
 
-@check.public
+@check.public()
 def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
     """Read and check the run of a YAML file, for :func:`generate`, :func:`record`, :func:`render_frame`.
 
@@ -77,17 +65,17 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 class Settings(TypedDict, total=False):
     """Values that replace those of a run's source; :func:`blinkgl.record` describes them. None keeps the source's."""
 
-    emulator: EmulatorSettings | None
+    emulator: Section | None
     sensor: str | None
     timeline: Timeline | None
     quality: str | None
     labels: Sequence[str | float] | None
-    images: ImageSettings | None
-    imu: ImuSettings | None
-    tracks: TrackSettings | None
+    images: Section | None
+    imu: Section | None
+    tracks: Section | None
 
 
-@check.public
+@check.public(Settings)
 def generate(
     source: Source,
     out: str | os.PathLike,
@@ -103,7 +91,7 @@ def generate(
     source : :class:`Scene` or the result of :func:`load`.   num : number of sequences (of each group at most).
     workers : processes; 1: this one.
     resume : continue where ``out`` contains sequences of this run.   settings : emulator, sensor, timeline, quality,
-    labels, images, imu, tracks as of :func:`record`, rig as of :func:`record_rig`.
+    labels, images, imu, tracks as of :func:`record`, rig as of :func:`record`.
     Returns the counts (``made.events``, ``made.labels`` …) and the sequences set aside.
     Raises BlinkGLError: ConfigError (also for a scene with arrays: save them to files
     first), AssetError, GLError, OutputError."""
@@ -124,7 +112,7 @@ def generate(
     return run_dataset(template, check.path(out, "out"), executor, num=num, resume=bool(resume))
 
 
-@check.public
+@check.public()
 def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
     """Check a data set; ``.clean`` tells whether it has no problem, ``.problems`` lists them by sequence.
 
@@ -135,25 +123,18 @@ def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verifi
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))
 
 
-_SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "emulator": ("events", events_tree),
-    "labels": ("labels", labels_tree),
-    **{key: (key, partial(section_tree, key)) for key in NAMED},
+_READERS = {
+    **SECTIONS,
     "timeline": ("timeline", lambda given: check.one_of(given, "timeline", Timeline, "a Timeline").tree),
-    "sensor": ("sensor", check.plain),
     "quality": ("quality", check.plain),
 }
-"""Argument -> key of the configuration, and the function that reads it."""
 
 
 def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[Settings]) -> RunTemplate:
     """Return ``source`` as a run, with the given values replacing its own. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load(path) gives")
     template = source.template() if isinstance(source, Scene) else source
-    own: dict[str, Any] = {}
-    for name, (key, read) in _SECTIONS.items():
-        if (value := settings.get(name)) is not None:
-            own[key] = read(value)
+    own = sections(_READERS, settings)
     if rig is not None:
         own |= rig_of(rig).tree
     own = expanded(own, Path.cwd())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from blinkgl.config.base import Config
@@ -12,13 +13,11 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.labels import LABELS
 
-EmulatorSettings = str | Mapping[str, Any] | Config
-ImageSettings = str | Mapping[str, Any] | Config
-ImuSettings = str | Mapping[str, Any] | Config
-TrackSettings = str | Mapping[str, Any] | Config
+Section = str | Mapping[str, Any] | Config
+"""A section of a configuration: the name of a preset or kind, a table of its keys, or the model itself."""
 
 
-def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
+def events_tree(emulator: Section) -> dict[str, Any]:
     """Return ``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
     from blinkgl.recordings.simulation import emulator_config
 
@@ -101,3 +100,18 @@ def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
         asked["flow"] = [*asked.get("flow", ()), *sorted(intervals)]
     tree = {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}
     return {**tree, **{name: name in wanted for name in OF_EVENTS}}
+
+
+SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "emulator": ("events", events_tree),
+    "labels": ("labels", labels_tree),
+    **{key: (key, partial(section_tree, key)) for key in NAMED},
+    "sensor": ("sensor", check.plain),
+}
+"""Argument -> key of the configuration, and the function that reads it."""
+
+
+def sections(readers: Mapping[str, tuple[str, Callable[[Any], Any]]], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sections of the given arguments that are not None. readers : as :data:`SECTIONS`. Raises
+    ConfigError."""
+    return {key: read(given[name]) for name, (key, read) in readers.items() if given.get(name) is not None}

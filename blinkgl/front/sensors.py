@@ -29,17 +29,17 @@ def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, val
     return make_on_device(config, height, width, check.seed(seed))
 
 
-@check.public
+@check.public()
 def Esim(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
     return _made("esim", height, width, seed, sensor, values)
 
 
-@check.public
+@check.public()
 def V2e(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
     return _made("v2e", height, width, seed, sensor, values)
 
 
-@check.public
+@check.public()
 def DvsVoltmeter(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
     return _made("voltmeter", height, width, seed, sensor, values)
 
@@ -53,7 +53,7 @@ DvsVoltmeter.__doc__ = (
 )
 
 
-@check.public
+@check.public()
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
     """Return the values of an included camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
     (case and punctuation do not matter), or of a sensor file by its path.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Unpack, cast
 
 import numpy as np
 
@@ -21,19 +22,18 @@ from blinkgl.front.runs import (
 )
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.render.tracks import Tracks
-from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, Simulation, factory
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Item, SensorSimulation, Simulation, simulate
 from blinkgl.sequence.inertial import Inertial
-from blinkgl.sequence.rig import RigSequence, simulate_rig as simulate_rig_of
 from blinkgl.srgb import to_srgb8
 from blinkgl.types.events import Events
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+_no_times = partial(np.zeros, 0, np.int64)
 
 
-@check.public
+@check.public(Settings)
 def simulate_sequence(
     source: Source,
+    rig: Rig | str | None = None,
     *,
     index: int = 0,
     events: bool = True,
@@ -48,32 +48,31 @@ def simulate_sequence(
                 case GroundTruth(): item.frame.forward.flow           # (H, W, 2) float32 px
                 case CameraImage(): item.image                        # of `images:`, codes
 
-    All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is
-    released when the loop ends, also by an error.
+    All events before a label's time come before its :class:`GroundTruth`, and no others. Items of several sensors are
+    merged by time; ``item.sensor`` is the name of theirs. OpenGL is released when the loop ends, also by an error.
 
-    source : :class:`Scene` or the result of :func:`load`, recorded frames (``frames:``)
-    included.   index : number of the sequence.
-    settings : emulator, sensor, timeline, quality, labels, images, imu, tracks as of :func:`record`; labels not in
-    ``labels`` are not drawn; ``imu()`` and ``tracks()`` of the iterator give the last two.
+    source : :class:`Scene`, whose camera's pose is the rig's, or the result of :func:`load`, recorded frames
+    (``frames:``) included.
+    rig : :class:`Rig`, or a preset's name; None: the source's, or its single camera.   index : number of the sequence.
+    settings : emulator, sensor, timeline, quality, labels of all cameras that do not set them, and for a single camera
+    images, imu, tracks, as of :func:`record`; labels not in ``labels`` are not drawn.
     events : False: no events.
     pictures_hz : number of :class:`Picture` per second of simulated time, at event frames.
-    The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
-    ``labels``. Iterate over it once, or use it in ``with`` if it may not be iterated. Raises ConfigError, AssetError,
-    GLError and, during iteration, EventDataError."""
-    config = _configured(source, index, settings)
+    The iterator has ``config``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``, ``labels``. ``members`` has
+    each camera's ``name``, ``height``, ``width``, ``imu()`` and ``tracks()``; those of the first are its own, too.
+    ``inertial_units()`` gives the measurements of the other sensors. Iterate over it once, or use it in ``with`` if it
+    may not be iterated. Raises ConfigError, AssetError, GLError and, during iteration, EventDataError."""
+    config = configured(source, rig, **settings).sequence(check.whole(index, "index", 0, MAX_INDEX))
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
         pictures_hz = check.number(pictures_hz, "pictures_hz", above=0, most=1e4)
-    return factory.simulate_sequence(requested(source, config, index, events=events, pictures_hz=pictures_hz))
-
-
-def _configured(source: Source, index: int, settings: Settings) -> SequenceConfig:
-    return configured(source, **settings).sequence(check.whole(index, "index", 0, MAX_INDEX))
+    return simulate.simulate_sequence(requested(source, config, index, events=events, pictures_hz=pictures_hz))
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A sequence in memory.
+    """A sequence in memory, of one camera or of a rig: ``recording["left"]`` is the Recording of that camera, and what
+    follows is the first camera's.
 
     events : all of them, t in µs on the scene's clock.   t_us : (K,) int64, times of the labels.
     labels : K times :class:`LabelFrame`; labels that were not requested are None.
@@ -82,19 +81,36 @@ class Recording:
     lost : events dropped by its limit and the read-out.
     camera : :class:`CameraImage` of the frame camera, with ``images:``.
     imu : measurements of the inertial unit, :class:`~blinkgl.sequence.inertial.Inertial`; None: no unit.
-    tracks : tracked points, :class:`~blinkgl.render.tracks.Tracks`; None: not requested."""
+    tracks : tracked points, :class:`~blinkgl.render.tracks.Tracks`; None: not requested.
 
-    events: Events
-    t_us: np.ndarray
-    labels: tuple[LabelFrame, ...]
-    image_t_us: np.ndarray
-    images: np.ndarray | None
+    cameras : recordings by name; that of a frame camera without events contains none.
+    units : measurements of every sensor with an inertial unit, by name; ``T_cam_imu`` leads to that sensor's axes.
+    T_rig_sensor : (4, 4) float64 by name, from a sensor's axes to the rig's.
+    rig_t_us : (M,) int64, the start and every label's time, the last one's end included.   T_world_rig : (M, 4, 4)
+    float64, the rig's poses then, those of a single camera; of recorded frames they are unknown and M is 0.
+    A single camera has the name ""."""
+
     config: SequenceConfig = field(repr=False)
-    frames: int
-    lost: int
+    events: Events = field(default_factory=Events.empty)
+    t_us: np.ndarray = field(default_factory=_no_times)
+    labels: tuple[LabelFrame, ...] = ()
+    image_t_us: np.ndarray = field(default_factory=_no_times)
+    images: np.ndarray | None = None
+    frames: int = 0
+    lost: int = 0
     camera: tuple[CameraImage, ...] = ()
     imu: Inertial | None = None
     tracks: Tracks | None = None
+    cameras: Mapping[str, Recording] = field(default_factory=dict, repr=False)
+    units: Mapping[str, Inertial] = field(default_factory=dict, repr=False)
+    T_rig_sensor: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    rig_t_us: np.ndarray = field(default_factory=_no_times)
+    T_world_rig: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)), repr=False)
+
+    def __getitem__(self, name: str) -> Recording:
+        if name not in self.cameras:
+            raise ConfigError("no such camera on the rig", where="name", value=name, accepted=", ".join(self.cameras))
+        return self.cameras[name]
 
     @property
     def flow(self) -> np.ndarray:
@@ -119,11 +135,14 @@ class Recording:
         return flows
 
 
-@check.public
-def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
+@check.public(Settings)
+def record(source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]) -> Recording:
     """Return events, images and ground truth of one sequence as arrays, as :func:`generate` writes them.
 
-    source : :class:`Scene` or the result of :func:`load`.   index : number of the sequence.
+    source : :class:`Scene`, whose camera's pose is the rig's, or the result of :func:`load`.
+    rig : several sensors, a :class:`Rig` or a preset's name; None: the source's, or its single camera.
+    index : number of the sequence.   The rest is for all cameras that do not set it; images, imu and tracks only for a
+    single camera, since a rig's sensors have their own.
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
     sensor : camera that gives size, emulator values and read-out, such as "davis346".
     timeline : :class:`Timeline`.
@@ -135,12 +154,24 @@ def record(source: Source, *, index: int = 0, **settings: Unpack[Settings]) -> R
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
-    config = _configured(source, index, settings)
-    gathered = Gathered()
-    with factory.simulate_sequence(requested(source, config, index)) as sequence:
-        for item in sequence:
-            gathered.take(item)
-        return gathered.recording(sequence)
+    with simulate_sequence(source, rig, index=index, **settings) as sequence:
+        gathered = {member.name: Gathered() for member in sequence.members}
+        for member, item in sequence.by_sensor():
+            gathered[member.name].take(item)
+        cameras = {member.name: gathered[member.name].recording(member) for member in sequence.members}
+        units = {name: one.imu for name, one in cameras.items() if one.imu is not None}
+        units |= {name: measured for name, _, measured in sequence.inertial_units()}
+    made = replace(
+        next(iter(cameras.values()), Recording(sequence.config)),
+        config=sequence.config,
+        cameras=cameras,
+        units=units,
+        T_rig_sensor={one.name: one.place.T for one in sequence.config.sensors or ()} or {"": np.eye(4)},
+    )
+    if sequence.scene is None:
+        return made
+    times = np.array([sequence.config.time.t0_ns, *sequence.config.time.label_times_ns], np.int64)
+    return replace(made, rig_t_us=times // 1000, T_world_rig=sequence.scene.rig.path.poses(times))
 
 
 class Gathered:
@@ -166,16 +197,16 @@ class Gathered:
         elif isinstance(item, CameraImage):
             self._images.append(item)
 
-    def recording(self, sequence: Simulation) -> Recording:
-        """Return the recording of the sequence of all items."""
+    def recording(self, sequence: SensorSimulation) -> Recording:
+        """Return the recording of the camera of all items."""
         t_us = np.array(self._t_us, np.int64)
         return Recording(
+            sequence.config,
             Events.concatenate(self._events),
             t_us[:-1],
             tuple(self._labels[:-1]),
             t_us,
             np.stack(self._pictures) if self._pictures else None,
-            sequence.config,
             sequence.frames,
             sum(sequence.losses[:2]),
             tuple(self._images),
@@ -188,77 +219,21 @@ class Gathered:
 # Iteration over a rig's sequence during its simulation, and one in memory.
 
 
-@check.public
-def simulate_rig(
-    source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
-) -> RigSequence:
-    """Iterate over the data of a rig's sensors in the order of time; nothing is written or stored:
+# ---------------------------------------------------------------------------------------------------------------------
+# Former names; they stay for one release.
 
-        for member, item in simulate_rig(scene, "stereo"):
-            member.name, item                 # "left", EventChunk(…): items as of simulate_sequence
-
-    source : :class:`Scene`, whose camera's pose is the rig's, or the result of :func:`load`.
-    rig : :class:`Rig`, or a preset's name; None: the source's.   index : number of the sequence.
-    settings : emulator, sensor, timeline, quality, labels of all its cameras that do not set them, as of
-    :func:`record`.
-    The iterator has ``config``, ``scene``, ``t0_ns``, ``t1_ns`` and ``members``, one of each camera, as
-    :func:`simulate_sequence` gives them; ``inertial_units()`` gives the inertial measurements. Iterate over it once, or
-    use it in ``with``. Raises ConfigError, AssetError, GLError and, during iteration, EventDataError."""
-    template = configured(source, rig, **settings)
-    config = template.sequence(check.whole(index, "index", 0, MAX_INDEX))
-    if config.sensors is None:
-        raise ConfigError(
-            "the source has a single camera", where="rig", value=rig, accepted="a Rig, or a preset's name; or record"
-        )
-    return simulate_rig_of(requested(source, config, index))
+RigRecording = Recording
+"""Write ``Recording``."""
 
 
-@dataclass(frozen=True, eq=False)
-class RigRecording:
-    """A rig's sequence in memory. ``recording["left"]`` is the :class:`Recording` of that camera.
-
-    cameras : recordings by name; that of a frame camera without events contains none.
-    imu : of every sensor with an inertial unit, by name; ``T_cam_imu`` leads to that sensor's axes.
-    T_rig_sensor : (4, 4) float64 by name, from a sensor's axes to the rig's.
-    t_us : (M,) int64, the start and every label's time, the last one's end included.   T_world_rig : (M, 4, 4) float64,
-    the rig's poses.
-    config : every value as drawn."""
-
-    cameras: Mapping[str, Recording]
-    imu: Mapping[str, Inertial]
-    T_rig_sensor: Mapping[str, np.ndarray]
-    t_us: np.ndarray
-    T_world_rig: np.ndarray
-    config: SequenceConfig = field(repr=False)
-
-    def __getitem__(self, name: str) -> Recording:
-        if name not in self.cameras:
-            raise ConfigError("no such camera on the rig", where="name", value=name, accepted=", ".join(self.cameras))
-        return self.cameras[name]
+def record_rig(*arguments: Any, **settings: Any) -> Recording:
+    """Write ``record(source, rig)``, whose ``units`` and ``rig_t_us`` are called ``imu`` and ``t_us`` here."""
+    made = record(*arguments, **settings)
+    return replace(made, imu=cast(Any, made.units), t_us=made.rig_t_us)
 
 
-@check.public
-def record_rig(
-    source: Source, rig: Rig | str | None = None, *, index: int = 0, **settings: Unpack[Settings]
-) -> RigRecording:
-    """Return the data of all sensors of a rig for one sequence, as arrays, as :func:`generate` writes them.
-
-    Arguments as of :func:`simulate_rig`. Raises ConfigError, AssetError, GLError, EventDataError."""
-    with simulate_rig(source, rig, index=index, **settings) as sequence:
-        gathered = {member.name: Gathered() for member in sequence.members}
-        for member, item in sequence:
-            gathered[member.name].take(item)
-        cameras = {member.name: gathered[member.name].recording(member) for member in sequence.members}
-        units = {name: one.imu for name, one in cameras.items() if one.imu is not None}
-        units |= {name: measured for name, _, measured in sequence.inertial_units()}
-    config, scene = sequence.config, sequence.scene
-    assert scene is not None  # of a rig
-    times = np.array([config.time.t0_ns, *config.time.label_times_ns], np.int64)
-    return RigRecording(
-        cameras,
-        units,
-        {one.name: one.place.T for one in config.sensors or ()},
-        times // 1000,
-        scene.rig.path.poses(times),
-        config,
-    )
+def simulate_rig(*arguments: Any, **settings: Any) -> Simulation:
+    """Write ``simulate_sequence(source, rig)``, whose items have a ``sensor``; here they are (member, item) pairs."""
+    made = simulate_sequence(*arguments, **settings)
+    made.in_pairs = True
+    return made

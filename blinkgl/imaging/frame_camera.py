@@ -45,7 +45,7 @@ class CameraImage:
     exposure_ns : of each row.   row_ns : between the starts of two rows.   gain : a factor.
     instants : number of instants averaged.   step_px : largest motion between two, from the speeds at a few times.
     pictures : name -> codes, (H, W, 3) RGB or (H, W) of one colour per pixel, uint8 for 8 bits, else uint16: "images",
-    the camera's output, and those of ``images.also``."""
+    the camera's output, and those of ``images.also``.   sensor : name of the camera; "" of a single one."""
 
     k: int
     start_ns: int
@@ -56,6 +56,7 @@ class CameraImage:
     instants: int
     step_px: float
     pictures: Mapping[str, np.ndarray]
+    sensor: str = ""
 
     @property
     def t_ns(self) -> int:

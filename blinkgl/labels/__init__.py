@@ -16,7 +16,7 @@ from blinkgl.labels.label import Label
 from blinkgl.labels.occlusion import OcclusionAt
 from blinkgl.labels.semantics import Semantics
 from blinkgl.labels.surface import Depth, Ids, Images, Normals, SceneFlow, Velocity
-from blinkgl.labels.table import LABELS, label_of, register, unregister
+from blinkgl.labels.table import LABELS, label_of, register
 from blinkgl.labels.values import Flow
 
 for _row in (
@@ -50,5 +50,4 @@ __all__ = [
     "asked_for",
     "label_of",
     "register",
-    "unregister",
 ]

@@ -10,15 +10,12 @@ from collections.abc import Callable
 from importlib import resources
 from typing import Any
 
-from pydantic import Field
-
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.sequence import add_label
 from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Label
 
 LABELS: dict[str, Label] = {}
 """Labels by ``name``, in the order of registration, which all lists of labels use."""
-_KEYS: set[str] = set()
-"""Keys of ``labels:`` that were added for a label."""
 
 
 def register(label: Label) -> Label:
@@ -28,21 +25,9 @@ def register(label: Label) -> Label:
     nothing is then registered."""
     _checked(label)
     if _has_own_key(label) and label.name not in LabelsConfig.model_fields:
-        try:
-            LabelsConfig.add_key(label.name, bool, Field(False, description=label.about))
-        except TypeError as error:
-            raise TypeError(f"label '{label.name}': `name`: {error}") from None
-        _KEYS.add(label.name)
+        add_label(label.name, label.about)
     LABELS[label.name] = label
     return label
-
-
-def unregister(name: str) -> None:
-    """Remove the label of this name, and the keys that no other uses. Raises KeyError where there is none."""
-    del LABELS[name]
-    if name in _KEYS:
-        LabelsConfig.remove_key(name)
-        _KEYS.remove(name)
 
 
 def _has_own_key(label: Label) -> bool:
@@ -73,7 +58,9 @@ def _checked(label: Any) -> None:
     unless(name not in LABELS, "name", "is taken: there is such a label already")
     if _has_own_key(label):
         unless(name not in LabelsConfig.settings, "name", "is taken: `labels:` has such a key for something else")
-        unless(name in LabelsConfig.model_fields or bool(label.about), "about", "is missing")
+        new = name not in LabelsConfig.model_fields
+        unless(not new or not hasattr(LabelsConfig, name), "name", "cannot be a key")
+        unless(not new or bool(label.about), "about", "is missing")
     unless(label.kind in KINDS, "kind", f"is {label.kind!r} and none of {', '.join(KINDS)}")
     _check_drawing(label, unless)
     taken = {form.folder + "." + form.ending: other.name for other in LABELS.values() for form in other.forms}

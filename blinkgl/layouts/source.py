@@ -26,7 +26,7 @@ from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
-from blinkgl.sequence_files.rig_dir import CAM_TO_CAM, read_rig
+from blinkgl.sequence_files.rig_dir import CAM_TO_CAM, read_sensors
 from blinkgl.sequence_files.sequence_dir import is_rig_folder, whole
 from blinkgl.types.events import Events
 
@@ -203,12 +203,12 @@ class Source:
 def sources_of(root: Path) -> list[Source]:
     """Return the sequences of a data set, or ``root`` itself; of a rig its first event camera's, of a pair the left
     one's. Raises as :meth:`Source.open`, and AssetError: a rig without an event camera."""
-    return [_of_rig(f) if is_rig_folder(f) else Source.open(f) for f in made_folders(root)]
+    return [_of_sensors(f) if is_rig_folder(f) else Source.open(f) for f in made_folders(root)]
 
 
-def _of_rig(folder: Path) -> Source:
+def _of_sensors(folder: Path) -> Source:
     whole(folder)
-    tables = read_rig(folder)
+    tables = read_sensors(folder)
     cameras = [name for name, one in tables.items() if "events" in one["records"]]
     if not cameras:
         raise AssetError("a rig without an event camera", where=str(folder))

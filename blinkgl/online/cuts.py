@@ -12,19 +12,19 @@ from blinkgl.errors import ConfigError
 from blinkgl.labels.values import Flow
 from blinkgl.online.job import StreamJob
 from blinkgl.online.samples import StreamSample, WindowSample
-from blinkgl.sequence import Simulation
+from blinkgl.sequence import SensorSimulation
 from blinkgl.types.events import Events
 
 _LEAST_PX = 0.3  # shorter flow counts as this long for the density
 _CANDIDATES = 6  # candidate positions for each requested sample
 
 Sample = WindowSample | StreamSample
-Cut = Callable[[Simulation, StreamJob, str, int, np.random.Generator], Iterator[Sample]]
+Cut = Callable[[SensorSimulation, StreamJob, str, int, np.random.Generator], Iterator[Sample]]
 """(sequence, job, name of the sequence, largest number of samples, random generator) -> samples."""
 
 
 def windows(
-    sequence: Simulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
+    sequence: SensorSimulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
 ) -> Iterator[WindowSample]:
     """Yield pairs of windows at random times and of random lengths."""
     events = sequence.gather()
@@ -54,7 +54,7 @@ def windows(
 
 
 def streams(
-    sequence: Simulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
+    sequence: SensorSimulation, job: StreamJob, name: str, wanted: int, dice: np.random.Generator
 ) -> Iterator[StreamSample]:
     """Yield runs of ``job.steps`` consecutive windows."""
     events = sequence.gather()
@@ -86,7 +86,7 @@ def _moves_as_asked(job: StreamJob, flow: np.ndarray, pixels: int, parts: list[E
 
 
 def _places(
-    sequence: Simulation, job: StreamJob, steps: int, wanted: int, dice: np.random.Generator
+    sequence: SensorSimulation, job: StreamJob, steps: int, wanted: int, dice: np.random.Generator
 ) -> list[tuple[int, int]]:
     drawn = drawn_spans(
         dice,

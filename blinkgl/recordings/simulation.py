@@ -125,7 +125,7 @@ def frames_to_events(
     fps: float | None = None,
     unit: str = "ns",
     zero_time: bool = False,
-    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    emulator: str | EmulatorConfig = EmulatorConfig.default_member,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     report: SimulationReport | None = None,
@@ -210,7 +210,7 @@ def simulated_steps(
     fps: float | None = None,
     unit: str = "ns",
     zero_time: bool = False,
-    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    emulator: str | EmulatorConfig = EmulatorConfig.default_member,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     fitting: Fitting | None = None,
@@ -342,7 +342,7 @@ def file_to_events(
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
     use: FrameUse = FrameUse(),
-    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    emulator: str | EmulatorConfig = EmulatorConfig.default_member,
     seed: int = 0,
     readout: ReadoutConfig | None = None,
     progress: Callable[[SimulationReport, float | None], None] | None = None,
@@ -389,8 +389,8 @@ def file_to_events(
         done = 0
         for step in steps:
             if video is not None:
-                video.add_events(step.events)
-                if video.due(step.t_ns // 1000):
+                video.panels[0].add_events(step.events)
+                if video.panels[0].due(step.t_ns // 1000):
                     video.frame(step.t_ns // 1000, step.luminance())
             out.append(step.events)
             if progress is not None and report.frames > done:
@@ -420,15 +420,12 @@ def _preview(
 ) -> Iterator[PreviewWriter]:
     """Return a video of frames and events, at the frames' rate up to 100 Hz, which appears completely or not at all."""
     from blinkgl.io.atomic import atomic_file
-    from blinkgl.sequence_files.preview import PreviewWriter
+    from blinkgl.sequence_files.preview import Panels, PreviewWriter
 
     rate = min(1e9 / gap_ns, 100.0)
-    with (
-        atomic_file(path, overwrite=overwrite) as temporary,
-        PreviewWriter(
-            temporary, height, width, t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)
-        ) as writer,
-    ):
+    fps = min(rate, 25.0)
+    panels = Panels(height, width, t0_us=start_us, flow=False, rate_hz=rate, fps=fps)
+    with atomic_file(path, overwrite=overwrite) as temporary, PreviewWriter(temporary, [panels], fps) as writer:
         yield writer
 
 
@@ -437,11 +434,10 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     if isinstance(emulator, EmulatorConfig):
         return emulator
     data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
-    members = EmulatorConfig.members
-    kind = data.get("emulator", members.default)
-    if not isinstance(kind, str) or kind not in members.models:
-        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members.models))
-    return validate(members.models[kind], data, where=kind)
+    kind, members = data.get("emulator", EmulatorConfig.default_member), EmulatorConfig.members
+    if not isinstance(kind, str) or kind not in members:
+        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members))
+    return validate(members[kind], data, where=kind)
 
 
 def timed(

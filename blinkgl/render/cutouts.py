@@ -4,7 +4,7 @@ expensive, and a few thousand pixels in many places represent its errors."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Self
 
 import cv2
 import numpy as np
@@ -16,9 +16,6 @@ from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
-
-
-Self = TypeVar("Self", bound="Cutouts")
 
 
 def lattice(
@@ -52,7 +49,7 @@ class Cutouts:
         self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), samples)
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
-    def __enter__(self: Self) -> Self:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

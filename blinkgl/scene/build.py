@@ -62,8 +62,7 @@ def in_fog(scene: Scene, config: SceneConfig) -> Scene:
 
 
 def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:
-    """Return the scene of sequence ``index`` of a run, with the sensor of the configuration; for a rig, with all of its
-    sensors, each recording what its own sections configure.
+    """Return the scene of sequence ``index`` of a run, with the sensors of the configuration.
 
     base : folder that the configuration's relative paths start from. Raises ConfigError and AssetError."""
     time, seed = config.time, config.seed
@@ -81,30 +80,18 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
 
 
 def equipped(scene: Scene, config: SequenceConfig) -> Scene:
-    """Return the scene with the sensors of the configuration, each recording what is configured, and a note on what its
-    times leave out."""
+    """Return the scene with the sensors of the configuration, and a note on what its times leave out."""
     scene = replace(scene, omissions=scene.omissions + config.time.cut)
     if config.sensors is None:
-        return recording(scene, config)
-    return replace(scene, rig=Rig(scene.rig.path, tuple(_on_rig(one, config.sensors) for one in config.sensors)))
+        return scene
+    pairs: dict[str | None, RigSensorConfig] = {one.name: one for one in config.sensors}
+    sensors = [Sensor(one.camera.model, one.place.T, baseline_of(one, pairs.get(one.pair))) for one in config.sensors]
+    return replace(scene, rig=Rig(scene.rig.path, tuple(sensors)))
 
 
 def seen_by(config: SequenceConfig) -> CameraConfig:
     """Return the camera that a scene is made for: a rig's first one; without one, the top level's."""
     return next((one.camera for one in config.sensors or () if one.sees), config.camera)
-
-
-def _on_rig(one: RigSensorConfig, all_: tuple[RigSensorConfig, ...]) -> Sensor:
-    other = next((other for other in all_ if other.name == one.pair), None)
-    return Sensor(
-        one.camera.model,
-        one.place.T,
-        one.events,
-        one.readout,
-        one.labels,
-        one.name,
-        None if other is None else baseline_of(one, other),
-    )
 
 
 def _with_room(config: SequenceConfig) -> SceneConfig:
@@ -118,13 +105,6 @@ def _with_room(config: SequenceConfig) -> SceneConfig:
         if one.sees
     ]
     return scene.model_copy(update={"camera_clearance": max([scene.camera_clearance, *reach])})
-
-
-def recording(scene: Scene, config: SequenceConfig) -> Scene:
-    """Return the scene whose first sensor records what ``events:``, ``readout:`` and ``labels:`` of the configuration
-    say."""
-    recorded = {"emulator": config.events, "readout": config.readout, "labels": config.labels}
-    return replace(scene, rig=scene.rig.with_first(**recorded))
 
 
 def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "train") -> None:

@@ -12,9 +12,6 @@ from typing import Any
 import numpy as np
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.labels import LabelsConfig
-from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath, SharedOriginPath
 from blinkgl.scene.motion.pose_path import PosePath
@@ -22,41 +19,23 @@ from blinkgl.scene.motion.pose_path import PosePath
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """One camera of a rig and what is recorded with it.
+    """One camera of a rig. What is recorded with it, the configuration says.
 
     camera : its model.   T_rig_cam : (4, 4) float64 rigid, from camera axes (OpenCV's) to the rig's.
-    emulator, readout : event emulator and read-out; emulator None: no events are recorded; readout None: no limit.
-    labels : ground truth and pictures that are recorded; None: none.
-    folder : of its files below the sequence's directory; "": that directory itself.
     baseline : world units along the camera's x axis to the other camera of a rectified pair; None: no pair.
     """
 
     camera: CameraModel
     T_rig_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
-    emulator: EmulatorConfig | None = None
-    readout: ReadoutConfig | None = None
-    labels: LabelsConfig | None = None
-    folder: str = ""
     baseline: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A rig. path : T_world_rig over time.   sensors : one or more, all carried by it.
-
-    Raises ConfigError for none, and for two with the same folder."""
+    """A rig. path : T_world_rig over time.   sensors : one or more, all carried by it."""
 
     path: PosePath
     sensors: tuple[Sensor, ...]
-
-    def __post_init__(self) -> None:
-        folders = [sensor.folder for sensor in self.sensors]
-        if not folders:
-            raise ConfigError("the rig has no sensor", where="Rig.sensors", accepted="one or more")
-        if twice := [folder for folder in folders if folders.count(folder) > 1]:
-            raise ConfigError(
-                "two sensors have one folder", where="Rig.sensors", value=twice[0], accepted="a folder each"
-            )
 
     @classmethod
     def alone(cls, camera: CameraModel, path: PosePath) -> Rig:

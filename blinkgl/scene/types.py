@@ -455,7 +455,3 @@ class Scene:
         """Return the scene as the rig's sensor of this number sees it, with only that one. Raises ConfigError where
         there is none."""
         return replace(self, rig=self.rig.seen_by(number))
-
-    def with_path(self, path: PosePath) -> Scene:
-        """Return the scene with its rig on another path."""
-        return replace(self, rig=replace(self.rig, path=path))

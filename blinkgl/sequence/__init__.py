@@ -2,12 +2,13 @@
 
 In: the configuration of one sequence, and OpenGL where a scene is drawn.
 Out: its events, ground truth, the frame camera's images and pictures, in the order of time.
-Start: simulate.py; rendered.py and recorded.py are its two sources, rig.py merges several.
+Start: simulate.py, which merges the cameras of a rig, or has a single one; sensor.py is a camera, of a scene
+(rendered.py) or of recorded frames (recorded.py).
 """
 
-from blinkgl.sequence.factory import simulate_sequence
 from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest
-from blinkgl.sequence.simulate import Simulation
+from blinkgl.sequence.sensor import SensorSimulation
+from blinkgl.sequence.simulate import Simulation, simulate_sequence
 
 __all__ = [
     "CameraImage",
@@ -15,6 +16,7 @@ __all__ = [
     "GroundTruth",
     "Item",
     "Picture",
+    "SensorSimulation",
     "SequenceRequest",
     "Simulation",
     "simulate_sequence",

@@ -30,7 +30,7 @@ from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.sequence.given_flow import factor_that_fits
 from blinkgl.sequence.request import GroundTruth, Picture, SequenceRequest, StageClock
-from blinkgl.sequence.simulate import Simulation
+from blinkgl.sequence.sensor import SensorSimulation
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.types.events import Events
 
@@ -246,8 +246,8 @@ RECORDED = ("images", "flow_forward", "flow_backward", "occlusion_forward", "occ
 """Labels that recorded frames may have."""
 
 
-class RecordedSequence(Simulation):
-    """A sequence of the ``index``-th folder of frames; see :func:`~blinkgl.sequence.simulate.simulate_sequence`.
+class RecordedSequence(SensorSimulation):
+    """A sequence of the ``index``-th folder of frames; see :class:`SensorSimulation`.
 
     Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval
     of events before it, as in rendered sequences. Its ``config`` names the folder.   files : the images.   flow : the
@@ -303,11 +303,13 @@ class RecordedSequence(Simulation):
         self._step: Step
         pictures_hz = None if request.pictures_hz is None else min(request.pictures_hz, frames.fps * 8)
         super().__init__(
-            replace(request, config=resolved, pictures_hz=pictures_hz),
+            request,
+            resolved.cameras()[0],
             clock,
             size=size,
             span_ns=(0, self._time_of(len(self.files) - 1, frames.fps)),
             camera=camera,
+            pictures_hz=pictures_hz,
         )
 
     def _resume(self) -> None:

@@ -4,7 +4,6 @@ drawn at label times."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
 from functools import cached_property, partial
 from typing import Any
 
@@ -13,26 +12,23 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
 from blinkgl.config.over_time import track_times
-from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.sequence import CameraOnRig
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.truth import Surfaces, SurfaceTruth
-from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks, track_points
 from blinkgl.rng import Role, generator, kernel_seed
-from blinkgl.scene.build import recording, sequence_scene
-from blinkgl.scene.rig import Sensor
 from blinkgl.scene.types import Dynamics, Scene, SceneObject
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.request import GroundTruth, Item, Picture, SequenceRequest, StageClock
-from blinkgl.sequence.simulate import Simulation
+from blinkgl.sequence.sensor import SensorSimulation
 from blinkgl.tensors.choice import make_on_device
-from blinkgl.timeline import Timeline, make_timeline
+from blinkgl.timeline import make_timeline
 from blinkgl.types.events import Events
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
@@ -52,82 +48,51 @@ def drawn(renderer: Renderer, times: Iterable[int], surfaces: bool = False, devi
         yield EventFrame(t_ns, luminance, rows, surfaces_at(renderer, t_ns) if surfaces else None)
 
 
-def _truth_of(sensor: Sensor, config: SequenceConfig) -> SurfaceTruth | None:
-    """Return what finds the truth of a sensor's events; None where its labels do not request it."""
-    if sensor.labels is None or not sensor.labels.events:
-        return None
-    return SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
-
-
-def timeline_of(
-    config: SequenceConfig,
-    scene: Scene,
-    renderer: Renderer,
-    span_ns: tuple[int, int],
-) -> Timeline:
-    """Return the timeline of a sensor's frames.   scene : of one sensor, as it was built.   renderer : of it.
-    span_ns : first and last time, ns."""
-    emulator, dynamics = recording(scene, config).sensors[0].emulator, scene.dynamics
-    # A frame is drawn at every impact: a velocity jumps there, and no speed measured before it bounds the step.
-    stops = dynamics.impacts_ns if dynamics is not None else ()
-    response = emulator_of(emulator).response(emulator)
-    return make_timeline(config.timeline, *span_ns, renderer, response, stops)
-
-
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
     """Return the surface at every pixel's centre at t_ns."""
     seen = renderer.labels(t_ns, SURFACES)
     return Surfaces(seen.ids, seen.depth, seen.velocity)
 
 
-class RenderedSequence(Simulation):
-    """The simulation of a scene; see :func:`~blinkgl.sequence.simulate.simulate_sequence`.
+class RenderedSequence(SensorSimulation):
+    """The simulation of a camera in a scene.
 
-    scene : as it was built.   renderer : draws it.
-    sensor : records, with its camera. An existing scene is recorded as configured.   number : of the sensor on its rig,
-    which selects its noise."""
+    scene : as it was built, with only this camera.   renderer : draws it.   number : of the sensor on its rig, which
+    selects its noise."""
 
-    def __init__(self, request: SequenceRequest, gl: GLContext | None):
-        self.number = request.number
-        config, index, renderer, clock = request.config, request.index, request.renderer, StageClock()
-        scene = request.scene or (renderer.scene if renderer is not None else None)
-        if scene is None:
-            with clock("scene"):
-                scene = sequence_scene(config, index, request.base)
-        with ExitStack() as stack:
-            if renderer is None:
-                gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
-                renderer = stack.enter_context(Renderer(gl, scene, config.render))
-            size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
-            self.scene, self.renderer = scene, renderer
-            # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
-            self.notes = scene.omissions + (() if config.scene.kind == "random" else scene.log)
-            if scene.dynamics is not None:
-                self.libraries = {scene.dynamics.engine: scene.dynamics.version}
-            self.sensor = recording(scene, config).sensors[0]
-            self.name = self.sensor.folder
-            if request.labels and self.sensor.labels is not None:
-                for name in asked_for(self.sensor.labels):
-                    LABELS[name].check(scene, self.sensor.labels)
-            # A given renderer may have drawn before: its seconds until now do not belong to this sequence.
-            self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
-            camera = None
-            if request.events:
-                emulator, readout = self.sensor.emulator, self.sensor.readout
-                seed = kernel_seed(config.seed, index, Role.EVENTS, request.number)
-                camera = EventCamera(
-                    emulator,
-                    readout,
-                    *size,
-                    seed,
-                    _truth_of(self.sensor, config),
-                    partial(make_on_device, gl=renderer.gl),
-                )
-                self.timeline = timeline_of(config, scene, renderer, span_ns)
-            if request.labels and config.images is not None:
-                seed = kernel_seed(config.seed, index, Role.IMAGES, request.number)
-                self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
-            super().__init__(request, clock, size=size, span_ns=span_ns, camera=camera, stack=stack.pop_all())
+    def __init__(self, request: SequenceRequest, of: CameraOnRig, scene: Scene, renderer: Renderer):
+        config, clock, self.number = of.config, StageClock(), of.number
+        size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
+        self.scene, self.renderer = scene, renderer
+        # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
+        self.notes = scene.omissions + (() if config.scene.kind == "random" else scene.log)
+        if scene.dynamics is not None:
+            self.libraries = {scene.dynamics.engine: scene.dynamics.version}
+        if request.labels:
+            for name in asked_for(config.labels):
+                LABELS[name].check(scene, config.labels)
+        # A given renderer may have drawn before: its seconds until now do not belong to this sequence.
+        self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
+        camera, pictures_hz = None, None
+        if request.events and of.gives_events:
+            pictures_hz = request.pictures_hz
+            truth = SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
+            camera = EventCamera(
+                config.events,
+                config.readout,
+                *size,
+                kernel_seed(config.seed, request.index, Role.EVENTS, of.number),
+                truth if config.labels.events else None,
+                partial(make_on_device, gl=renderer.gl),
+            )
+            # A frame is drawn at every impact: a velocity jumps there, and no speed measured before it bounds the step.
+            stops = () if scene.dynamics is None else scene.dynamics.impacts_ns
+            response = emulator_of(config.events).response(config.events)
+            self.timeline = make_timeline(config.timeline, *span_ns, renderer, response, stops)
+        if request.labels and config.images is not None:
+            seed = kernel_seed(config.seed, request.index, Role.IMAGES, of.number)
+            self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
+        super().__init__(request, of, clock, size=size, span_ns=span_ns, camera=camera, pictures_hz=pictures_hz)
 
     def _resume(self) -> None:
         self.renderer.gl.resume()
@@ -165,7 +130,7 @@ class RenderedSequence(Simulation):
         return ((k, t) for k, t in enumerate(self.config.time.label_times_ns) if self.t0_ns <= t <= self.t1_ns)
 
     def _truth(self, k: int, t_ns: int) -> GroundTruth:
-        request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
+        request, interval = asked_for(self.config.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
             # No label begins at the last label time: flow and related labels have no other end.
@@ -175,7 +140,7 @@ class RenderedSequence(Simulation):
     def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
         self._resume()
         self.renderer.gl.check()
-        return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
+        return self._truth_over(-1, t_ns, span_ns, asked_for(self.config.labels), False)
 
     def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
         request = request.within(self.scene.t0_ns - t_ns, self.scene.t1_ns - t_ns)
@@ -220,13 +185,9 @@ class RenderedSequence(Simulation):
         return self.scene.camera if self.scene.camera.coefficients else None
 
     @property
-    def rectifies(self) -> bool:
-        return self._rectified is not None
-
-    @property
     def _rectified(self) -> PinHole | None:
         """Return the camera whose pixels labels use; None: the sensor's own."""
-        asked = self.sensor.labels is not None and self.sensor.labels.pixels == "rectified"
+        asked = self.config.labels.pixels == "rectified"
         return rectified(self.scene.camera) if asked and self.lens is not None else None
 
     def imu(self) -> Inertial | None:
@@ -255,8 +216,8 @@ class RenderedSequence(Simulation):
         return track_points(scene, config, times, rng)
 
     def _facts_of_labels(self) -> dict[str, Any]:
-        labels, facts = self.sensor.labels, {}
-        for name in () if labels is None else asked_for(labels):
+        labels, facts = self.config.labels, {}
+        for name in asked_for(labels):
             facts.update(LABELS[name].facts(self.renderer.scene, labels))
         return facts
 

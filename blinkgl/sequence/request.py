@@ -27,10 +27,9 @@ class SequenceRequest:
     events, labels : False leaves them out, ``labels`` ground truth and the frame camera's images; labels and images
     that the configuration does not request are always left out. Nothing is drawn unless it is used.
     pictures_hz : pictures per second of simulated time, at the frames of the event pass; None: none.
-    scene : an existing one, instead of the configuration's.   renderer : an existing one, which is not released at the
-    end; its scene is drawn.
+    scene : an existing one, instead of the configuration's.   renderer : an existing one of a single camera, which is
+    not released at the end; its scene is drawn.
     window_ns : first and last time, ns, instead of the whole sequence. (These three: only for rendered sequences.)
-    number : of the camera on its rig, which selects its noise.
     Raises ConfigError for parts that exclude each other."""
 
     config: SequenceConfig
@@ -42,7 +41,6 @@ class SequenceRequest:
     scene: Scene | None = None
     renderer: Renderer | None = None
     window_ns: tuple[int, int] | None = None
-    number: int = 0
 
     def __post_init__(self) -> None:
         if self.pictures_hz is not None and not self.events:
@@ -62,7 +60,8 @@ class SequenceRequest:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Items of a sequence, in their order. All arrays belong to the receiver.
+# Items of a sequence, in their order. All arrays belong to the receiver. ``sensor`` is the name of the camera that they
+# are of; "" of a single camera.
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +73,7 @@ class EventChunk:
 
     t_ns: int
     events: Events
+    sensor: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +94,7 @@ class GroundTruth:
     backward_ns: int | None = None
     T_world_cam: np.ndarray | None = None
     T_world_obj: np.ndarray | None = None
+    sensor: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +107,7 @@ class Picture:
     t_ns: int
     image: np.ndarray
     velocity: np.ndarray | None = None
+    sensor: str = ""
 
 
 Item = EventChunk | GroundTruth | CameraImage | Picture

@@ -7,92 +7,103 @@
                 case GroundTruth(): ...
                 case CameraImage(): ...
 
-Events come in chunks, one per frame, cut where the time of a label or of a frame camera's image lies between two
-frames; ground truth comes at its time, between them, and an image when its exposure ends. So training on a window of
-events and the flow over it needs to store only that window, never the whole sequence.
+A single camera is a rig of one, without a name. Each camera is a :class:`~blinkgl.sequence.sensor.SensorSimulation`,
+which sees the scene from its pose; they share the scene, OpenGL, meshes, textures, shadow maps and the times of frames.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from types import MappingProxyType
+from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
-import numpy as np
-
-from blinkgl.camera import CameraModel
 from blinkgl.errors import ConfigError
-from blinkgl.events.camera import EventCamera
-from blinkgl.imaging import FrameCamera
-from blinkgl.render.tracks import Tracks
-from blinkgl.sequence.inertial import Inertial
-from blinkgl.sequence.request import CameraImage, EventChunk, GroundTruth, Item, Picture, SequenceRequest, StageClock
-from blinkgl.timeline import Ticks, Timeline
-from blinkgl.types.events import Events, count_causes, named_causes
+from blinkgl.gl import GLContext, create_context
+from blinkgl.render.renderer import Renderer
+from blinkgl.rng import Role, generator
+from blinkgl.scene.build import sequence_scene
+from blinkgl.scene.types import Scene
+from blinkgl.sequence.inertial import Inertial, measured
+from blinkgl.sequence.recorded import RecordedSequence
+from blinkgl.sequence.rendered import RenderedSequence
+from blinkgl.sequence.request import Item, SequenceRequest, StageClock
+from blinkgl.sequence.sensor import SensorSimulation
+from blinkgl.timeline import together
 
 
-class _Due:
-    """The next item besides events: labels at their times, a frame camera's images at the end of their exposure."""
+def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> Simulation:
+    """Return a sequence with all its cameras, one or several, ready for iteration.
 
-    def __init__(self, labels: Iterable[tuple[int, int]], camera: FrameCamera | None):
-        self._labels, self._camera = iter(labels), camera
-        self._next = next(self._labels, None)
-
-    @property
-    def ns(self) -> int | None:
-        """Return its time; None: there are no more."""
-        times = [self._next[1]] if self._next is not None else []
-        if self._camera is not None and self._camera.due_ns is not None:
-            times.append(self._camera.due_ns)
-        return min(times, default=None)
-
-    def label(self) -> tuple[int, int] | None:
-        """Return number and time of the next label, and mark it as done; None: the camera is next."""
-        label = self._next
-        if label is None or label[1] != self.ns:
-            return None
-        self._next = next(self._labels, None)
-        return label
+    gl : context to draw with; None: a new one, where something is drawn.
+    Raises BlinkGLError for every error of the user or the machine, here or while iterating."""
+    clock, config = StageClock(), request.config
+    with ExitStack() as stack:
+        if config.frames is not None:
+            return Simulation(request, clock, [RecordedSequence(request)], None, stack.pop_all())
+        scene = request.scene or (None if request.renderer is None else request.renderer.scene)
+        if scene is None:
+            with clock("scene"):
+                scene = sequence_scene(config, request.index, request.base)
+        members = list(_rendered(request, scene, gl, stack))
+        timed = [member for member in members if member.timeline is not None]
+        shared = together([member.timeline for member in timed if member.timeline is not None])
+        for member, timeline in zip(timed, shared, strict=True):
+            member.timeline = timeline
+        return Simulation(request, clock, members, scene, stack.pop_all())
 
 
-class Simulation(ABC):
-    """One sequence in time: iterate over it once. It holds OpenGL until its end, however the loop ends, or that of its
-    ``with`` block.
+def _rendered(
+    request: SequenceRequest, scene: Scene, gl: GLContext | None, stack: ExitStack
+) -> Iterator[SensorSimulation]:
+    """Yield the cameras, which share the resources of the first one's renderer; ``stack`` releases them."""
+    settings, first = request.config.gl, None
+    for camera in request.config.cameras():
+        seen, renderer = scene, request.renderer
+        if renderer is None:
+            gl = gl or stack.enter_context(create_context(settings.backend, settings.device))
+            seen = scene.seen_by(camera.number)
+            renderer = stack.enter_context(Renderer(gl, seen, camera.config.render, beside=first))
+            first = first or renderer
+        yield RenderedSequence(request, camera, seen, renderer)
 
-    name : of the sensor on a rig; "" of a single camera.
-    config : every value as drawn.   index : number of the sequence.   height, width : px.
-    t0_ns, t1_ns : first and last time, ns.   pictures_hz : rate of its pictures, or None.
-    clock : wall seconds per stage.   camera : emulator and read-out, None when no events are requested.
-    events, labels : numbers so far.   triangles : of everything drawn; 0 for recorded frames.
-    frame_camera : the :class:`~blinkgl.imaging.FrameCamera` of its images; None: there is none.
-    timeline : the :class:`Timeline` of event frames; None for recorded frames, and without events.
-    notes : what was guessed, left out or not drawn of the files so far, a line each.
+
+class Simulation:
+    """A sequence of one camera or several. Iterate over it once: its items, in time order, each with the name of its
+    ``sensor``; items of one time are in the order of the sensors. It holds OpenGL until its end, however the loop ends,
+    or that of its ``with`` block.
+
+    config : every value as drawn.   index : number of the sequence.   members : its cameras, in their order; what else
+    is said of one camera (``height``, ``width``, ``imu()``, ``tracks()``, …) is the first one's.
+    scene : with all sensors; None for recorded frames.   t0_ns, t1_ns : first and last time, ns.
+    clock : wall seconds per stage, without those of the members.
+    frames, events, labels : numbers so far.   triangles : of everything drawn; 0 for recorded frames.
+    notes : what was guessed, left out or not drawn of the files so far, a line each.   causes : numbers of events so
+    far by cause; empty unless ``events.causes`` is on.   seconds : wall seconds per stage so far.
     libraries : versions of those that affect this sequence but not every one."""
 
-    name = ""
-    triangles = 0
-    timeline: Timeline | None = None
-    frame_camera: FrameCamera | None = None
-    notes: Sequence[str] = ()
-    libraries: Mapping[str, str] = MappingProxyType({})
+    in_pairs = False
+    """Whether its items come as (member, item): those of ``blinkgl.simulate_rig`` do, for one release."""
 
     def __init__(
         self,
         request: SequenceRequest,
         clock: StageClock,
-        *,
-        size: tuple[int, int],
-        span_ns: tuple[int, int],
-        camera: EventCamera | None,
-        stack: ExitStack | None = None,
+        members: list[SensorSimulation],
+        scene: Scene | None,
+        stack: ExitStack,
     ):
-        self.config, self.index, self.clock, self.camera = request.config, request.index, clock, camera
-        (self.height, self.width), (self.t0_ns, self.t1_ns) = size, span_ns
-        self.pictures_hz, self.events, self.labels = request.pictures_hz, 0, 0
-        self._by_cause = count_causes(Events.empty())
-        self._labels, self._stack, self._begun = request.labels, stack or ExitStack(), False
+        self.config = request.config if request.config.sensors is not None else members[0].config
+        self.index, self.clock, self.members, self.scene, self._stack = request.index, clock, members, scene, stack
+        spans = [(member.t0_ns, member.t1_ns) for member in members]
+        self.t0_ns, self.t1_ns = spans[0] if spans else (self.config.time.t0_ns, self.config.time.t1_ns)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or not self.members:
+            raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
+        return getattr(self.members[0], name)
 
     def __enter__(self) -> Simulation:
         return self
@@ -104,139 +115,79 @@ class Simulation(ABC):
         """Release OpenGL. May be called repeatedly."""
         self._stack.close()
 
-    def __iter__(self) -> Iterator[Item]:
-        if self._begun:
+    @property
+    def alone(self) -> SensorSimulation:
+        """Return the only camera. Raises ConfigError: there are several sensors."""
+        if self.config.sensors is not None:
             raise ConfigError(
-                "a simulation can be iterated over only once", where="simulate_sequence", accepted="a new one"
+                "several sensors are simulated together, not as one camera",
+                where="sensors",
+                value=[one.name for one in self.config.sensors],
+                accepted="a configuration of a single camera",
             )
-        self._begun = True
-        return self._items()
+        return self.members[0]
 
-    def chunks(self) -> Iterator[EventChunk]:
-        """Yield only the events."""
-        return (item for item in self if isinstance(item, EventChunk))
+    def __iter__(self) -> Iterator[Any]:
+        for member, item in self.by_sensor():
+            named = replace(item, sensor=member.name) if member.name else item
+            yield (member, named) if self.in_pairs else named
 
-    def gather(self) -> Events:
-        """Return all events at once, for cutting windows out of a short sequence. OpenGL stays until :meth:`close`, so
-        that :meth:`truth` can be called for any time: use it in ``with``."""
-        # The end of the iteration closes ``_stack``: an empty one replaces it meanwhile.
-        held, self._stack = self._stack, ExitStack()
-        try:
-            return Events.concatenate([chunk.events for chunk in self.chunks()])
-        finally:
-            self._stack = held
-
-    @abstractmethod
-    def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
-        """Return the ground truth at any time t_ns, with flow forward to t_ns + span_ns and back to t_ns - span_ns (k
-        is -1). Raises ConfigError for recorded frames, whose truth is known only at their times."""
-
-    def _items(self) -> Iterator[Item]:
+    def by_sensor(self) -> Iterator[tuple[SensorSimulation, Item]]:
+        """Yield (member, item) in the same order."""
         with self:
-            # The caller may use OpenGL between two items, as another sensor of the rig does.
-            self._resume()
-            for item in self._in_order():
-                yield item
-                self._resume()
+            waiting = [iter(member) for member in self.members]
+            heads = [next(items, None) for items in waiting]
+            while there := [(head.t_ns, k, head) for k, head in enumerate(heads) if head is not None]:
+                _, k, head = min(there, key=itemgetter(0, 1))
+                yield self.members[k], head
+                heads[k] = next(waiting[k], None)
 
-    def _in_order(self) -> Iterator[Item]:
-        due = _Due(self._label_times() if self._labels else (), self.frame_camera)
-        ticks = None if self.pictures_hz is None else Ticks(self.t0_ns // 1000, self.pictures_hz)
-        for t_ns, events in self._event_pass() if self.camera is not None else ():
-            self.events += len(events)
-            if events.cause is not None:
-                self._by_cause += count_causes(events)
-            # Labels and images come between the events before and after their microsecond, so a chunk is cut at each.
-            while (due_ns := due.ns) is not None and due_ns <= t_ns:
-                before, events = events.split(due_ns // 1000)
-                yield EventChunk(due_ns, before)
-                yield self._next(due)
-            yield EventChunk(t_ns, events)
-            if ticks is not None and ticks.passed(t_ns // 1000):
-                yield self._picture(t_ns)
-        # Those at or after the last frame, and all of them without events.
-        while due.ns is not None:
-            yield self._next(due)
+    def inertial_units(self) -> Iterator[tuple[str, Any, Inertial]]:
+        """Yield (name, configuration, measurements) of the sensors that are only inertial units; those of cameras are
+        ``member.imu()``. Raises ConfigError where the rig's velocity jumps."""
+        for k, one in enumerate(self.config.sensors or ()):
+            if one.imu is not None and not one.sees and self.scene is not None:
+                path = self.scene.rig.path_of(self.scene.sensors[k])
+                rng = generator(self.config.seed, self.index, Role.IMU, k)
+                yield one.name, one.imu, measured(path, one.imu, self.t0_ns, self.t1_ns, rng)
 
-    def _next(self, due: _Due) -> GroundTruth | CameraImage:
-        label = due.label()
-        if label is not None:
-            return self._counted(*label)
-        assert self.frame_camera is not None
-        return self.frame_camera.take()
-
-    def _counted(self, k: int, t_ns: int) -> GroundTruth:
-        truth = self._truth(k, t_ns)
-        self.labels += truth.forward_ns is not None
-        return truth
+    # ---- what a report counts, of all members together -----------------------------------------------------------
 
     @property
     def frames(self) -> int:
-        """Return the number of frames that the emulator has taken so far."""
-        return 0 if self.camera is None else self.camera.frames
+        return sum(member.frames for member in self.members)
 
     @property
-    def losses(self) -> tuple[int, int, int]:
-        """Return numbers of events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's
-        queue full, and that are still on its bus."""
-        return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
+    def events(self) -> int:
+        return sum(member.events for member in self.members)
 
     @property
-    def tells(self) -> bool:
-        """Return whether its events record their surfaces (``labels.events``)."""
-        return self.camera is not None and self.camera.tells
+    def labels(self) -> int:
+        return sum(member.labels for member in self.members)
+
+    @property
+    def triangles(self) -> int:
+        return max((member.triangles for member in self.members), default=0)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(line for member in self.members for line in member.notes))
 
     @property
     def causes(self) -> dict[str, int]:
-        """Return numbers of events so far by cause; empty unless ``events.causes`` is on."""
-        asked = self.camera is not None and self.camera.emulator.causes
-        return named_causes(self._by_cause) if asked else {}
+        return _summed(member.causes for member in self.members)
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Return wall seconds per stage so far."""
-        return dict(self.clock.seconds)
-
-    @abstractmethod
-    def facts(self) -> dict[str, Any]:
-        """Return plain values for the manifest about its source; complete when the iteration is."""
-
-    @abstractmethod
-    def poses(self) -> dict[str, np.ndarray]:
-        """Return the content of poses.npz; empty where poses are unknown."""
+        return _summed([self.clock.seconds, *(member.seconds for member in self.members)])
 
     @property
-    def lens(self) -> CameraModel | None:
-        """Return the camera if it has distortion."""
-        return None
+    def libraries(self) -> Mapping[str, str]:
+        return self.members[0].libraries if self.members else {}
 
-    @property
-    def rectifies(self) -> bool:
-        """Return whether its labels and tracks are in other pixels than its pictures: those of the rectified camera."""
-        return False
 
-    def imu(self) -> Inertial | None:
-        """Return the measurements of the inertial unit of ``imu:``; None: there is none. Raises ConfigError where the
-        camera's velocity jumps."""
-        return None
-
-    def tracks(self) -> Tracks | None:
-        """Return the points of ``tracks:``; None: not requested."""
-        return None
-
-    @abstractmethod
-    def _resume(self) -> None:
-        """Called before drawing again: the caller may have used OpenGL meanwhile."""
-
-    @abstractmethod
-    def _label_times(self) -> Iterable[tuple[int, int]]:
-        """Yield number and time, ns, of every label."""
-
-    @abstractmethod
-    def _event_pass(self) -> Iterator[tuple[int, Events]]: ...
-
-    @abstractmethod
-    def _truth(self, k: int, t_ns: int) -> GroundTruth: ...
-
-    @abstractmethod
-    def _picture(self, t_ns: int) -> Picture: ...
+def _summed(tables: Any) -> dict[str, Any]:
+    total: Counter[str] = Counter()
+    for table in tables:
+        total.update(table)
+    return dict(total)

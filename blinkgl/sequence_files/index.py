@@ -45,15 +45,10 @@ def sequence_folders(root: str | Path) -> Iterator[Path]:
     """Yield folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a sequence; of a rig those
     of its cameras, <root>/<split>/<sequence>/<sensor>. Hidden folders are skipped."""
     for folder in made_folders(root):
-        yield from _of_cameras(folder)
-
-
-def _of_cameras(folder: Path) -> Iterator[Path]:
-    """Yield the folder itself, or for a rig those of its cameras."""
-    if is_rig_folder(folder):
-        yield from (inside(folder, manifest.parent.name) for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
-    else:
-        yield folder
+        if is_rig_folder(folder):
+            yield from (inside(folder, manifest.parent.name) for manifest in sorted(folder.glob(f"*/{MANIFEST}")))
+        else:
+            yield folder
 
 
 def made_folders(root: str | Path) -> Iterator[Path]:

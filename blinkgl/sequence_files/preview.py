@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -16,7 +15,6 @@ from blinkgl.srgb import to_srgb8, tone_mapped
 from blinkgl.timeline.sampling import Ticks
 from blinkgl.types.events import Events
 
-Self = TypeVar("Self", bound="_Streamed")
 _BAR = 30
 _GAP = 4
 _BACK, _TEXT, _DIM = (22, 24, 28), (235, 238, 242), (150, 156, 166)
@@ -148,61 +146,16 @@ class Panels:
         corner[:] = mixed * (1 - ring) + 60 * ring
 
 
-class _Streamed:
-    """Context manager around a video that is kept if no error occurs."""
+class PreviewWriter(VideoWriter):
+    """Streams a side-by-side video of one camera, or of several, one below the other; memory does not grow with the
+    sequence.
 
-    _video: VideoWriter
-
-    def close(self) -> None:
-        self._video.close()
-
-    def abort(self) -> None:
-        self._video.abort()
-
-    def __enter__(self: Self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close() if kind is None else self.abort()
-
-
-class PreviewWriter(Panels, _Streamed):
-    """Streams a side-by-side video of one camera; memory does not grow with the sequence.
-
-        preview.add_events(events)              every chunk
-        preview.set_flow(flow, valid)           whenever a label exists; shown until the next
-        if preview.due(t_us):                   ask first: making the picture may be expensive
+        preview.panels[0].add_events(events)            every chunk
+        preview.panels[0].set_flow(flow, valid)         whenever a label exists; shown until the next
+        if preview.panels[0].due(t_us):                 ask first: making the picture may be expensive
             preview.frame(t_us, image)
 
-    path : ending decides the container, .mp4 usually.   The others are those of :class:`Panels`.
-
-    Raises OutputError when the video cannot be written.
-    """
-
-    def __init__(
-        self,
-        path: str | os.PathLike,
-        height: int,
-        width: int,
-        *,
-        t0_us: int = 0,
-        flow: bool = True,
-        rate_hz: float = 40,
-        fps: float = 20,
-        label: str = "frame",
-    ):
-        super().__init__(height, width, t0_us=t0_us, flow=flow, rate_hz=rate_hz, fps=fps, label=label)
-        self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
-
-    def frame(self, t_us: int, image: np.ndarray) -> None:
-        """Compose and encode one picture (several times when more than one period has passed), see
-        :meth:`Panels.compose`."""
-        for _ in range(self.compose(t_us, image)):
-            self._video.write(self._canvas)
-
-
-class RigPreviewWriter(_Streamed):
-    """Streams a video of several cameras, one below the other. panels : of each, of one ``rate_hz`` and ``fps``.
+    path : ending decides the container, .mp4 usually.   panels : of each camera, of one ``rate_hz`` and ``fps``.
 
     Raises OutputError when the video cannot be written."""
 
@@ -213,11 +166,11 @@ class RigPreviewWriter(_Streamed):
         self._canvas[:] = _BACK
         self._tops = np.cumsum([0, *heights[:-1]])
         height, width = self._canvas.shape[:2]
-        self._video = VideoWriter(path, height, width, fps, preset="superfast", crf=22)
+        super().__init__(path, height, width, fps, preset="superfast", crf=22)
 
-    def frame(self, number: int, t_us: int, image: np.ndarray) -> None:
+    def frame(self, t_us: int, image: np.ndarray, number: int = 0) -> None:
         """Set the picture of the camera of this number, see :meth:`Panels.compose`; the last camera's picture completes
-        the frame, which is then encoded."""
+        the frame, which is then encoded, several times when more than one period has passed."""
         one, top = self.panels[number], self._tops[number]
         count = one.compose(t_us, image)
         if count:
@@ -225,4 +178,4 @@ class RigPreviewWriter(_Streamed):
             self._canvas[top : top + height, :width] = one.canvas
         if number == len(self.panels) - 1:
             for _ in range(count):
-                self._video.write(self._canvas)
+                self.write(self._canvas)

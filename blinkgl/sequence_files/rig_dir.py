@@ -26,60 +26,12 @@ from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml, camchain_yaml
 from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.errors import AssetError
-from blinkgl.io.atomic import output_errors
 from blinkgl.io.dsec import write_rectify_map
 from blinkgl.io.records import PlainName, first_problem
-from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, SequenceWriter, digest_of, read_manifest
+from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter
 
 
-class RigWriter(SequenceWriter):
-    """Context manager around the folder of a rig's sequence, which appears completely or not at all, as a sequence's
-    does.
-
-    sensors : as configured.   The other parameters are those of :class:`SequenceWriter`.
-
-        with RigWriter(final, sensors, config_yaml=…) as rig:
-            with SequenceWriter(rig.folder("left"), …) as left: …
-            rig.adopt("left")
-    """
-
-    kind = "blinkgl-rig"
-
-    def __init__(
-        self, final: str | os.PathLike, sensors: Sequence[RigSensorConfig], *, config_yaml: str, t_offset_us: int = 0
-    ):
-        super().__init__(final, 1, 1, config_yaml=config_yaml, t_offset_us=t_offset_us, events=False)
-        self.sensors = tuple(sensors)
-        self.count = 0
-        """Events of all sensors."""
-
-    def folder(self, name: str) -> Path:
-        """Return the folder for the sequence of a sensor."""
-        return self.path(name)
-
-    def adopt(self, name: str) -> None:
-        """List the files, with their checksums, of the complete sequence at :meth:`folder`."""
-        folder = self.folder(name)
-        manifest = read_manifest(folder)
-        with output_errors(folder):
-            self._files |= {f"{name}/{file}": known for file, known in manifest["files"].items()}
-            self._files[f"{name}/{MANIFEST}"] = digest_of(folder / MANIFEST)
-        self.count += manifest["events"]
-
-    def _finish(self) -> None:
-        self.text(RIG, rig_yaml(self.sensors))
-        super()._finish()
-
-    def _about(self) -> dict[str, Any]:
-        return {
-            "t_offset_us": self.t_offset_us,
-            "events": self.count,
-            "sensors": [one.name for one in self.sensors],
-            "cameras": [one.name for one in self.sensors if one.sees],
-        }
-
-
-def rig_yaml(sensors: Sequence[RigSensorConfig]) -> str:
+def sensors_yaml(sensors: Sequence[RigSensorConfig]) -> str:
     """Return ``rig.yaml``: the rig's sensors, by name, unrounded."""
     tables: dict[str, Any] = {}
     for one in sensors:
@@ -117,23 +69,23 @@ class _Sensor(BaseModel):
     baseline: FiniteFloat | None = None
 
 
-class _Rig(BaseModel):
+class _Sensors(BaseModel):
     """``rig.yaml``."""
 
     sensors: dict[PlainName, _Sensor] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _pairs(self) -> _Rig:
+    def _pairs(self) -> _Sensors:
         for name, one in self.sensors.items():
             if one.pair is not None and (one.pair not in self.sensors or one.baseline is None):
                 raise ValueError(f"'{name}' is paired with no sensor of the rig, or has no baseline")
         return self
 
 
-_MODEL = TypeAdapter(_Rig)
+_MODEL = TypeAdapter(_Sensors)
 
 
-def read_rig(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
+def read_sensors(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
     """Return the sensors of a rig's folder, by name, as in ``rig.yaml``, with ``T_rig_sensor`` as (4, 4) float64.
 
     Raises AssetError, ConfigError: no such file, or damaged."""

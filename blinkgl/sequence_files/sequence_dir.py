@@ -28,7 +28,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +62,6 @@ from blinkgl.labels import Form, Label, label_of
 from blinkgl.sequence_files.manifest import MODEL, RIG_MODEL
 from blinkgl.types.events import Events
 
-Self = TypeVar("Self", bound="SequenceWriter")
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
 """File in the folder of a sequence of several sensors (:mod:`blinkgl.sequence_files.rig_dir`)."""
@@ -80,7 +79,7 @@ class SequenceWriter:
     Parameters
     ----------
     final : the directory to make. An existing non-empty one is refused.
-    height, width : sensor size, px.
+    height, width : sensor size, px; None: of several sensors, whose own writers are those of :meth:`of_camera`.
     config_yaml : resolved configuration, stored as ``config.yaml``.
     t_offset_us : time of the sequence's start, µs; events before it are refused by the DSEC format.
     labels : ``labels:``, which says in which forms labels are written; None: each in its first.
@@ -99,14 +98,11 @@ class SequenceWriter:
     OutputError : the directory exists, or cannot be written.
     """
 
-    kind = "blinkgl-sequence"
-    """``format`` of the manifest."""
-
     def __init__(
         self,
         final: str | os.PathLike,
-        height: int,
-        width: int,
+        height: int | None,
+        width: int | None,
         *,
         config_yaml: str,
         t_offset_us: int = 0,
@@ -116,7 +112,7 @@ class SequenceWriter:
         codec: str = "zstd",
     ):
         self.final = Path(final)
-        self.height, self.width = int(height), int(width)
+        self.height, self.width = height, width
         self.config_yaml, self.t_offset_us = config_yaml, int(t_offset_us)
         self.labels = labels
         self.info: dict[str, Any] = {}
@@ -128,8 +124,17 @@ class SequenceWriter:
         self._timestamps: dict[str, list[str]] = {}
         self._exposures: list[ExposureLine] = []
         self._failure: list[BaseException] = []
+        self._whole: SequenceWriter | None = None
+        self._count = 0
 
-    def __enter__(self: Self) -> Self:
+    def of_camera(self, name: str, height: int, width: int, **settings: Any) -> SequenceWriter:
+        """Return the writer of a camera's own sequence, in the folder ``name`` of this one, which lists its files, too,
+        with their checksums. settings : as of the constructor."""
+        own = SequenceWriter(self.path(name), height, width, config_yaml=self.config_yaml, **settings)
+        own.info["sensor"], own._whole = name, self
+        return own
+
+    def __enter__(self) -> SequenceWriter:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)
@@ -321,7 +326,7 @@ class SequenceWriter:
                 if path.is_file() and name not in self._files:
                     fsync(path)
                     self._files[name] = digest_of(path)
-            about = {"format": self.kind, "format_version": 2, **self._about(), **self.info}
+            about = {"format_version": 2, **self._about(), **self.info}
             manifest = {**about, "files": self._files}
             path = self._tmp / MANIFEST
             path.write_text(sealed(manifest, default=_plain), encoding="utf-8")
@@ -333,16 +338,28 @@ class SequenceWriter:
             refuse_existing(self.final)
             os.rename(self._tmp, self.final)
             fsync(self.final.parent)
+            if self._whole is not None:
+                self._whole.adopt(self)
 
     def _about(self) -> dict[str, Any]:
         """Return the manifest's entries for this kind."""
+        if self.height is None:
+            return {"format": "blinkgl-rig", "t_offset_us": self.t_offset_us, "events": self._count}
         return {
+            "format": "blinkgl-sequence",
             "height": self.height,
             "width": self.width,
             "t_offset_us": self.t_offset_us,
             "events": self._events.count if self._events is not None else 0,
             "flow_pixels_out_of_range": self.lost,
         }
+
+    def adopt(self, own: SequenceWriter) -> None:
+        """List the files of a camera's complete sequence."""
+        name = own.final.name
+        self._files |= {f"{name}/{file}": known for file, known in own._files.items()}
+        self._files[f"{name}/{MANIFEST}"] = digest_of(own.final / MANIFEST)
+        self._count += own._about()["events"]
 
     def _check_untouched(self) -> None:
         """Raise OutputError when a written file is missing or truncated because something else changed the folder."""

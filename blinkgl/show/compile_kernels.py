@@ -24,7 +24,7 @@ def compile_ahead() -> float:
     """Compile the kernels of all emulators, for both frame types, and the other kernels of a sequence, on all cores, so
     that no later process has to. Returns the wall time, s; 0 where there was nothing to compile."""
     # The longest first; a sequence's own kernels together with its default emulator.
-    default, began = EmulatorConfig.members.default, time.perf_counter()
+    default, began = EmulatorConfig.default_member, time.perf_counter()
     parts = [*((kind,) for kind in sorted(EMULATORS) if kind != default), (default, None)]
     workers = min(len(os.sched_getaffinity(0)), len(parts))
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:

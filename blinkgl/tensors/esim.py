@@ -100,7 +100,7 @@ class TensorEsim(Batch):
         self.config = config = config or EsimConfig()
         total = self.envs * self._pixels
         zeros = lambda dtype, wanted=True: torch.zeros(total if wanted else 0, dtype=dtype, device=self.device)
-        on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        on, off = config.thresholds
         # Fixed point from here on; one number where all pixels share it, else a tensor.
         self._on: Any = int(to_q25(on))
         self._off: Any = int(to_q25(off))

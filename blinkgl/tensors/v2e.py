@@ -164,8 +164,7 @@ class TensorV2e(Batch):
     def _draw(self, k: int, c: V2eConfig) -> None:
         """Draw the constant properties of environment k's sensor."""
         seed, size = np.uint64(self.seeds[k]), (self.height, self.width)
-        theta = c.contrast_threshold, c.contrast_threshold_off or c.contrast_threshold
-        on, off = (one.astype(np.float32) for one in draw_thresholds(*size, *theta, c.threshold_sigma, seed))
+        on, off = (one.astype(np.float32) for one in draw_thresholds(*size, *c.thresholds, c.threshold_sigma, seed))
         leak = model.draw_leaks(*size, c, on, seed)
         drawn = {"_on": on, "_off": off, "_mean_leak": leak}
         if leak.size and leak.max() > 0:
@@ -174,7 +173,7 @@ class TensorV2e(Batch):
         if c.causes:
             drawn["_hot"] = model.draw_hot(*size, c, seed)
         if self._shots:
-            table = drawn["_shot_table"] = model.shot_tables(on, off, *theta)
+            table = drawn["_shot_table"] = model.shot_tables(on, off, *c.thresholds)
             self._shots_per_ns[k] = self._shot_unit * float(table[:, -1:].sum())  # if all pixels were dark
         self._take(k, drawn)
 

@@ -26,7 +26,7 @@ from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Label
 from blinkgl.layouts.source import Source
 from blinkgl.sequence_files.index import made_folders
-from blinkgl.sequence_files.rig_dir import read_rig
+from blinkgl.sequence_files.rig_dir import read_sensors
 from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, whole
 from blinkgl.types.boxes import Boxes
 from blinkgl.types.events import Events
@@ -295,7 +295,7 @@ class SequenceView:
         self.folder, self.name = folder, folder.name
         whole(folder)
         rig = is_rig_folder(folder)
-        places = {name: inside(folder, name) for name in read_rig(folder)} if rig else {"camera": folder}
+        places = {name: inside(folder, name) for name in read_sensors(folder)} if rig else {"camera": folder}
         cameras = {name: place for name, place in places.items() if (place / MANIFEST).is_file()}
         self.sensors = [CameraView(Source.open(place), name) for name, place in cameras.items()]
         units = {name if rig else "imu": place for name, place in places.items() if (place / IMU).is_file()}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan, register, unregister
+from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan, register
 from blinkgl.camera.distorted import DistortedModel
 from blinkgl.camera.pinhole import rectified, rectify_map
 from blinkgl.config.scene import RandomSceneConfig
@@ -271,7 +271,7 @@ class Stereographic(DistortedModel):
 @pytest.fixture
 def stereographic():
     yield register(Stereographic)
-    unregister("stereographic")
+    del CAMERA_MODELS["stereographic"]
 
 
 def test_a_model_from_outside_is_in_the_table(stereographic):

@@ -176,9 +176,9 @@ def test_a_damaged_eye_is_made_again_with_its_rig(pair, tmp_path):
         assert differences(pair / "out" / name, out / name) == [], "another process makes the same bytes"
 
 
-def test_one_door_for_several_sensors(pair):
+def test_several_sensors_are_not_one_camera(pair):
     with pytest.raises(ConfigError, match="several sensors are simulated together"):
-        simulate_sequence(SequenceRequest(config_of(pair)))
+        _ = simulate_sequence(SequenceRequest(config_of(pair), base=pair)).alone
 
 
 def _inside(ids: np.ndarray) -> np.ndarray:

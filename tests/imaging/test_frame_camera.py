@@ -1,6 +1,7 @@
 """A frame camera's images against what they stand for: means of instants, rows at their own times, a thin lens."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,7 +81,8 @@ def test_displacement_asks_for_enough_instants(gl):
     assert all((error <= 0.5).mean() > share for error, share in zip(errors, (0.9, 0.93, 0.96)))
     assert errors[0].mean() > 1.6 * errors[1].mean() > 2.5 * errors[2].mean()
     # a camera that turns past smooth surfaces alone: everywhere
-    turning = still_wall.with_path(drift((0, 0, 0), (0.4, 0, 0), LEVEL, LEVEL))
+    way = drift((0, 0, 0), (0.4, 0, 0), LEVEL, LEVEL)
+    turning = replace(still_wall, rig=replace(still_wall.rig, path=way))
     with Renderer(gl, turning.__class__(turning.objects[:1], turning.rig, 0, SECOND), FINE) as renderer:
         take = lambda **how: camera_of(renderer, exposure_us=500_000, rate=2, **how, **LINEAR).take()
         truth, image = take(max_px=1e-3, max_instants=256), take()

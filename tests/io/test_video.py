@@ -8,7 +8,7 @@ import pytest
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.video import VideoReader, VideoWriter
-from blinkgl.sequence_files.preview import PreviewWriter
+from blinkgl.sequence_files.preview import Panels, PreviewWriter
 from blinkgl.types.events import Events
 
 
@@ -141,11 +141,12 @@ def test_no_ffmpeg(tmp_path, monkeypatch):
 @pytest.mark.parametrize("flow", [True, False])
 def test_preview(tmp_path, height, width, flow):
     rng = np.random.default_rng(0)
-    with PreviewWriter(tmp_path / "p.mp4", height, width, t0_us=5000, flow=flow, rate_hz=100, fps=20) as preview:
+    panels = Panels(height, width, t0_us=5000, flow=flow, rate_hz=100, fps=20)
+    with PreviewWriter(tmp_path / "p.mp4", [panels], 20) as preview:
         for i in range(11):
             t = 5000 + i * 5000  # twice the preview's rate: every second frame is due
             n = 100
-            preview.add_events(
+            panels.add_events(
                 Events(
                     rng.integers(0, width, n).astype(np.uint16),
                     rng.integers(0, height, n).astype(np.uint16),
@@ -153,9 +154,9 @@ def test_preview(tmp_path, height, width, flow):
                     rng.integers(0, 2, n).astype(np.uint8),
                 )
             )
-            assert preview.due(t) == (i % 2 == 0)
+            assert panels.due(t) == (i % 2 == 0)
             if i % 4 == 0:
-                preview.set_flow(rng.normal(size=(height, width, 2)).astype(np.float32))
+                panels.set_flow(rng.normal(size=(height, width, 2)).astype(np.float32))
             preview.frame(t, rng.random((height, width) if i % 4 else (height, width, 3), dtype=np.float32))
     reader = VideoReader(tmp_path / "p.mp4")
     assert len(list(reader)) == 6 and reader.fps == 20

@@ -152,7 +152,7 @@ def moving(scene: Scene) -> Scene:
         for thing in scene.objects
     )
     seen = path(scene.camera_path.pose(0), (0.05, 0.0, 0.02), (0.0, 1.0, 0.0))
-    return replace(scene, objects=objects, t1_ns=EXPOSURE_US * 1000).with_path(seen)
+    return replace(scene, objects=objects, t1_ns=EXPOSURE_US * 1000, rig=replace(scene.rig, path=seen))
 
 
 def taken(renderer: DebugRenderer, images: dict[str, Any]) -> np.ndarray:

@@ -146,7 +146,8 @@ def moved_scene(original: Scene, offset) -> Scene:
     return replace(
         original,
         objects=tuple(replace(o, path=shifted(o.path, offset)) for o in original.objects),
-    ).with_path(shifted(original.rig.path, offset))
+        rig=replace(original.rig, path=shifted(original.rig.path, offset)),
+    )
 
 
 def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, textured=True) -> Scene:

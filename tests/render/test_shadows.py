@@ -132,7 +132,7 @@ def test_each_camera_of_a_rig_has_the_shadows_that_it_sees(gl, crowd):
     movers = [thing(f"ball {x}", 3, sphere(0.3), drift((x - 0.1, 4, 0.3), (x, 4, 0.3))) for x in (-4.0, 0.0, 4.0)]
     stays = [] if crowd else [thing("wall", 4, cube(2.0), still((0, 30, 0)))]
     one = sunlit(*movers, *stays)
-    apart = [one.with_path(still((x, 0, 1.0), DOWN)) for x in (-4.0, 0.0, 4.0)]
+    apart = [replace(one, rig=replace(one.rig, path=still((x, 0, 1.0), DOWN))) for x in (-4.0, 0.0, 4.0)]
     alone = [drawn(gl, world, SECOND // 2) for world in apart]
     bare = drawn(gl, replace(apart[2], light=replace(one.light, shadows="off")), SECOND // 2)
     assert (alone[2] != bare).sum() > 20

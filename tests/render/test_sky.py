@@ -103,7 +103,7 @@ def test_every_camera_of_a_rig_has_it_around_itself(gl):
     aside = np.eye(4)
     aside[0, 3] = 50.0
     scene = world(MOVE)
-    scene = replace(scene, rig=Rig(MOVE, (Sensor(CAMERA, folder="a"), Sensor(CAMERA, aside, folder="b"))))
+    scene = replace(scene, rig=Rig(MOVE, (Sensor(CAMERA), Sensor(CAMERA, aside))))
     with (
         Renderer(gl, scene.seen_by(0), RenderConfig()) as first,
         Renderer(gl, scene.seen_by(1), RenderConfig(), beside=first) as second,

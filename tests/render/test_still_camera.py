@@ -54,7 +54,7 @@ def one_mover() -> Scene:
     objects = tuple(
         replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(world.objects)
     )
-    return replace(world, objects=objects).with_path(StaticPath(at))
+    return replace(world, objects=objects, rig=replace(world.rig, path=StaticPath(at)))
 
 
 def events_of(renderer: Renderer, rounds: int) -> tuple[Events, list[float]]:

@@ -65,8 +65,8 @@ def stereo(T_right=None):
     turns = Rotation.from_rotvec([[0, 0, 0], [0.02, -0.03, 0.05]])
     path = KeyframePath([0, SECOND], [(0, 0, 0), (0.2, 0.05, 0.3)], turns, "linear")
     sensors = (
-        Sensor(CAMERA, folder="left"),
-        Sensor(CAMERA, offset(BASELINE) if T_right is None else T_right, folder="right"),
+        Sensor(CAMERA),
+        Sensor(CAMERA, offset(BASELINE) if T_right is None else T_right),
     )
     return Scene((wall, box), Rig(path, sensors), 0, SECOND)
 
@@ -74,9 +74,9 @@ def stereo(T_right=None):
 def test_a_configuration_makes_one_sensor_in_the_rigs_origin(tmp_path):
     scene = sequence_scene(CONFIG, 0, tmp_path)
     (sensor,) = scene.sensors
-    assert sensor.camera == CONFIG.camera.model == scene.camera and sensor.folder == ""
+    assert sensor.camera == CONFIG.camera.model == scene.camera
     np.testing.assert_array_equal(sensor.T_rig_cam, np.eye(4))
-    assert sensor.emulator is CONFIG.events and sensor.readout is None and sensor.labels is CONFIG.labels
+    assert sensor.baseline is None
     assert scene.camera_path is scene.rig.path  # the same object: today's numbers to the last bit
 
 
@@ -102,11 +102,6 @@ def test_disparity_is_focal_length_times_baseline_over_depth(gl):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: Rig(StaticPath(np.eye(4)), ()), r"^Rig.sensors: the rig has no sensor; expected one or more"),
-        (
-            lambda: Rig(StaticPath(np.eye(4)), (Sensor(CAMERA, folder="a"), Sensor(CAMERA, folder="a"))),
-            r"^Rig.sensors: two sensors have one folder \(got 'a'\); expected a folder each",
-        ),
         (lambda: stereo().seen_by(2), r"^seen_by: no such sensor \(got 2\); expected 0 to 1"),
         (lambda: stereo(2 * np.eye(4)).seen_by(1).camera_path, r"pose is not rigid"),
     ],

@@ -30,7 +30,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.sequence import SequenceRequest, Simulation, simulate_sequence
+from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
 from blinkgl.timeline.sampling import displacement_times, largest_speed
 from blinkgl.tools.trade.metrics import EventErrors, SpeedMaps, event_errors, flow_errors
 from blinkgl.tools.trade.settings import SIZES, Setting
@@ -341,11 +341,11 @@ class Bench:
     def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
         config = config.model_copy(update={"events": self.emulator, "readout": None})
 
-        def clip(end_ns: int) -> Simulation:
+        def clip(end_ns: int) -> SensorSimulation:
             window_ns = self.t0_ns, end_ns
             return simulate_sequence(
                 SequenceRequest(config, self.options.sequence, labels=False, renderer=renderer, window_ns=window_ns)
-            )
+            ).alone
 
         for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # compile programs, targets and kernels first
             pass

@@ -39,16 +39,9 @@ def register(deformer: type[Deformer]) -> type[Deformer]:
     Raises TypeError naming the class and the part that is missing or of the wrong kind; nothing is then registered."""
     name = _checked(deformer)
     if deformer.Config is not None:
-        DeformConfig.members.add(deformer.Config)
+        DeformConfig.members[deformer.Config.model_fields["kind"].default] = deformer.Config
     DEFORMERS[name] = deformer
     return deformer
-
-
-def unregister(deformer: type[Deformer]) -> None:
-    """Remove a class. Raises KeyError where it is not in the table."""
-    del DEFORMERS[deformer.__name__]
-    if deformer.Config is not None:
-        DeformConfig.members.remove(deformer.Config.model_fields["kind"].default)
 
 
 def deformer_of(config: DeformConfig, low: np.ndarray, high: np.ndarray) -> Deformer:
@@ -103,11 +96,9 @@ def _checked(deformer: Any) -> str:
         unless(
             isinstance(model, type) and issubclass(model, DeformConfig), "Config", f"is {model!r} and no DeformConfig"
         )
-        unless(
-            (tag_of(model) or ("",))[0] == "kind",
-            "Config.kind",
-            'is not of the form `kind: Literal["name"] = "name"`',
-        )
+        key, kind = tag_of(model) or ("", "")
+        unless(key == "kind", "Config.kind", 'is not of the form `kind: Literal["name"] = "name"`')
+        unless(DeformConfig.members.get(kind, model) is model, "Config.kind", f"is taken: there is another '{kind}'")
         unless(deformer.of.__func__ is not Deformer.of.__func__, "of", "is missing")
     return name
 

@@ -329,8 +329,8 @@ def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str
     the sphere of radius 1."""
     if config.share == 0 or rng.random() >= config.share or any(p.mesh.deformer is not None for p in asset.parts):
         return asset, ""
-    kinds = config.kinds or tuple(DeformConfig.members.models)
-    model = DeformConfig.members.models[kinds[int(rng.integers(len(kinds)))]]
+    kinds = config.kinds or tuple(DeformConfig.members)
+    model = DeformConfig.members[kinds[int(rng.integers(len(kinds)))]]
     drawn = model.drawn(rng, float(rng.uniform(*config.strength)), _log_uniform(rng, config.period))
     parts = deforming(asset.parts, drawn)
     reach = max(

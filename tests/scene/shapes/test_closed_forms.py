@@ -22,7 +22,7 @@ from blinkgl.scene.geometry.primitives import icosphere
 from blinkgl.scene.geometry.random_primitives import random_primitive
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.sweep import Sweep, filled, sweep
-from blinkgl.scene.shapes.table import DEFORMERS, deformer_of, register, unregister
+from blinkgl.scene.shapes.table import DEFORMERS, deformer_of, register
 from blinkgl.scene.types import Deformer
 
 MS = 1_000_000
@@ -276,7 +276,7 @@ def test_one_from_outside_is_generated_and_judged(tmp_path, capsys):
         reports = {b["buffer"]: b for b in json.loads(capsys.readouterr().out)["buffers"]}
         assert reports["flow_forward"]["off_silhouettes"]["pixels"] > 100
     finally:
-        unregister(Shear)
+        del DEFORMERS["Shear"], DeformConfig.members["shear"]
     with pytest.raises(ConfigError, match="shear"):
         validate(ObjectConfig, {"mesh": "a", "deform": {"kind": "shear"}})
 

@@ -22,6 +22,7 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import CameraFrame, G, ImuSamples
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -136,20 +137,17 @@ class Aedat2Reader:
 
     def _raw(self, records: int) -> Iterator[tuple[int, np.ndarray]]:
         first = 0
-        try:
-            with open(self.path, "rb") as file:
-                file.seek(self._start)
-                while data := file.read(records * _RECORD.itemsize):
-                    whole = len(data) // _RECORD.itemsize
-                    yield first, np.frombuffer(data, _RECORD, whole)
-                    first += whole
-                    if stray := len(data) - whole * _RECORD.itemsize:
-                        raise AssetError(
-                            f"truncated: {stray} stray bytes after record {first - 1}, at byte {self._byte(first)}",
-                            where=str(self.path),
-                        )
-        except OSError as error:
-            raise AssetError(f"cannot read: {error.strerror}", where=str(self.path)) from error
+        with input_errors(self.path), open(self.path, "rb") as file:
+            file.seek(self._start)
+            while data := file.read(records * _RECORD.itemsize):
+                whole = len(data) // _RECORD.itemsize
+                yield first, np.frombuffer(data, _RECORD, whole)
+                first += whole
+                if stray := len(data) - whole * _RECORD.itemsize:
+                    raise AssetError(
+                        f"truncated: {stray} stray bytes after record {first - 1}, at byte {self._byte(first)}",
+                        where=str(self.path),
+                    )
 
     def _byte(self, record: int) -> int:
         return self._start + record * _RECORD.itemsize
@@ -176,37 +174,25 @@ def _read_header(path: Path) -> tuple[str, int]:
     """Return the lines that begin with '#', and where they end. A record may also begin with that byte (y of 140 …
     143); but a line has no control characters, which its low bytes are, and newer files mark the end."""
     lines, size = [], 0
-    try:
-        with open(path, "rb") as file:
-            magic = file.read(len(MAGIC) + 3)
-            if not magic.startswith(MAGIC):
-                raise AssetError(
-                    "not an AEDAT file: wrong magic", where=str(path), value=magic, accepted="#!AER-DAT2.0"
-                )
-            if magic != MAGIC + b"2.0":
-                raise AssetError(
-                    "another version of AEDAT",
-                    where=str(path),
-                    value=magic[len(MAGIC) :].decode("latin-1"),
-                    accepted="2.0 (4.0 is .aedat4)",
-                )
-            file.seek(0)
-            while True:
-                start = file.tell()
-                line = file.readline(_MAX_LINE)
-                if not line.startswith(b"#") or (not line.endswith(b"\n") and len(line) < _MAX_LINE):
-                    break
-                if any(c < 32 and c not in b"\t\r\n" for c in line):
-                    break
-                size += len(line)
-                if len(line) == _MAX_LINE or size > _MAX_HEADER:
-                    raise AssetError(f"a header without an end, at byte {start}", where=str(path))
-                lines.append(line.decode("utf-8", "replace").rstrip())
-                if re.match(r"#\s*End Of ASCII Header", lines[-1], re.I):
-                    start = file.tell()
-                    break
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    with input_errors(path), open(path, "rb") as file:
+        magic = file.read(len(MAGIC) + 3)
+        if not magic.startswith(MAGIC):
+            raise AssetError("not an AEDAT file: wrong magic", where=str(path), value=magic, accepted="#!AER-DAT2.0")
+        if magic != MAGIC + b"2.0":
+            version, accepted = magic[len(MAGIC) :].decode("latin-1"), "2.0 (4.0 is .aedat4)"
+            raise AssetError("another version of AEDAT", where=str(path), value=version, accepted=accepted)
+        start = file.seek(0)
+        while (line := file.readline(_MAX_LINE)).startswith(b"#"):
+            cut = not line.endswith(b"\n") and len(line) < _MAX_LINE
+            if cut or any(c < 32 and c not in b"\t\r\n" for c in line):
+                break
+            size += len(line)
+            if len(line) == _MAX_LINE or size > _MAX_HEADER:
+                raise AssetError(f"a header without an end, at byte {start}", where=str(path))
+            lines.append(line.decode("utf-8", "replace").rstrip())
+            start = file.tell()
+            if re.match(r"#\s*End Of ASCII Header", lines[-1], re.I):
+                break
     return "\n".join(lines), start
 
 

@@ -25,6 +25,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -66,7 +67,7 @@ class EvtWriter(CheckedWriter):
         # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us passed.
         t = events.t
         words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
-        n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
+        n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self.count, words)
         self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
 
 
@@ -185,27 +186,16 @@ def decode(
 
 
 def _read_header(path: Path) -> tuple[str, int]:
-    lines = []
-    try:
-        with open(path, "rb") as file:
-            while True:
-                start = file.tell()
-                if file.read(1) != b"%":
-                    break
-                line = file.readline(_LONGEST_LINE)
-                if line.startswith(b" ") and len(line) == _LONGEST_LINE:
-                    raise AssetError(
-                        f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path)
-                    )
-                if not line.startswith(b" ") or not line.endswith(b"\n"):
-                    # The data begins here: this is a word whose first byte happens to be '%'.
-                    break
-                lines.append("%" + line.decode("latin-1").rstrip())
-                if lines[-1] == "% end":
-                    start = file.tell()
-                    break
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    lines, start = [], 0
+    with input_errors(path), open(path, "rb") as file:
+        # A word of the data may begin with '%', too, but hardly goes on as a line.
+        while (line := file.readline(_LONGEST_LINE)).startswith(b"% ") and lines[-1:] != ["% end"]:
+            if len(line) == _LONGEST_LINE:
+                raise AssetError(f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path))
+            if not line.endswith(b"\n"):
+                break
+            lines.append(line.decode("latin-1").rstrip())
+            start = file.tell()
     return "\n".join(lines), start
 
 

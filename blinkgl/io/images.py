@@ -11,16 +11,17 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
 from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import output_errors
+from blinkgl.io.records import input_errors
+from blinkgl.machine.closing import Closing
 from blinkgl.srgb import to_srgb8
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -72,8 +73,13 @@ def read_ids(path: str | os.PathLike) -> np.ndarray:
 
 def encode_npy(array: np.ndarray) -> bytes:
     """Return .npy bytes; object arrays are refused (they would be pickled)."""
+    return encoded(np.save, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def encoded(save: Callable[..., None], *given: Any, **named: Any) -> bytes:
+    """Return the bytes that ``save(file, …)`` writes, one of NumPy's."""
     buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    save(buffer, *given, **named)
     return buffer.getvalue()
 
 
@@ -117,7 +123,7 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
     return shape, fortran, dtype
 
 
-class NpzReader:
+class NpzReader(Closing):
     """The arrays of an .npz by name; each is read when requested. Never unpickles. Use as a context manager.
 
     Raises (inside :func:`numpy_errors`) AssetError: an entry that is not a plain array of numbers, or that would not
@@ -127,10 +133,7 @@ class NpzReader:
         self.path, self._archive = path, zipfile.ZipFile(path)
         self.names = [n.removesuffix(".npy") for n in self._archive.namelist()]
 
-    def __enter__(self) -> NpzReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._archive.close()
 
     def __contains__(self, name: str) -> bool:
@@ -209,32 +212,10 @@ _HEADER = re.compile(
 )
 
 
-def encode_pfm(image: np.ndarray) -> bytes:
-    """Return the bytes of (H, W) or (H, W, 3) float32, row 0 = top."""
-    image = np.asarray(image)
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise ValueError(f"PFM holds (H, W) or (H, W, 3), got {image.shape}")
-    kind = b"PF" if image.ndim == 3 else b"Pf"
-    return kind + f"\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode() + image[::-1].astype("<f4").tobytes()
-
-
-def write_pfm(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write :func:`encode_pfm`. Raises OutputError."""
-    with output_errors(path):
-        Path(path).write_bytes(encode_pfm(image))
-
-
 def read_pfm(path: str | os.PathLike) -> np.ndarray:
     """Return (H, W) or (H, W, 3) float32, row 0 = top. Raises AssetError: wrong header or length."""
-    try:
+    with input_errors(path):
         data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    return decode_pfm(data, path)
-
-
-def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
-    """Return :func:`read_pfm` of bytes; ``path`` is for messages."""
     header = _HEADER.match(data)
     if not header:
         raise AssetError("not a PFM file: wrong header", where=str(path))
@@ -261,11 +242,8 @@ def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) 
 def read_png(path: str | os.PathLike) -> np.ndarray:
     """Return pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes. Raises
     AssetError when missing, truncated, undecodable, or of more than 2^28 px (checked before unpacking)."""
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
-    return decode_image(data, path)
+    with input_errors(path, "cannot read image"):
+        return decode_image(Path(path).read_bytes(), path)
 
 
 def decode_image(data: bytes, path: str | os.PathLike) -> np.ndarray:

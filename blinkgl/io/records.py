@@ -6,6 +6,7 @@ that says what is wrong.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -31,6 +32,15 @@ def open_regular(path: str | os.PathLike) -> int:
         os.close(descriptor)
         raise AssetError("not a regular file", where=str(path))
     return descriptor
+
+
+@contextlib.contextmanager
+def input_errors(path: str | os.PathLike, problem: str = "cannot read") -> Iterator[None]:
+    """Convert an ``OSError`` of reading ``path`` to an :class:`AssetError` of one line."""
+    try:
+        yield
+    except OSError as error:
+        raise AssetError(f"{problem}: {error.strerror}", where=str(path)) from error
 
 
 def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:

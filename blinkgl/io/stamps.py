@@ -14,7 +14,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
-from blinkgl.io.records import read_text
+from blinkgl.io.records import input_errors, read_text
 from blinkgl.io.rows import is_number, read_rows, titles_of
 
 
@@ -38,11 +38,8 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
 
     Raises AssetError: unreadable. EventDataError: not a time, with its line; two units in one list; no times.
     ConfigError: "frames" without fps."""
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    heading, numbered = read_rows(text)
+    with input_errors(path):
+        heading, numbered = read_rows(path.read_text(encoding="utf-8-sig", errors="replace"))
     rows = [fields for _, fields in numbered]
     if not rows:
         raise EventDataError("no time stamps", where=str(path))

@@ -23,6 +23,7 @@ from PIL import Image, ImageSequence
 from blinkgl.errors import AssetError
 from blinkgl.io.alpha import over
 from blinkgl.io.images import decode_image, read_pfm, size_problem
+from blinkgl.io.records import input_errors
 
 SUFFIXES = frozenset(".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pgm .ppm .pnm .exr .hdr .pfm".split())
 _ANIMATED = {".gif", ".webp", ".png", ".apng"}
@@ -269,11 +270,8 @@ def _orientation(data: bytes, path: Path) -> int:
 
 
 def _bytes(path: Path, most: int = -1) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            return file.read(most)
-    except OSError as error:
-        raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
+    with input_errors(path, "cannot read image"), open(path, "rb") as file:
+        return file.read(most)
 
 
 def _pillow(path: Path) -> Image.Image:

@@ -24,6 +24,7 @@ from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.alpha import over
 from blinkgl.io.ticks import frame_times
 from blinkgl.io.yuv import known, rgb_from_yuv
+from blinkgl.machine.closing import Finishing
 from blinkgl.machine.interrupts import uninterrupted
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ _PACKED = {
 """Formats with interleaved samples, by the planar one with the same samples."""
 
 
-class VideoWriter:
+class VideoWriter(Finishing):
     """H.264 (yuv420p, plays everywhere) from uint8 RGB frames; the container goes by the ending (.mp4, .mkv, .avi).
 
     width and height have to be even. One encoder thread: the bytes do not depend on the machine's core count. Use as a
@@ -91,20 +92,11 @@ class VideoWriter:
                 self._file.close()
             self._file = None
 
-    def __enter__(self) -> VideoWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close() if kind is None else self.abort()
-
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:  # PyAV's errors are OSErrors, or ValueErrors of a bad argument
-            self.abort()
-            raise OutputError(f"cannot write video: {_gist(error)}", where=str(self.path)) from error
-        except ValueError as error:
+        except (OSError, ValueError) as error:  # PyAV's errors are OSErrors, or ValueErrors of a bad argument
             self.abort()
             raise OutputError(f"cannot write video: {_gist(error)}", where=str(self.path)) from error
 

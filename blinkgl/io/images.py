@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
 import os
@@ -11,7 +10,8 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.records import input_errors
+from blinkgl.io.records import decoding, input_errors
 from blinkgl.machine.closing import Closing
 from blinkgl.srgb import to_srgb8
 
@@ -190,18 +190,10 @@ def memory_limit() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
-@contextlib.contextmanager
-def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
+def numpy_errors(path: str | os.PathLike) -> AbstractContextManager[None]:
     """Convert any failure to load ``path`` with NumPy to an AssetError: on damaged bytes it raises exceptions of its
     header parser, zipfile and zlib (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
-    try:
-        yield
-    except AssetError:
-        raise
-    except Exception as error:
-        raise AssetError(
-            f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)
-        ) from error
+    return decoding(path, "cannot read")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

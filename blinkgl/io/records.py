@@ -43,6 +43,18 @@ def input_errors(path: str | os.PathLike, problem: str = "cannot read") -> Itera
         raise AssetError(f"{problem}: {error.strerror}", where=str(path)) from error
 
 
+@contextlib.contextmanager
+def decoding(path: str | os.PathLike, problem: str) -> Iterator[None]:
+    """Convert whatever a library raises on damaged bytes to an :class:`AssetError` of one line."""
+    try:
+        yield
+    except AssetError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise AssetError(f"{problem}: {reason}", where=str(path)) from error
+
+
 def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:
     """Return UTF-8 text of a regular file. Raises FileNotFoundError; AssetError: unreadable, not text, more than
     ``limit`` bytes."""

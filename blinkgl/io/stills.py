@@ -12,6 +12,7 @@ import re
 import struct
 import warnings
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from PIL import Image, ImageSequence
 from blinkgl.errors import AssetError
 from blinkgl.io.alpha import over
 from blinkgl.io.images import decode_image, read_pfm, size_problem
-from blinkgl.io.records import input_errors
+from blinkgl.io.records import decoding, input_errors
 
 SUFFIXES = frozenset(".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pgm .ppm .pnm .exr .hdr .pfm".split())
 _ANIMATED = {".gif", ".webp", ".png", ".apng"}
@@ -274,22 +275,11 @@ def _bytes(path: Path, most: int = -1) -> bytes:
         return file.read(most)
 
 
+def _decoding(path: Path) -> AbstractContextManager[None]:
+    return decoding(path, "cannot decode image (corrupt or truncated)")
+
+
 def _pillow(path: Path) -> Image.Image:
     with _decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return Image.open(path)
-
-
-class _decoding:
-    """Convert whatever a decoder raises on damaged bytes into an AssetError."""
-
-    def __init__(self, path: Path):
-        self._path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, *_: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, AssetError):
-            reason = " ".join(str(error).split())[:160] or type(error).__name__
-            raise AssetError(f"cannot decode image (corrupt or truncated): {reason}", where=str(self._path)) from error

@@ -21,6 +21,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import CameraFrame, G, ImuSamples
+from blinkgl.io.fixed_records import read_records
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
@@ -123,7 +124,8 @@ class Aedat2Reader:
         that a damaged file is always refused."""
         # state: the last time, then the last time of each kind.
         state = np.full(5, -1, np.int64)
-        for first, raw in self._raw(records):
+        last = lambda count: f"record {count - 1}, at byte {self._byte(count)}"
+        for first, raw in read_records(self.path, self._start, _RECORD, records, last):
             # int64, so that shifts and differences cannot overflow.
             address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
             kinds = _kinds(address)
@@ -134,20 +136,6 @@ class Aedat2Reader:
             chosen = kinds == kind
             if chosen.any():
                 yield first, address[chosen], t[chosen]
-
-    def _raw(self, records: int) -> Iterator[tuple[int, np.ndarray]]:
-        first = 0
-        with input_errors(self.path), open(self.path, "rb") as file:
-            file.seek(self._start)
-            while data := file.read(records * _RECORD.itemsize):
-                whole = len(data) // _RECORD.itemsize
-                yield first, np.frombuffer(data, _RECORD, whole)
-                first += whole
-                if stray := len(data) - whole * _RECORD.itemsize:
-                    raise AssetError(
-                        f"truncated: {stray} stray bytes after record {first - 1}, at byte {self._byte(first)}",
-                        where=str(self.path),
-                    )
 
     def _byte(self, record: int) -> int:
         return self._start + record * _RECORD.itemsize

@@ -24,6 +24,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import CheckedWriter
+from blinkgl.io.fixed_records import read_records
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
@@ -100,38 +101,31 @@ class EvtReader:
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``words`` words at a time."""
         dtype, state = _WORD[self.version], START[self.version].copy()
-        position, lost, stray = self._start, 0, 0
+        name, lost = self.version.upper(), 0
         buffers = room(self.version, words)  # one for all pieces: fresh memory costs as much as decoding
-        with open(self.path, "rb") as file:
-            file.seek(self._start)
-            while not stray and (data := file.read(words * dtype.itemsize)):
-                # A file that ends within a word is truncated, which is said after its whole words.
-                stray = len(data) % dtype.itemsize
-                raw = np.frombuffer(data[: len(data) - stray], dtype)
+        try:
+            for first, raw in read_records(self.path, self._start, dtype, words, lambda _: f"the last {name} word"):
                 events, bad = self._decode(raw, state, buffers)
                 while bad >= 0 and self._keep:
-                    raw, lost, position = raw[bad + 1 :], lost + 1, position + (bad + 1) * dtype.itemsize
+                    first, raw, lost = first + bad + 1, raw[bad + 1 :], lost + 1
                     more, bad = self._decode(raw, state, buffers)
                     events = Events.concatenate([events, more])
                 if bad >= 0:
                     raise AssetError(
-                        f"damaged at byte {position + bad * dtype.itemsize}: no valid {self.version.upper()} word",
+                        f"damaged at byte {self._start + (first + bad) * dtype.itemsize}: no valid {name} word",
                         where=str(self.path),
                         value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}",
                     )
-                position += len(raw) * dtype.itemsize
                 if len(events):
                     yield events
-        said = [f"left out: words that {self.version.upper()} does not have: {lost:,}" if lost else ""]
-        if self.version == "evt3" and state[-2]:
-            said.append(f"4096 µs counted for each of {state[-2]:,} TIME_HIGH words that are missing")
-        if state[-1]:
-            said.append(f"left out: events before the first TIME_HIGH, which have no time: {state[-1]:,}")
-        self.notes = [line for line in said if line]
-        if stray:
-            raise AssetError(
-                f"truncated: {stray} stray bytes after the last {self.version.upper()} word", where=str(self.path)
+        finally:
+            missing = state[-2] if self.version == "evt3" else 0
+            said = (
+                (lost, f"left out: words that {name} does not have: {lost:,}"),
+                (missing, f"4096 µs counted for each of {missing:,} TIME_HIGH words that are missing"),
+                (state[-1], f"left out: events before the first TIME_HIGH, which have no time: {state[-1]:,}"),
             )
+            self.notes = [line for count, line in said if count]
         if state[0] < 0 and state[-1]:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
+from blinkgl.io.clock import guessed_frame_unit, named_unit, nanoseconds, unit_of
 from blinkgl.io.records import input_errors, read_text
 from blinkgl.io.rows import is_number, read_rows, titles_of
 
@@ -63,7 +63,8 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
                 "times in frames need a frame rate", where="--time-unit", value=unit, accepted="--fps, too"
             )
         return Stamps([round(Fraction(text) * 10**9 / Fraction(fps)) for text in texts], names)
-    found = _unit(unit, titles, columns, heading, path, texts)
+    guessed = lambda: guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+    found = unit_of(unit, _stated(titles, columns, heading, path), guessed)
     return Stamps(nanoseconds(texts, found), names, None if found.line is None else f"{path.name}: {found.line}")
 
 
@@ -107,9 +108,8 @@ def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str)
             value=values[bad : bad + 1].tolist(),
             accepted="a finite number",
         )
-    stated = unit or named_unit(name)
-    how = "declared" if unit else "read"
-    found = TimeUnit(stated, how) if stated else guessed_frame_unit(values.astype(np.float64), f"{where}: '{name}'")
+    guessed = lambda: guessed_frame_unit(values.astype(np.float64), f"{where}: '{name}'")
+    found = unit_of(unit, named_unit(name), guessed)
     return Stamps(nanoseconds(values, found), None, found.line)
 
 
@@ -147,15 +147,9 @@ def _names(rows: Sequence[Sequence[str]], columns: Sequence[int], path: Path) ->
             for k, name in enumerate(names)]  # fmt: skip
 
 
-def _unit(
-    unit: str | None, titles: Sequence[str], columns: Sequence[int], heading: str, path: Path, texts: Sequence[str]
-) -> TimeUnit:
-    if unit is not None:
-        return TimeUnit(unit, "declared")
+def _stated(titles: Sequence[str], columns: Sequence[int], heading: str, path: Path) -> str | None:
+    """Return the unit that a title, the heading or the file's name states."""
     stated = named_unit(titles[columns[0]]) if columns[0] < len(titles) else None
     if stated is None and re.search(r"time(code|stamp)s? format v2", heading, re.I):
         stated = "ms"  # mkvextract
-    stated = stated or (named_unit(heading) if not titles[1:] else None) or unit_of_file(path)
-    if stated is not None:
-        return TimeUnit(stated, "read")
-    return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+    return stated or (named_unit(heading) if not titles[1:] else None) or named_unit(path.stem)

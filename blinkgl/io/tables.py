@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
+from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit, unit_of
 from blinkgl.io.columns import events_of, microseconds
 from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
@@ -159,14 +159,12 @@ class TableReader:
         self.height, self.width = table.size or (None, None)
         first = table.read(slice(0, 1))
         self.count, self.causes = table.count, "cause" in first
-        if reading.time_unit:
-            self.unit = TimeUnit(reading.time_unit, "declared")
-        elif said := table.unit or named_unit(table.heading):
-            self.unit = TimeUnit(said, "read")
-        else:
-            self.unit = self._guessed() if first["t"].dtype.kind in "iufb" else TimeUnit("us", "read")
+        self._numbers = first["t"].dtype.kind in "iufb"
+        self.unit = unit_of(reading.time_unit, table.unit or named_unit(table.heading), self._guessed)
 
     def _guessed(self) -> TimeUnit:
+        if not self._numbers:
+            return TimeUnit("us", "read")
         ends = (slice(0, _SAMPLE), slice(max(self.count - _SAMPLE, _SAMPLE), self.count))
         t = np.concatenate([self._table.read(part)["t"] for part in ends]).astype(np.float64) + self._table.offset
         t = t[np.isfinite(t)]

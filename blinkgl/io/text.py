@@ -23,7 +23,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
+from blinkgl.io.clock import guessed_event_unit, named_unit, unit_of
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import guessed_order, order_line, slot_of
@@ -79,11 +79,9 @@ class TextReader:
         if not self._order:
             self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
             self.notes.append(order_line(self._order))
-        self.unit = TimeUnit("us", "read")
-        if reading.time_unit or unit:
-            self.unit = TimeUnit(reading.time_unit or unit or "", "declared" if reading.time_unit else "read")
-        elif len(sample) and sample.shape[1] == len(self._order):
-            self.unit = guessed_event_unit(sample[:, self._order.index("t")], count)
+        known = len(sample) and sample.shape[1] == len(self._order)
+        guessed = lambda: guessed_event_unit(sample[:, self._order.index("t")], count)
+        self.unit = unit_of(reading.time_unit, unit if unit or known else "us", guessed)
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds
+from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds, unit_of
 from blinkgl.io.names import natural_order
 from blinkgl.io.rows import is_number, read_rows, titles_of
 from blinkgl.io.stamps import read_timestamps
@@ -315,7 +315,9 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
         for number, text in zip(table.lines, texts):
             if not is_number(text):
                 raise _no_pose(path, number, [text], "a time first, a finite number")
-        unit = _unit(table, texts, declared, path)
+        # Two equal times are refused in a moment, whatever the unit.
+        stated = table.unit or ("s" if any(a == b for a, b in pairwise(texts)) else None)
+        unit = unit_of(declared.time_unit, stated, lambda: _guessed(texts, path))
         if unit.line is not None:
             notes.append(f"{path.name}: {unit.line.replace('--time-unit', 'time_unit:')}")
         values = nanoseconds(texts, unit)
@@ -328,13 +330,7 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
     return t_ns
 
 
-def _unit(table: _Table, texts: Sequence[str], declared: PoseFile, path: Path) -> TimeUnit:
-    if declared.time_unit is not None:
-        return TimeUnit(declared.time_unit, "declared")
-    if table.unit is not None:
-        return TimeUnit(table.unit, "read")
-    if any(a == b for a, b in pairwise(texts)):
-        return TimeUnit("s", "read")  # refused in a moment, whatever the unit
+def _guessed(texts: Sequence[str], path: Path) -> TimeUnit:
     try:
         return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
     except EventDataError as error:

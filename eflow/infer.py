@@ -441,7 +441,7 @@ def doubts(events: Events, height: int, width: int) -> list[str]:
         found.append(
             f"{rate:.2g} events per second and pixel; cameras give 0.05 to 1000. Are the times {other}, instead of µs?"
         )
-    counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=height * width)
+    counts = np.bincount(events.pixel(width), minlength=height * width)
     few = max(round(FEW * counts.size), 1)
     share = np.partition(counts, -few)[-few:].sum() / len(events)
     if share > FLOOD:

@@ -16,11 +16,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-import numpy as np
-
 from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError
-from blinkgl.io.images import encode_png, read_image
 
 FOLDER = "frame_camera"
 STAMPS = f"{FOLDER}/images/timestamps.txt"
@@ -57,16 +54,6 @@ def files_of(images: ImagesConfig, count: int) -> Iterator[str]:
     yield from (STAMPS, EXPOSURES)
     for picture in images.pictures:
         yield from (picture_file(picture, k) for k in range(count))
-
-
-def encode_codes(codes: np.ndarray) -> bytes:
-    """Return a PNG of (H, W, 3) RGB or (H, W), uint8 or uint16, unchanged."""
-    return encode_png(codes[..., ::-1] if codes.ndim == 3 else codes)
-
-
-def read_codes(path: str | os.PathLike) -> np.ndarray:
-    """Return the codes of :func:`encode_codes`. Raises AssetError."""
-    return read_image(path)
 
 
 def exposures_csv(lines: Iterable[ExposureLine]) -> str:

@@ -61,39 +61,36 @@ class FrameUse:
 
 @dataclass
 class SimulationReport:
-    """Record of a simulation; complete when the generator is exhausted."""
+    """Record of a simulation; complete when the generator is exhausted.
+
+    frames : given.   steps : frames that the emulator saw, interpolated ones included.   saturated : events cut by the
+    emulator's max_events_per_step.   lost : events that found the queue of the sensor's read-out full.   late : events
+    that were still on the read-out's bus at the last frame.   causes : events by cause, "signal", "leak", "shot" and
+    "hot"; empty unless ``causes`` of the emulator is set.   displacement : for interpolate="motion".   moved_px : for
+    interpolate="linear", 99th percentile of the dense flow between a few pairs of given frames.   assumed_gamma :
+    assumed curve of codes without a given one, that of the sensor's own frames, srgb of integers, linear of floats.
+    fitting : conversion of frames to the sensor's size; None: not needed.   noise : of the frames, from which no events
+    were made; None: exact frames, or it was kept.   notes : what was read that is unusual, guessed or left out, a line
+    each, with the option that overrules it.   caveats : problems of the frames, a line each: few codes, clipped,
+    repeated, flicker."""
 
     frames: int = 0
-    """given"""
     steps: int = 0
-    """frames that the emulator saw, interpolated ones included"""
     first_ns: int = 0
     last_ns: int = 0
     events: int = 0
     on: int = 0
     saturated: int = 0
-    """events cut by the emulator's max_events_per_step"""
     lost: int = 0
-    """events that found the queue of the sensor's read-out full"""
     late: int = 0
-    """events that were still on the read-out's bus at the last frame"""
     causes: dict[str, int] = field(default_factory=dict)
-    """events by cause, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
-    """for interpolate="motion" """
     moved_px: list[float] = field(default_factory=list)
-    """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
     assumed_gamma: str | float | None = None
-    """assumed curve of codes without a given one: that of the sensor's own frames, srgb of integers, linear of
-    floats"""
     fitting: Fitting | None = None
-    """conversion of frames to the sensor's size; None: not needed"""
     noise: FrameNoise | None = None
-    """noise of the frames, from which no events were made; None: exact frames, or it was kept"""
     notes: list[str] = field(default_factory=list)
-    """what was read that is unusual, guessed or left out, a line each, with the option that overrules it"""
     caveats: list[str] = field(default_factory=list)
-    """problems of the frames, a line each: few codes, clipped, repeated, flicker"""
 
     @property
     def duration_s(self) -> float:

@@ -52,7 +52,6 @@ _DVS, _PIN, _APS, _IMU = range(4)
 class Aedat2Reader:
     """A recording of a DAVIS camera; times are the file's own µs, unwrapped. height, width : px, by the chip's name, or
     as declared where the header names none (v2e's files).
-    frames_cut : frames without all of their samples (at the file's ends), known after :meth:`frames`.
 
     Raises AssetError: another magic or version, an unknown chip, a header without an end; while reading, naming the
     byte: stray bytes at the end (truncated), an address outside the sensor, decreasing times."""
@@ -72,7 +71,6 @@ class Aedat2Reader:
                 accepted=", ".join(SIZES) + ("" if chip else "; or --size WIDTHxHEIGHT"),
             )
         self.height, self.width = size
-        self.frames_cut = 0
 
     def chunks(self, records: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``records`` records at a time."""
@@ -93,7 +91,6 @@ class Aedat2Reader:
         for _, address, t in self._kind(_APS, records):
             yield from assembler.add(address, t)
         yield from assembler.end()
-        self.frames_cut = assembler.cut
 
     def imu(self) -> ImuSamples:
         """Return all complete samples. Scales are the header's (``ImuGyroScale``, ``ImuAccelScale``), or jAER's usual
@@ -228,10 +225,10 @@ def _unwrap(address, kinds, stamp, state, height, width, keep, t):
 
 
 class _Frames:
-    """Assembles frames from frame samples, in their order. cut : frames without all of their samples."""
+    """Assembles frames from frame samples, in their order. Those without all of their samples are left out."""
 
     def __init__(self, height: int, width: int):
-        self._shape, self.cut = (height, width), 0
+        self._shape = height, width
         self._clear()
 
     def _clear(self) -> None:
@@ -250,15 +247,12 @@ class _Frames:
         """Yield the frame so far, if it is one."""
         # A frame is complete where each pixel that was reset has also been read, in a rectangle.
         read, there = self._signal >= 0, self._reset >= 0
-        if read.any() or there.any():
-            if read.any() and np.array_equal(read, there) and _rectangular(read):
-                image = np.where(read, np.maximum(self._reset - self._signal, 0), 0).astype(np.uint16)
-                first, last, signal = self._times.tolist()
-                # A global shutter resets all rows before the first is read; a rolling one does not.
-                begin = last if last <= signal else first
-                yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
-            else:
-                self.cut += 1
+        if read.any() and np.array_equal(read, there) and _rectangular(read):
+            image = np.where(read, np.maximum(self._reset - self._signal, 0), 0).astype(np.uint16)
+            first, last, signal = self._times.tolist()
+            # A global shutter resets all rows before the first is read; a rolling one does not.
+            begin = last if last <= signal else first
+            yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
         self._clear()
 
 

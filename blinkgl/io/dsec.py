@@ -14,7 +14,7 @@ import queue
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import h5py
 import hdf5plugin
@@ -23,7 +23,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import MAX_SIDE, CheckedWriter, check_events, check_size, events_of
-from blinkgl.io.hdf5 import Blocks, attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import Blocks, attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, packing, write_rows
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
@@ -336,17 +336,9 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: s
     """Write ``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A pinhole camera's is the identity;
     loaders such as E-RAFT's require the file. codec : "gzip", which h5py alone reads, or another, which is Blosc's
     zstd."""
-    if codec == "gzip":
-        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    else:
-        packed = {"compression": hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)}
     with output_errors(path), h5py.File(path, "w") as file:
-        file.create_dataset(
-            "rectify_map",
-            data=np.asarray(rectify_map, np.float32),
-            track_times=False,
-            **packed,
-        )
+        packed = packing("gzip" if codec == "gzip" else "zstd", hdf5plugin.Blosc.SHUFFLE)
+        file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False, **packed)
 
 
 def identity_rectify_map(height: int, width: int) -> np.ndarray:

@@ -191,13 +191,17 @@ def growing_dataset(
     """Return a new data set that grows along its first axis. codec : of :data:`CODECS`, packed by Blosc, level 1 with
     bit shuffle (filter 32001), zstd as in DSEC's files; or "gzip", level 1 with byte shuffle, which every HDF5
     unpacks."""
-    if codec == "gzip":
-        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
-    else:
-        packed = {"compression": hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=_BIT_SHUFFLE)}
+    packed = packing(codec, _BIT_SHUFFLE)
     return file.create_dataset(
         name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, **packed
     )
+
+
+def packing(codec: str, shuffle: int) -> dict[str, Any]:
+    """Return the arguments of ``create_dataset`` for a codec of :func:`growing_dataset`.   shuffle : of Blosc."""
+    if codec == "gzip":
+        return {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
+    return {"compression": hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=shuffle)}
 
 
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:

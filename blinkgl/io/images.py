@@ -10,7 +10,7 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -276,15 +276,22 @@ def _png_problem(data: bytes) -> str | None:
     if data[12:16] != b"IHDR" or len(data) < 33:
         return "cannot decode image (corrupt or truncated)"
     at = 8
-    while at + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 12 + length
-        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+    for at, kind, body in png_chunks(data):
+        if zlib.crc32(kind + body).to_bytes(4, "big") != data[at + 8 + len(body) : at + 12 + len(body)]:
             break
         if kind == b"IEND":
             return size_problem(*struct.unpack_from(">II", data, 16))
-        at = end
+        at += 12 + len(body)
     return f"cannot decode image (corrupt or truncated at byte {at})"
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield where each chunk begins, its type, and its content, of which the last one's may be cut."""
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        yield at, kind, data[at + 8 : at + 8 + length]
+        at += 12 + length
 
 
 def size_problem(width: int, height: int) -> str | None:

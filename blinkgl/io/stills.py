@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import logging
 import re
-import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
@@ -23,7 +22,7 @@ from PIL import Image, ImageSequence
 
 from blinkgl.errors import AssetError
 from blinkgl.io.alpha import over
-from blinkgl.io.images import decode_image, read_pfm, size_problem
+from blinkgl.io.images import decode_image, png_chunks, read_pfm, size_problem
 from blinkgl.io.records import decoding, input_errors
 
 SUFFIXES = frozenset(".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pgm .ppm .pnm .exr .hdr .pfm".split())
@@ -71,9 +70,9 @@ class Stills:
         if suffix == ".pfm":
             yield read_pfm(self.path)
         elif suffix == ".exr":
-            from blinkgl.io.video import read_exr
+            from blinkgl.io.video import decode_exr
 
-            yield read_exr(self.path)
+            yield decode_exr(_bytes(self.path), str(self.path))
         elif suffix in _TIFF:
             yield from self._tiff_pages(first)
         elif self.delays_ms is not None:
@@ -135,10 +134,8 @@ def open_stills(path: Path) -> Stills:
 
 def _png(path: Path, head: bytes) -> Stills:
     """Read the chunks before the pixels that say what codes mean (PNG specification, 11.3.2)."""
-    stills, at, bits = Stills(path), 8, 0
-    while at + 12 <= len(head):
-        length, kind = struct.unpack_from(">I4s", head, at)
-        body = head[at + 8 : at + 8 + length]
+    stills, bits = Stills(path), 0
+    for _, kind, body in png_chunks(head):
         if kind == b"IHDR":
             bits = body[8]
         elif kind == b"cICP" and len(body) == 4:
@@ -156,10 +153,9 @@ def _png(path: Path, head: bytes) -> Stills:
             stills.white = 2 ** body[0] - 1  # only where the codes are no larger, which the reader of the clip checks
         elif kind in (b"IDAT", b"IEND"):
             break
-        at += 12 + length
     if stills.transfer is not None:
-        stills.notes.append(f"the images state the curve {stills.transfer:.4g}" if isinstance(stills.transfer, float)
-                            else f"the images state the curve {stills.transfer}")  # fmt: skip
+        curve = f"{stills.transfer:.4g}" if isinstance(stills.transfer, float) else stills.transfer
+        stills.notes.append(f"the images state the curve {curve}")
     return stills
 
 

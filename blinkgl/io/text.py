@@ -62,14 +62,19 @@ class TextReader:
                 size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
                 if size and self.width is None:
                     self.width, self.height = int(size[1]), int(size[2])
-                elif text and (comment or _is_heading(text)):
+                elif text and (comment or re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I)):
                     names = _names(text.lstrip("#% "))
                     order = tuple(slot_of(name.partition("@")[0]) for name in names)
                     named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
                     if not self._order and named:
                         self._order, unit = order, self._heading(dict(zip(order, names)))
                     elif not comment and not reading.columns:
-                        self._refuse_heading(text)
+                        raise AssetError(
+                            f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
+                            where=str(path),
+                            value=text,
+                            accepted="a heading such as t x y p, or --columns",
+                        )
                 elif text:
                     self._start += 3 if line.startswith(codecs.BOM_UTF8) else 0
                     break
@@ -100,14 +105,6 @@ class TextReader:
             self.width, self.height = map(int, sizes)
             return "us"
         return named_unit(names["t"])
-
-    def _refuse_heading(self, text: str) -> None:
-        raise AssetError(
-            f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
-            where=str(self.path),
-            value=text,
-            accepted="a heading such as t x y p, or --columns",
-        )
 
     def _sample(self, file: BinaryIO, size: int = 1 << 15) -> tuple[np.ndarray, int]:
         """Return events of both ends of the file as (N, K) numbers, and about how many events it holds."""
@@ -168,10 +165,6 @@ class TextReader:
                     yield Events(x[:n], y[:n], t[:n], p[:n])
                 if not data:
                     return
-
-
-def _is_heading(text: str) -> bool:
-    return bool(re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I))
 
 
 def _names(heading: str) -> list[str]:

@@ -373,16 +373,9 @@ def _floats(frame: av.VideoFrame) -> np.ndarray:
     return planes[0] if len(planes) == 1 else np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
 
 
-def read_exr(path: str | os.PathLike) -> np.ndarray:
+def decode_exr(data: bytes, where: str) -> np.ndarray:
     """Return (H, W, 3), (H, W, 4) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; FFmpeg
     has. Raises AssetError: undecodable."""
-    if not os.path.isfile(path):
-        raise AssetError("no such file", where=str(path))
-    return decode_exr(Path(path).read_bytes(), str(path))
-
-
-def decode_exr(data: bytes, where: str) -> np.ndarray:
-    """Return :func:`read_exr` of bytes already read."""
     av = _av(AssetError, where)
     try:
         frames = av.CodecContext.create("exr", "r").decode(av.Packet(data))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.hdf5 import growing_dataset, write_rows
+from blinkgl.io.hdf5 import growing_dataset, packing, write_rows
 from blinkgl.layouts.source import Source
 
 
@@ -77,6 +77,7 @@ events_before = need(
 # Writing below an export's folder.
 
 _ROWS = 1 << 16
+GZIP = packing("gzip", 0)
 
 
 def copy(source: Path, target: Path) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
-from blinkgl.layouts.layout import Layout, append, copy, growing, images, need
+from blinkgl.layouts.layout import GZIP, Layout, append, copy, growing, images, need
 from blinkgl.layouts.source import Source
 
 LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000
@@ -102,14 +102,7 @@ def _write_flow(flow: np.ndarray, path: Path) -> None:
     with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with h5py.File(path, "w") as file:
-            file.create_dataset(
-                "flow",
-                data=flow.astype(np.float32),
-                compression="gzip",
-                compression_opts=1,
-                shuffle=True,
-                track_times=False,
-            )
+            file.create_dataset("flow", data=flow.astype(np.float32), track_times=False, **GZIP)
 
 
 def _write_events(source: Source, label_us: int, path: Path) -> None:

@@ -95,7 +95,7 @@ class Search:
         tried = qmc.scale(qmc.Sobol(len(keys), seed=self._seed).random(TRIED), *ends.T)
         tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
         self._planned = len(tried) + starts * 20 * (len(keys) + 2)
-        ordered = tried[np.argsort(self._costs(keys, tried))]
+        ordered = tried[np.argsort([_loss(self._difference(keys, at)) for at in tried])]
         self.target.beside(self._sums(keys, ordered[0]), floor="expected")
         first = [self._descend(keys, one, steps=_FEW_STEPS) for one in _apart(ordered, _EACH * starts)]
         first.sort(key=lambda found: found[0])
@@ -235,9 +235,6 @@ class Search:
 
     def _off(self, keys: list[str], at: np.ndarray) -> np.ndarray:
         return self.target.residual(self._sums(keys, at))
-
-    def _costs(self, keys: list[str], places: np.ndarray) -> np.ndarray:
-        return np.array([_loss(self._difference(keys, at)) for at in places])
 
     def _derivatives(self, keys: list[str], at: np.ndarray, here: np.ndarray) -> np.ndarray:
         """Return derivatives by steps of ``STEP``, or wider ones where that has hardly any effect."""

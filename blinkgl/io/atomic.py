@@ -144,16 +144,17 @@ def _remove(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
+def atomic_folder(final: str | os.PathLike, *, overwrite: bool = False) -> Iterator[Path]:
     """``with atomic_folder("out") as folder:`` write below ``folder``; it is renamed to ``out`` on success and deleted
     on any exception. The parent folder is made.
 
     Raises
     ------
-    OutputError : ``final`` exists (and is not an empty folder), or cannot be written.
+    OutputError : ``final`` exists (and is not an empty folder) and ``overwrite`` is False, or cannot be written.
     """
     final = Path(final)
-    refuse_existing(final)
+    if not overwrite:
+        refuse_existing(final)
     with _appearing(final) as temporary:
         with output_errors(final):
             temporary.mkdir()
@@ -162,6 +163,8 @@ def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
             for path in sorted(temporary.rglob("*"), reverse=True):  # what a folder holds comes before the folder
                 fsync(path)
             fsync(temporary)
+            if overwrite:
+                shutil.rmtree(final, ignore_errors=True)
             refuse_existing(final)
             os.rename(temporary, final)
             fsync(final.parent)

@@ -135,8 +135,12 @@ def _appearing(final: Path) -> Iterator[Path]:
         _remove(temporary)
         if not isinstance(error, BlinkGLError) or str(temporary) not in (error.where or ""):
             raise
-        where = (error.where or "").replace(str(temporary), str(final))
-        raise type(error)(error.problem, where=where, value=error.value, accepted=error.accepted) from error
+        raise type(error)(
+            error.problem,
+            where=(error.where or "").replace(str(temporary), str(final)),
+            value=error.value,
+            accepted=error.accepted,
+        ) from error
 
 
 def _remove(path: Path) -> None:

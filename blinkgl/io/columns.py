@@ -185,8 +185,12 @@ class CheckedWriter(Finishing):
         if self.limits is not None:
             least, most, problem = self.limits
             if events.t[0] < least or events.t[-1] >= most:
-                value = int(events.t[0] if events.t[0] < least else events.t[-1])
-                raise EventDataError(problem, where=where, value=value, accepted=f"{least} to less than {most} µs")
+                raise EventDataError(
+                    problem,
+                    where=where,
+                    value=int(events.t[0] if events.t[0] < least else events.t[-1]),
+                    accepted=f"{least} to less than {most} µs",
+                )
         self._last = check_events(events, where, self.count, height=height, width=width, after=self._last)
         with output_errors(self.path):
             self._write(events)

@@ -147,8 +147,9 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
     flow."""
     path = Path(path)
     if path.suffix.lower() not in READ_ENDINGS:
-        accepted = ", ".join(READ_ENDINGS)
-        raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=accepted)
+        raise AssetError(
+            "unknown flow file ending", where=str(path), value=path.suffix, accepted=", ".join(READ_ENDINGS)
+        )
     form = form or {".png": "dsec"}.get(path.suffix.lower(), path.suffix.lower()[1:])
     if form == "flo":
         return read_flo(path)

@@ -167,8 +167,12 @@ class EventFile(Closing):
             for events in self._reader.chunks():
                 yield replace(events, p=on_or_off(events.p, pair, str(self.path))) if pair else events
         except (AssetError, EventDataError) as error:
-            accepted = f"{error.accepted or 'a whole file'}; or --damaged keep"
-            raise type(error)(error.problem, where=error.where, value=error.value, accepted=accepted) from error
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                value=error.value,
+                accepted=f"{error.accepted or 'a whole file'}; or --damaged keep",
+            ) from error
 
     def _salvaged(self) -> Iterator[Events]:
         """Yield what is whole, in order of time; count the rest."""

@@ -10,11 +10,12 @@ frame_camera/
 from __future__ import annotations
 
 import csv
-import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+
+import numpy as np
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError
@@ -80,12 +81,9 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
             first, *rows = csv.reader(file)
         if first != heading or any(len(row) != len(heading) for row in rows):
             raise ValueError("not the columns " + ", ".join(heading))
-        lines = []
-        for row in rows:
-            start, end, exposure, row_us, gain_db = (float(v) for v in row[:5])
-            if not math.isfinite(start + end + exposure + row_us + gain_db):
-                raise ValueError("a number that is not finite")
-            lines.append(ExposureLine(start, end, exposure, row_us, gain_db, int(row[5])))
+        lines = [ExposureLine(**dict(zip(heading, map(float, row[:5])), instants=int(row[5]))) for row in rows]
+        if not np.isfinite([astuple(line) for line in lines]).all():
+            raise ValueError("a number that is not finite")
         return lines
     except FileNotFoundError:
         raise AssetError(

@@ -86,8 +86,12 @@ def read_label_times(path: Path, columns: int, count: int | None = None) -> list
         if not line.strip() or line.startswith("#"):
             continue
         if len(fields) != columns or not all(map(_MICROSECONDS.fullmatch, fields)):
-            accepted = "from_us, to_us" if columns == 2 else "a time in µs"
-            raise AssetError(f"line {number} is no time", where=str(path), value=line, accepted=accepted)
+            raise AssetError(
+                f"line {number} is no time",
+                where=str(path),
+                value=line,
+                accepted="from_us, to_us" if columns == 2 else "a time in µs",
+            )
         rows.append(tuple(map(int, fields)))
         if columns == 2 and rows[-1][0] == rows[-1][1]:
             raise AssetError(f"line {number} is not an interval", where=str(path), value=line, accepted="two times")

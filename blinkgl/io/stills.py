@@ -165,10 +165,9 @@ def _animated(path: Path) -> Stills:
             raise AssetError(problem, where=str(path))
         delays = []
         for page in ImageSequence.Iterator(image):
-            delays.append(float(page.info.get("duration", 0) or 0))
             if image.format == "WEBP":
                 page.load()  # its delay is known then
-                delays[-1] = float(page.info.get("duration", 0) or 0)
+            delays.append(float(page.info.get("duration", 0) or 0))
     notes = []
     if zero := sum(delay <= 0 for delay in delays):
         notes.append(f"{zero} frames state no delay: {_UNSTATED_MS} ms each, as browsers show them (--fps)")

@@ -94,8 +94,11 @@ def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Ta
     AssetError: columns of different lengths, or no numbers."""
     lengths = {slot: max(column.shape, default=0) for slot, column in columns.items() if _is_vector(column)}
     if len(lengths) != len(columns) or len(set(lengths.values())) != 1:
-        shapes = {slot: getattr(column, "shape", None) for slot, column in columns.items()}
-        raise AssetError("event columns differ in length", where=where, value=shapes)
+        raise AssetError(
+            "event columns differ in length",
+            where=where,
+            value={slot: getattr(column, "shape", None) for slot, column in columns.items()},
+        )
 
     def read(part: slice) -> dict[str, np.ndarray]:
         flat = {slot: column for slot, column in columns.items() if len(column.shape) == 1}
@@ -149,8 +152,9 @@ class TableReader:
         self.path, self._keep, self._polarity, self.unread = path, reading.keep, reading.polarity, 0
         number = reading.stream or 0
         if not 0 <= number < len(tables):
-            accepted = f"--stream 0 to {len(tables) - 1}"
-            raise AssetError("no such stream", where=str(path), value=number, accepted=accepted)
+            raise AssetError(
+                "no such stream", where=str(path), value=number, accepted=f"--stream 0 to {len(tables) - 1}"
+            )
         self._table = table = tables[number]
         self.notes = [*table.notes]
         if len(tables) > 1:

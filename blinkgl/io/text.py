@@ -95,8 +95,9 @@ class TextReader:
             with gzip.open(self.path) if self.path.suffix.lower() == ".gz" else open(self.path, "rb") as file:
                 yield cast(BinaryIO, file)
         except (OSError, EOFError, zlib.error) as error:
-            problem = f"cannot read: {getattr(error, 'strerror', None) or error}"
-            raise AssetError(problem, where=str(self.path)) from error
+            raise AssetError(
+                f"cannot read: {getattr(error, 'strerror', None) or error}", where=str(self.path)
+            ) from error
 
     def _heading(self, names: dict[str, str]) -> str | None:
         """Return the unit that the name of t states; take the sizes that faery adds to the names of x and y."""

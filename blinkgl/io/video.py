@@ -337,9 +337,11 @@ class VideoReader:
             if stream.codec_context is None:
                 raise AssetError("cannot read video: unknown codec", where=str(self.path))
             if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
-                size = f"{stream.codec_context.width}x{stream.codec_context.height}"
                 raise AssetError(
-                    "video too large", where=str(self.path), value=size, accepted="at most 268 Mpx a frame"
+                    "video too large",
+                    where=str(self.path),
+                    value=f"{stream.codec_context.width}x{stream.codec_context.height}",
+                    accepted="at most 268 Mpx a frame",
                 )
             yield file, stream
 

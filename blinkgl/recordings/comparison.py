@@ -224,10 +224,8 @@ def compare(
     changes: Iterator[np.ndarray | None]
     notes: list[str] = []
     if frames is not None:
-        declared = replace(declared, zero_time=zero_time or declared.zero_time)
-        edges, changes, notes = _frame_intervals(
-            frames, declared, gamma, round(frame_delay_ms * 1000), start, stop, files
-        )
+        zero = replace(declared, zero_time=zero_time or declared.zero_time)
+        edges, changes, notes = _frame_intervals(frames, zero, gamma, round(frame_delay_ms * 1000), start, stop, files)
     else:
         step = round(interval_ms * 1000)
         # What remains at the end is an interval of its own length, or lengthens the last one.
@@ -242,8 +240,7 @@ def compare(
             accepted="recordings that overlap (seconds shown), or --zero-time",
         )
     result = _accumulate(files, shifts, edges, changes)
-    result.notes += [f"{file.path}: {line}" for file in files for line in file.notes]
-    result.notes += notes
+    result.notes += [f"{file.path}: {line}" for file in files for line in file.notes] + notes
     if judge:
         result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))
     return result

@@ -139,8 +139,8 @@ def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.nda
 def area(score: np.ndarray, label: np.ndarray) -> float:
     """Return the area under the curve of true against false positives: how often one of the second kind has the higher
     score (Mann and Whitney), ties half."""
-    from scipy.stats import rankdata
+    from scipy.stats import mannwhitneyu
 
     positive = label > 0.5
-    n, m = int(positive.sum()), int((~positive).sum())
-    return float((rankdata(score)[positive].sum() - n * (n + 1) / 2) / (n * m))
+    above = mannwhitneyu(score[positive], score[~positive], method="asymptotic").statistic
+    return float(above / (positive.sum() * (~positive).sum()))

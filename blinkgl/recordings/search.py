@@ -61,8 +61,10 @@ class Search:
         one = lambda clip, stop: target(sums(clip.events, clip, 0, stop), together=base.one_threshold)
         self.target = Targets([one(*part) for part in parts])
         if not len(self.target.values):
-            pixels = sum(int(clip.used.sum()) for clip, _ in parts)
-            raise EventDataError("too few pixels to estimate an emulator's parameters", value=pixels)
+            raise EventDataError(
+                "too few pixels to estimate an emulator's parameters",
+                value=sum(int(clip.used.sum()) for clip, _ in parts),
+            )
         self.evaluations = 0
         self.untold: dict[str, str] = {}
         self.cost = float("nan")

@@ -365,25 +365,22 @@ def file_to_events(
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
     iterator = iter(frames)
-    first = next(iterator)
-    second = next(iterator, None)
-    start_us = first[1] // 1000
-    gap_ns = (second[1] - first[1]) if second else 10**9
-
-    def given() -> Iterator:
-        for i, (frame, t_ns, name) in enumerate(itertools.chain([first], [second] if second else [], iterator)):
-            yield frame, t_ns, f"{source}: frame {i} ({name})"
-
+    first = list(itertools.islice(iterator, 2))
+    start_us, gap_ns = first[0][1] // 1000, first[-1][1] - first[0][1]
+    given = enumerate(itertools.chain(first, iterator))
     steps = simulated_steps(
-        given(), use, emulator=emulator, seed=seed, readout=readout, report=report, fitting=report.fitting
+        ((frame, t_ns, f"{source}: frame {i} ({name})") for i, (frame, t_ns, name) in given),
+        use,
+        emulator=emulator,
+        seed=seed,
+        readout=readout,
+        report=report,
+        fitting=report.fitting,
     )
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
-        video = None
-        if preview is not None:
-            shown = _preview(preview, height, width, start_us, gap_ns, overwrite)
-            video = stack.enter_context(shown)
-        done = 0
+        shown = None if preview is None else _preview(preview, height, width, start_us, gap_ns, overwrite)
+        video, done = shown and stack.enter_context(shown), 0
         for step in steps:
             if video is not None:
                 video.add_events(step.events)

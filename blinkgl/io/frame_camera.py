@@ -81,7 +81,10 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
             first, *rows = csv.reader(file)
         if first != heading or any(len(row) != len(heading) for row in rows):
             raise ValueError("not the columns " + ", ".join(heading))
-        lines = [ExposureLine(**dict(zip(heading, map(float, row[:5])), instants=int(row[5]))) for row in rows]
+        lines = [
+            ExposureLine(float(start), float(end), float(exposure), float(row_us), float(gain_db), int(instants))
+            for start, end, exposure, row_us, gain_db, instants in rows
+        ]
         if not np.isfinite([astuple(line) for line in lines]).all():
             raise ValueError("a number that is not finite")
         return lines

@@ -196,29 +196,24 @@ class VideoReader:
     def __iter__(self) -> Iterator[tuple[np.ndarray, int | None]]:
         pts, at, count = self._scan.pts, 0, 0
         damage = self._scan.damage
-        frames = self._decoded()
-        while True:
-            try:
-                frame = next(frames, None)
-            except AssetError as error:
-                damage = error.problem
-                break
-            if frame is None:
-                break
-            if frame.is_corrupt:
-                damage = damage or "a frame is corrupt"
-                break
-            time = None if pts or count >= self.count else self.times_ns[count]
-            if pts and frame.pts is not None:
-                # Packets that gave no frame are passed over, so that the others keep their times.
-                while at < len(pts) and pts[at] < frame.pts:
-                    at += 1
-                if at < len(pts) and pts[at] == frame.pts:
-                    time, at = self._scan.times_ns[at], at + 1
-                else:  # it runs back, which whoever reads the frames refuses
-                    time = round((frame.pts * self._tick - self._start) * 10**9)
-            yield self._pixels(frame), time
-            count += 1
+        try:
+            for frame in self._decoded():
+                if frame.is_corrupt:
+                    damage = damage or "a frame is corrupt"
+                    break
+                time = None if pts or count >= self.count else self.times_ns[count]
+                if pts and frame.pts is not None:
+                    # Packets that gave no frame are passed over, so that the others keep their times.
+                    while at < len(pts) and pts[at] < frame.pts:
+                        at += 1
+                    if at < len(pts) and pts[at] == frame.pts:
+                        time, at = self._scan.times_ns[at], at + 1
+                    else:  # it runs back, which whoever reads the frames refuses
+                        time = round((frame.pts * self._tick - self._start) * 10**9)
+                yield self._pixels(frame), time
+                count += 1
+        except AssetError as error:
+            damage = error.problem
         if damage or count < self.count:
             raise AssetError(
                 f"video truncated or corrupt after frame {count}{_because(damage)}",

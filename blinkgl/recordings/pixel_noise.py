@@ -327,8 +327,8 @@ class _Counts:
         decades = int(np.ceil(_PER_DECADE * np.log10(top / _EXACT))) + 1
         # Hot pixels have up to millions of events; bins of equal ratio keep the table small.
         edges = _EXACT * 10 ** (np.arange(decades + 1) / _PER_DECADE)
+        # Upper ends of the bins; the last one is open.
         self._edges = np.concatenate([np.arange(_EXACT + 1), edges[1:]]) + 0.5
-        """upper ends of the bins; the last one is open"""
         where = np.searchsorted(self._edges, counts)
         self._observed = np.bincount(where, minlength=len(self._edges) + 1)
         self._mean = float(counts.mean())

@@ -49,10 +49,7 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 def read_mask(path: str | os.PathLike) -> np.ndarray:
     """Return a mask, (H, W) bool."""
-    image = read_png(path)
-    if image.ndim != 2:
-        raise AssetError("not a mask", where=str(path), value=image.shape, accepted="one channel")
-    return image > 0
+    return _one_channel(path, "a mask") > 0
 
 
 def encode_ids(ids: np.ndarray) -> bytes:
@@ -65,9 +62,13 @@ def encode_ids(ids: np.ndarray) -> bytes:
 
 def read_ids(path: str | os.PathLike) -> np.ndarray:
     """Return (H, W) integers as stored. Raises AssetError."""
+    return _one_channel(path, "a picture of ids")
+
+
+def _one_channel(path: str | os.PathLike, what: str) -> np.ndarray:
     image = read_png(path)
     if image.ndim != 2:
-        raise AssetError("not a picture of ids", where=str(path), value=image.shape, accepted="one channel")
+        raise AssetError(f"not {what}", where=str(path), value=image.shape, accepted="one channel")
     return image
 
 

@@ -13,6 +13,7 @@ from blinkgl.config.frames import FLOW_FORMATS
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.images import encode_npy, encode_png, read_npy, read_pfm, read_png
+from blinkgl.io.records import input_errors
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Flow as 16-bit PNG: DSEC's (quantum 1/128 px, ±256 px) and KITTI's (1/64 px, ±512 px).
@@ -83,19 +84,11 @@ def encode_flo(flow: np.ndarray, valid: np.ndarray | None = None) -> bytes:
     return struct.pack("<fii", _TAG, data.shape[1], data.shape[0]) + data.tobytes()
 
 
-def write_flo(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
-    """Write :func:`encode_flo`. Raises OutputError."""
-    with output_errors(path):
-        Path(path).write_bytes(encode_flo(flow, valid))
-
-
 def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px (0 where unknown), valid (H, W) bool. Raises AssetError: wrong tag, size or
     length."""
-    try:
+    with input_errors(path):
         data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
     if len(data) < 12 or struct.unpack_from("<f", data)[0] != _TAG:
         raise AssetError("not a .flo file: wrong tag", where=str(path), accepted=f"{_TAG}")
     width, height = struct.unpack_from("<ii", data, 4)
@@ -154,8 +147,9 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
     flow."""
     path = Path(path)
     if path.suffix.lower() not in READ_ENDINGS:
-        accepted = ", ".join(READ_ENDINGS)
-        raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=accepted)
+        raise AssetError(
+            "unknown flow file ending", where=str(path), value=path.suffix, accepted=", ".join(READ_ENDINGS)
+        )
     form = form or {".png": "dsec"}.get(path.suffix.lower(), path.suffix.lower()[1:])
     if form == "flo":
         return read_flo(path)

@@ -11,14 +11,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.io.atomic import atomic_file
-from blinkgl.io.columns import MAX_SIDE, CameraFrame, ImuSamples, check_events, check_size, on_or_off
+from blinkgl.io.columns import MAX_SIDE, CameraFrame, CheckedWriter, ImuSamples, check_events, check_size, on_or_off
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
 
 
@@ -47,7 +48,7 @@ class EventFormat:
         """Return a reader of the file. Raises AssetError: not what the ending says."""
         return getattr(import_module(f"blinkgl.io.{self.module}"), self.reader)(path, reading)
 
-    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> EventWriter:
+    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> CheckedWriter:
         """Return a writer of the file. options : those that it takes are used."""
         given = {name: options[name] for name in self.takes}
         return getattr(import_module(f"blinkgl.io.{self.module}"), self.writer)(
@@ -96,19 +97,8 @@ _OVERLAP_US = 10_000
 """With ``damaged="keep"``, events that come up to so much too late are put in their place."""
 
 
-class EventWriter(Protocol):
-    """Interface of every format's writer; ``abort`` never raises. ``t_end_us`` may be set before the end: the
-    recording's, where it is later than the last event's (used by DSEC's table)."""
-
-    t_end_us: int | None
-
-    def append(self, events: Events) -> None: ...
-    def close(self, t_end_us: int | None = None) -> None: ...
-    def abort(self) -> None: ...
-
-
 @dataclass(frozen=True)
-class EventFile:
+class EventFile(Closing):
     """An event file opened for reading, in any format.
 
     height, width : px, None when neither the file nor the user gives them. t_offset_us : DSEC's, else 0 (already added
@@ -177,8 +167,12 @@ class EventFile:
             for events in self._reader.chunks():
                 yield replace(events, p=on_or_off(events.p, pair, str(self.path))) if pair else events
         except (AssetError, EventDataError) as error:
-            accepted = f"{error.accepted or 'a whole file'}; or --damaged keep"
-            raise type(error)(error.problem, where=error.where, value=error.value, accepted=accepted) from error
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                value=error.value,
+                accepted=f"{error.accepted or 'a whole file'}; or --damaged keep",
+            ) from error
 
     def _salvaged(self) -> Iterator[Events]:
         """Yield what is whole, in order of time; count the rest."""
@@ -257,12 +251,6 @@ class EventFile:
     def close(self) -> None:
         """Close the file (only HDF5 files stay open between reads)."""
         getattr(self._reader, "close", lambda: None)()
-
-    def __enter__(self) -> EventFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def read(self) -> Events:
         """Return all events at once."""
@@ -350,7 +338,7 @@ def output_format(path: str | os.PathLike) -> str:
 
 def _writer(
     path: Path, kind: str, height: int | None, width: int | None, t_offset_us: int, write_unit: str
-) -> EventWriter:
+) -> CheckedWriter:
     check_size(height, width, str(path), MAX_SIDE**2)
     if write_unit != "s" and "write_unit" not in FORMATS[kind].takes:
         raise OutputError(
@@ -375,7 +363,7 @@ def event_writer(
     t_offset_us: int = 0,
     write_unit: str = "s",
     overwrite: bool = True,
-) -> Iterator[EventWriter]:
+) -> Iterator[CheckedWriter]:
     """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the
     block ends without an exception, and not at all otherwise.
 
@@ -383,14 +371,11 @@ def event_writer(
     write_unit : text and CSV only, "s" or "us". Raises OutputError, EventDataError.
     """
     kind = output_format(path)
-    with atomic_file(path, overwrite=overwrite) as temporary:
-        writer = _writer(temporary, kind, height, width, t_offset_us, write_unit)
-        try:
-            yield writer
-            writer.close()
-        except BaseException:
-            writer.abort()
-            raise
+    with (
+        atomic_file(path, overwrite=overwrite) as temporary,
+        _writer(temporary, kind, height, width, t_offset_us, write_unit) as writer,
+    ):
+        yield writer
 
 
 def write_events(

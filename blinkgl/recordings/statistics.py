@@ -15,7 +15,7 @@ import numpy as np
 from blinkgl.machine.kernels import kernel
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
-from blinkgl.recordings.comparison import BLUR_PX
+from blinkgl.recordings.comparison import BLUR_PX, histogram_distance
 from blinkgl.recordings.judge import LEAST_IN_PATCH, LEAST_PATCHES
 from blinkgl.recordings.patches import NAMES, SIDE_PX, patches
 from blinkgl.types.events import Events
@@ -87,7 +87,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     span_us = int(clip.edges_us[first]), int(clip.edges_us[stop])
     part = events.window(*span_us)
     part = part.part(~inside_any(part.t, clip.bursts))
-    where = part.y.astype(np.int64) * width + part.x
+    where = part.pixel(width)
     _collect(where, part.t, part.p, clip.edges_us[first : stop + 1], clip.bursts, group, total, isi)
     used, still = clip.used.ravel(), clip.still.ravel()
     moving = used & ~still
@@ -358,5 +358,4 @@ def numbers(
 
 def interval_distance(a: Sums, b: Sums) -> float:
     """Return the Kolmogorov-Smirnov distance of the intervals between events of a pixel."""
-    cdf = [np.cumsum(s.isi.sum(axis=(0, 1))) / max(s.isi.sum(), 1) for s in (a, b)]
-    return float(np.abs(cdf[0] - cdf[1]).max())
+    return histogram_distance(*(s.isi.sum(axis=(0, 1)) for s in (a, b)))

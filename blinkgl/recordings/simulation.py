@@ -397,10 +397,10 @@ def file_to_events(
 def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | dict) -> None:
     """Raise OutputError for an ending that is not an event file's, or a format that cannot store the emulator's
     causes."""
-    from blinkgl.io.formats import WITH_CAUSES, output_format
+    from blinkgl.io.formats import FORMATS, output_format
 
     kind = output_format(target)
-    if getattr(emulator_config(emulator), "causes", False) and kind not in WITH_CAUSES:
+    if getattr(emulator_config(emulator), "causes", False) and not FORMATS[kind].causes:
         raise OutputError(
             f"{kind} cannot hold the causes of events",
             where=str(target),

@@ -159,23 +159,22 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
         # u is the third channel, and 0 in the first means that the point is seen in both images.
         raw = _sixteen_bits(path)
         return (raw[..., :2].astype(np.float32) - np.float32(_ZERO)) / np.float32(KITTI_SCALE), raw[..., 2] == 0
+    stated: np.ndarray | bool = True
     if form == "vkitti2":
         # Shares of the width and height less one, from -1 to 1.
         raw = _sixteen_bits(path)
         size = np.array([raw.shape[1] - 1, raw.shape[0] - 1], np.float32)
-        flow, valid = (raw[..., 2:0:-1].astype(np.float32) * np.float32(2 / 65535) - 1) * size, raw[..., 0] > 0
+        flow, stated = (raw[..., 2:0:-1].astype(np.float32) * np.float32(2 / 65535) - 1) * size, raw[..., 0] > 0
     elif form == "pfm":
         data = read_pfm(path)
         if data.ndim != 3:
             raise AssetError("not a flow field", where=str(path), value=data.shape, accepted="PFM of three channels")
         flow = data[..., :2]
-        valid = np.isfinite(flow).all(-1)
     elif form == "flo5":
         flow = read_flo5(path)
-        valid = np.isfinite(flow).all(-1)
     else:
         flow, stated = read_flow_npy(path)
-        valid = stated & np.isfinite(flow).all(-1)
+    valid = stated & np.isfinite(flow).all(-1)
     return np.where(valid[..., None], flow, np.float32(0)), valid
 
 

@@ -160,9 +160,8 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     heading, rows = read_rows(text)
     titles = titles_of(heading)
     roles = (declared.columns or "").replace(",", " ").split() or _roles(titles)
+    roles = roles or _COLUMNS.get(declared.form or "", "").split()
     notes: list[str] = []
-    if not roles and declared.form is not None:
-        roles = _COLUMNS[declared.form].split()
     if not rows:
         return _Table(None, np.empty((0, 3)), Rotation.identity(), [])
     if not roles:

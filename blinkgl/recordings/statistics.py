@@ -96,13 +96,11 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     per_pixel = total.sum(axis=2)
     rates = np.stack([_by(on_group, total[k, :, p]) for k in range(count) for p in (0, 1)], 1).reshape(GROUPS, count, 2)
     both = total.sum(axis=0, dtype=np.int64)
-    lights = np.zeros((GROUPS, LIGHTS, 2))
-    for part_of in range(LIGHTS):
-        here = np.where(clip.light.ravel() == part_of, on_group, GROUPS)
-        lights[:, part_of] = np.stack([_by(here, both[:, p]) for p in (0, 1)], 1)
+    light, of_both = clip.light.ravel(), lambda groups: np.stack([_by(groups, both[:, p]) for p in (0, 1)], 1)
+    lights = np.stack([of_both(np.where(light == part, on_group, GROUPS)) for part in range(LIGHTS)], 1)
     counts = _histogram(per_pixel[:, moving], np.broadcast_to(group[moving], (count, int(moving.sum()))))
     still_counts = _histogram(both.sum(axis=1)[still], group[still])
-    quiet = np.stack([_by(np.where(still, group, GROUPS), both[:, p]) for p in (0, 1)], 1)
+    quiet = of_both(np.where(still, group, GROUPS))
     raw = (total[..., 1] - total[..., 0]).reshape(count, height, width).astype(np.float32)
     # Quantisation and sub-pixel shifts are not compared, as in `compare`.
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])

@@ -31,7 +31,8 @@ from blinkgl.config.values import (
     word_or_list,
 )
 
-POOLED, ALL_PRIMITIVES = kinds("pool", "living"), tuple(PRIMITIVES)
+POOLED = kinds("pool", "living")
+_Primitive = Literal[tuple(PRIMITIVES)]  # type: ignore[invalid-literal]
 
 
 class ObjectsConfig(Config):
@@ -222,7 +223,7 @@ class RandomSceneConfig(Config):
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Annotated[Literal[ALL_PRIMITIVES], WrapValidator(or_registered), PlainSerializer(str)] | None = Field(  # type: ignore[invalid-literal]
+    primitive: Annotated[_Primitive, WrapValidator(or_registered), PlainSerializer(str)] | None = Field(
         None, description="kind of primitive"
     )
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(parameter_value)]] = Field(

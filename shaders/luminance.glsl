@@ -10,7 +10,7 @@
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
 //                       pixels
 //            FOG        seen through fog, see fog.glsl
-//           LIGHTS     other lights, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
+//           LIGHTS     other lights, see lights.glsl; RGB: the albedo is r, g, b, each times its share of the
 //                       luminance, because coloured light scales each channel separately
 //            TINTED     times the vertices' colours
 //           EMISSIVE   emitted light, EMISSION_MAP: from a texture of its luminance
@@ -175,7 +175,7 @@ void main()
     luminance *= light;
 #endif
 #endif
-#ifdef HUED
+#ifdef RGB
     // The albedo includes the luminance's weights.
     float seen = luminance.r + luminance.g + luminance.b;
 #ifdef RATE
@@ -206,7 +206,7 @@ void main()
 #elif !defined(LIT)
     const float light = 1.0, shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
 #endif
-#ifdef HUED
+#ifdef RGB
     float known = unlit.r + unlit.g + unlit.b;
 #define OF_LUMINANCE(light) (dot(unlit, vec3(light)) / max(known, 1e-30))
 #else

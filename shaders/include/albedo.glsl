@@ -1,5 +1,5 @@
 // The albedo of luminance.glsl: a texture's, filtered in one of four ways, or the uniform; and a tint on it.
-#ifdef HUED
+#ifdef RGB
 #define ALBEDO vec3
 #define CHANNELS rgb
 #define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // weights of the luminance, Rec. 709
@@ -9,7 +9,7 @@
 #define WEIGHTS 1.0
 #endif
 #ifdef TINTED
-#ifdef HUED
+#ifdef RGB
 #define TINT(colour) colour
 #else
 uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface

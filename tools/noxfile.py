@@ -35,6 +35,7 @@ def oldest(session: nox.Session) -> None:
     """With the lower bounds of setup.cfg, and what was current otherwise; the tests' own tools are the newest."""
     session.chdir(ROOT)
     constraints = Path(session.create_tmp()) / "oldest.txt"
+    constraints.unlink(missing_ok=True)  # uv would keep the versions of an older one
     if shutil.which("uv") is None:
         session.install("uv")
     resolve = ["uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct", "setup.cfg", "-o", str(constraints)]

@@ -51,7 +51,7 @@ def compare(glb: Path, seen: Path | None, per: int = 1) -> tuple[dict[str, Diffe
     if seen is None:
         return {}, 1, scene.omissions
     theirs: dict[str, list[np.ndarray]] = {}
-    objs = json.loads(str(table["objs"]))
+    objs = json.loads(str(table["things"]))
     for k, (name, _) in enumerate(objs):
         theirs.setdefault(name, []).append(table[f"arr_{k}"])
     ours, changing = _played(document, scene.objects, t_ns), {name for name, changes in objs if changes}

@@ -121,7 +121,7 @@ def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
     """Write to ``path`` (npz) where points of every surface are at a few frames and between frames: ``times`` (T,) s,
-    ``whole`` (T,) bool, ``objs`` JSON: (name, whether its faces change) of each, ``arr_0`` … (T, n, 3) its points,
+    ``whole`` (T,) bool, ``things`` JSON: (name, whether its faces change) of each, ``arr_0`` … (T, n, 3) its points,
     NaN where it is not seen.
 
     Return (owners that are broken, owners of each object's name)."""

@@ -51,7 +51,7 @@ def rigid_matrix(matrix: Any) -> np.ndarray:
 
 
 @rule("quaternion")
-def SOME_ROTATION(quaternion: tuple[float, ...] | None):
+def SOME_ROTATION(quaternion: tuple[float, ...] | None) -> None:
     """A rule of the key ``quaternion``."""
     if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
         raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))

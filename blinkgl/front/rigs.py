@@ -126,8 +126,3 @@ class Rig(Piece):
     def names(self) -> tuple[str, ...]:
         """Return the names of ``sensors``; a preset has further ones."""
         return tuple(one.tree["name"] for one in self.sensors)
-
-
-def rig_of(given: Rig | str) -> Rig:
-    """Return a rig, or that of a preset's name. Raises ConfigError."""
-    return Rig(preset=given) if isinstance(given, str) else check.one_of(given, "rig", Rig, "a Rig, or a preset's name")

@@ -15,7 +15,7 @@ from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.rigs import Rig, rig_of
+from blinkgl.front.rigs import Rig
 from blinkgl.front.scenes import Scene
 from blinkgl.front.sections import SECTIONS, Section, sections
 from blinkgl.scene.types import Scene as SceneData
@@ -136,7 +136,8 @@ def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[
     template = source.template() if isinstance(source, Scene) else source
     own = sections(_READERS, settings)
     if rig is not None:
-        own |= rig_of(rig).tree
+        named = Rig(preset=rig) if isinstance(rig, str) else rig
+        own |= check.one_of(named, "rig", Rig, "a Rig, or a preset's name").tree
     own = expanded(own, Path.cwd())
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])

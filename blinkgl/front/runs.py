@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
+from blinkgl.config.base import placed
 from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
 from blinkgl.config.problems import validate_field
@@ -39,11 +40,8 @@ class Timeline:
     @check.public()
     def __init__(self, kind: str = "displacement", **values: Any):
         self.tree = {"kind": check.plain(kind), **check.plain(values)}
-        try:
+        with placed(lambda where: where.replace("timeline", "Timeline", 1)):
             validate_field(SequenceConfig, "timeline", self.tree)
-        except ConfigError as error:
-            where = (error.where or "timeline").replace("timeline", "Timeline", 1)
-            raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
 
     def __repr__(self) -> str:
         return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"

@@ -53,9 +53,9 @@ class PreviewRecorder:
     sequences : of one camera, or of those of a rig, shown one below the other by their names."""
 
     def __init__(self, config: PreviewConfig, sequences: Sequence[SensorSimulation], writer: SequenceWriter):
-        self._shown = {id(one): k for k, one in enumerate(one for one in sequences if one.pictures_hz is not None)}
+        shown = [one for one in sequences if one.pictures_hz is not None]
+        self._numbers = {one.name: number for number, one in enumerate(shown)}
         self._video: PreviewWriter | None = None
-        shown = [one for one in sequences if id(one) in self._shown]
         if not shown:
             return
         self._clock = shown[0].clock
@@ -77,7 +77,7 @@ class PreviewRecorder:
 
     def take(self, sequence: SensorSimulation, item: Item) -> None:
         """Add the items of a sequence, in order."""
-        if self._video is None or (number := self._shown.get(id(sequence))) is None:
+        if self._video is None or (number := self._numbers.get(sequence.name)) is None:
             return
         if isinstance(item, EventChunk):
             with sequence.clock("preview"):

@@ -3,7 +3,7 @@
 # make lint    ruff, formatting, types; what the tests last covered      make format  rewrite what the formatter would; make coverage
 # make docs    install into .venv, build the documentation into out/site
 # make slow    the tests that take long       make bench WHAT=events   a benchmark
-# make fuzz    damaged files (minutes)
+# make fuzz    damaged files (minutes)        make matrix    the tests on other Pythons, and with the oldest libraries
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
@@ -17,7 +17,7 @@ COVERED = if [ -f .coverage ]; then .venv/bin/python -m coverage report --sort=c
 	else echo "coverage: not measured here yet (make coverage)"; fi
 INPUTS = setup.cfg setup.py pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test lint format coverage docs slow bench fuzz doctor setup opengl clean
+.PHONY: demo test lint format coverage docs slow bench fuzz matrix doctor setup opengl clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.installed-core opengl
@@ -55,6 +55,10 @@ bench: .venv/.installed-dev opengl
 
 fuzz: .venv/.installed-dev
 	.venv/bin/python -m blinkgl.tools.fuzz --mutants 1000
+
+# Environments of nox, in .nox/; without torch, so that the tests of eflow are skipped.
+matrix: .venv/.installed-dev opengl
+	.venv/bin/nox -f tools/noxfile.py
 
 doctor: .venv/.installed-core
 	.venv/bin/blinkgl doctor

@@ -14,12 +14,11 @@ DEVELOPERS = "blinkgl.tools"
 
 
 class BuildPy(build_py):
-    """Leaves out what only developers run; an editable install has it."""
+    """Leaves out the programs that only developers run; an editable install has them."""
 
-    def run(self) -> None:
-        if not self.editable_mode:
-            self.packages = [name for name in self.packages if name != DEVELOPERS]
-        super().run()
+    def find_package_modules(self, package: str, package_dir: str) -> list[tuple[str, str, str]]:
+        found = super().find_package_modules(package, package_dir)
+        return found if package != DEVELOPERS else [module for module in found if module[1] == "__init__"]
 
 
 def long_description() -> str:

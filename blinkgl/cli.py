@@ -16,7 +16,7 @@ import typer
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
 from blinkgl.machine.command_line import run_app
 from blinkgl.machine.plugins import load_plugins
-from blinkgl.shader_debugger.cli import app as shader_app
+from blinkgl.tools.shader_debugger.cli import app as shader_app
 from blinkgl.version import __version__
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -264,10 +264,10 @@ def trade(
 ) -> int:
     """Measure the cost of accuracy: settings are timed and compared with a converged reference; writes a table, a plot
     and a page."""
-    from blinkgl.show import trade as command
+    from blinkgl.tools.trade import command
 
     if suite:
-        from blinkgl.show import suite as suite_command
+        from blinkgl.tools.trade import suite_command
 
         return suite_command.run(
             config,

@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from blinkgl.errors import AssetError, ConfigError, OutputError
-from blinkgl.io.atomic import atomic_file, fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.atomic import atomic_file, atomic_folder, output_errors
 from blinkgl.io.records import parse, read_text
 from eflow import shipped
 from eflow.config import TrainConfig
@@ -69,7 +69,6 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, st
         except SafetensorError as error:
             raise OutputError(f"cannot write: {' '.join(str(error).split())}", where=str(path)) from error
         _sort_header(path)
-        fsync(path)
 
 
 def _sort_header(path: Path) -> None:
@@ -227,13 +226,7 @@ def save_checkpoint(
     """Write ``run/checkpoints/<step>`` completely or not at all, then delete all but the newest ``keep``
     checkpoints."""
     final = run / "checkpoints" / f"{step:09d}"
-    with output_errors(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
-    remove_stale(final.parent)
-    temporary = temporary_beside(final)
-    try:
-        with output_errors(final):
-            temporary.mkdir()
+    with atomic_folder(final, overwrite=True) as temporary:
         metadata = metadata_of(model)
         write_tensors(temporary / "weights.safetensors", model.state_dict(), metadata)
         if ema is not None:
@@ -243,15 +236,6 @@ def save_checkpoint(
             (temporary / "state.json").write_text(
                 json.dumps({"format": FORMAT, "step": step, **state}, indent=1) + "\n", encoding="utf-8"
             )
-            fsync(temporary / "state.json")
-            fsync(temporary)
-            if final.exists():
-                shutil.rmtree(final)
-            os.rename(temporary, final)
-            fsync(final.parent)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
     for old in _steps(final.parent)[:-keep]:
         shutil.rmtree(old, ignore_errors=True)
     return final

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import shutil
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,12 +14,11 @@ import torch
 import torch.nn.functional as F
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
+from blinkgl.io.atomic import atomic_folder, output_errors
 from blinkgl.io.flow import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
 from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.sequence_files.sequence_dir import refuse_existing
 from blinkgl.types.events import Events
 from eflow.data.representation import VoxelGrid
 from eflow.data.window import Window
@@ -365,12 +364,10 @@ class FlowWriter:
         self._lines = ["# from_timestamp_us, to_timestamp_us"]
 
     def __enter__(self) -> FlowWriter:
-        refuse_existing(self.final)
-        with output_errors(self.final):
-            self.final.parent.mkdir(parents=True, exist_ok=True)
-            remove_stale(self.final.parent)
-            self._tmp = temporary_beside(self.final)
-            self._tmp.mkdir()
+        with contextlib.ExitStack() as opened:
+            self._tmp = opened.enter_context(atomic_folder(self.final))
+            opened.push(self._finish)
+            self._opened = opened.pop_all()
         return self
 
     def add(
@@ -403,18 +400,13 @@ class FlowWriter:
         (self._tmp / folder).mkdir(exist_ok=True)
         return self._tmp / folder / name
 
-    def __exit__(self, kind, *_) -> None:
-        try:
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             with output_errors(self.final):
-                if kind is None:
-                    (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
-                    refuse_existing(self.final)
-                    os.rename(self._tmp, self.final)
-        except BaseException:
-            if kind is None:  # otherwise the first error is reported
-                raise
-        finally:
-            shutil.rmtree(self._tmp, ignore_errors=True)
+                (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
+
+    def __exit__(self, *error) -> bool | None:
+        return self._opened.__exit__(*error)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -441,7 +433,7 @@ def doubts(events: Events, height: int, width: int) -> list[str]:
         found.append(
             f"{rate:.2g} events per second and pixel; cameras give 0.05 to 1000. Are the times {other}, instead of µs?"
         )
-    counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=height * width)
+    counts = np.bincount(events.pixel(width), minlength=height * width)
     few = max(round(FEW * counts.size), 1)
     share = np.partition(counts, -few)[-few:].sum() / len(events)
     if share > FLOOD:

@@ -1,5 +1,5 @@
 #version 430 core
-// The pass of the shader debugger (blinkgl/shader_debugger): the primitive that wrote the pixel, and the place on it.
+// The pass of the shader debugger (tools/shader_debugger): the primitive that wrote the pixel, and the place on it.
 // Generation does not use it. It repeats the vertex stage of luminance.glsl and label.glsl, so that it covers the same
 // fragments. Those programs show their own lookups and intermediate values: see include/lookup.glsl.
 //

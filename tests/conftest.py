@@ -38,7 +38,7 @@ class _Lender:
         "blinkgl.dataset.work",
         "blinkgl.dataset.deep",
         "blinkgl.sequence.simulate",
-        "blinkgl.trade.run",
+        "blinkgl.tools.trade.run",
     )
 
     def __init__(self):

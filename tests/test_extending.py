@@ -1,4 +1,4 @@
-"""The code of docs/extending.md runs as it stands. Emulators and labels have a file of their own, test_seams.py."""
+"""The code of docs/extending.md runs as it stands. Parts of one's own are in test_plugins.py."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
 import pytest
 
-from blinkgl import AssetError, EventDataError, Events
-from blinkgl.io.formats import EventFile
+from blinkgl import EventDataError
 
 PAGE = (Path(__file__).parents[1] / "docs/extending.md").read_text(encoding="utf-8")
 
@@ -32,30 +30,6 @@ def code(tmp_path, monkeypatch):
         return made
 
     return module
-
-
-def test_a_file_format(code, tmp_path):
-    made = code("A file format of events")
-    rng = np.random.default_rng(0)
-    events = Events(
-        rng.integers(0, 64, 3000).astype(np.uint16),
-        rng.integers(0, 48, 3000).astype(np.uint16),
-        np.sort(rng.integers(0, 10**6, 3000)),
-        rng.integers(0, 2, 3000).astype(np.uint8),
-    )
-    path = tmp_path / "e.nine"
-    for recording in (events, Events.empty()):
-        writer = made.NineWriter(path, 48, 64)
-        for i in range(0, len(recording), 1000):
-            writer.append(Events(*(getattr(recording, k)[i : i + 1000] for k in "xytp")))
-        writer.close()
-        reader = made.NineReader(path)
-        file = EventFile(path, "nine", reader.height, reader.width, _reader=reader)
-        assert (file.height, file.width) == (48, 64)
-        assert all(np.array_equal(getattr(file.read(), k), getattr(recording, k)) for k in "xytp")
-    path.write_bytes(path.read_bytes() + b"x")
-    with pytest.raises(AssetError, match="truncated"):
-        made.NineReader(path)
 
 
 def test_a_network(code):

@@ -25,6 +25,8 @@ PACKAGES = {
     "eflow": "eflow",
     "shaders": "blinkgl/shaders",
     "configs": "blinkgl/configs",
+    "tools/shader_debugger": "blinkgl/tools/shader_debugger",
+    "tools/trade": "blinkgl/tools/trade",
 }
 URL = "https://here.invalid/blinkgl"
 NETWORK = ("model.safetensors", "card.yaml")
@@ -53,7 +55,12 @@ def source(tmp_path_factory):
     for name in ("setup.cfg", "setup.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, copy)
     for name in (*PACKAGES, "tools"):
-        shutil.copytree(REPOSITORY / name, copy / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
+        shutil.copytree(
+            REPOSITORY / name,
+            copy / name,
+            dirs_exist_ok=True,
+            ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"),
+        )
     return copy
 
 
@@ -145,7 +152,9 @@ def test_wheel(source, tmp_path):
     assert not relative and f"({URL}/raw/HEAD/docs/images/demo.jpg)" in metadata
     missing = (expected_files() | {f"eflow/weights/toy/{name}" for name in NETWORK}) - names
     assert not missing, f"not in the wheel (packages and package_data in setup.cfg): {sorted(missing)}"
-    assert not [name for name in names if name.startswith(("tests/", "docs/", "blinkgl/tools"))]
+    assert not [name for name in names if name.startswith(("tests/", "docs/"))]
+    programs = [name for name in names if name.startswith("blinkgl/tools/") and name.count("/") == 2]
+    assert programs == ["blinkgl/tools/__init__.py"], "what only developers run"
     assert any(name.endswith("LICENSE") for name in names)
     bin_ = fresh_environment(tmp_path / "venv")
     run(

@@ -2,25 +2,17 @@
 
 import json
 import os
-import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from tiny_recipe import TINY
 
-PAGE = (Path(__file__).parents[1] / "docs/extending.md").read_text(encoding="utf-8")
+from blinkgl import open_events
 
-
-def toy(folder: Path) -> Path:
-    """The emulator of docs/extending.md, as a file."""
-    section = PAGE.partition("\n## An emulator\n")[2].partition("\n## ")[0]
-    path = folder / "mine.py"
-    path.write_text(re.search(r"```python\n(.*?)```", section, re.S)[1])
-    return path
+MINE = Path(__file__).parents[1] / "examples/plugins"
 
 
 def command(folder: Path, *words: str) -> tuple[int, str]:
@@ -31,26 +23,60 @@ def command(folder: Path, *words: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def test_an_emulator_of_ones_own_reaches_everything(tmp_path):
-    toy(tmp_path)
-    recipe = {**TINY, "events": {"emulator": "toy"}, "output": {"split": "train", "sequences": 2}}
-    (tmp_path / "run.yaml").write_text(yaml.safe_dump(recipe))
-    np.save(tmp_path / "frames.npy", (np.random.default_rng(0).random((6, 24, 32)) * 255).astype(np.uint8))
-    status, said = command(tmp_path, "generate", "run.yaml", "--out", "set")
+def test_four_parts_of_ones_own_reach_everything(tmp_path):
+    """The file of docs/extending.md: emulator, label, primitive and event format, in commands, workers and verify."""
+    shutil.copy(MINE / "mine.py", tmp_path)
+    small = ["--set", "camera.width=48", "--set", "camera.height=36", "--set", "output.sequences=2"]
+    run = ["generate", str(MINE / "mine.yaml"), "--out", "set", *small]
+    status, said = command(tmp_path, *run)
     assert status == 2 and "unknown" in said and not (tmp_path / "set").exists()
-    status, said = command(tmp_path, "--plugin", "mine.py", "generate", "run.yaml", "--out", "set", "--workers", "2")
+    status, said = command(tmp_path, "--plugin", "mine.py", *run, "--workers", "2")
     assert status == 0, said
-    (manifest, _) = sorted((tmp_path / "set").glob("*/*/manifest.json"))
-    versions = json.loads(manifest.read_text())["versions"]
-    assert len(versions["plug-in mine"]) == 16
-    assert command(tmp_path, "--plugin", "mine.py", "verify", "set", "--deep")[0] == 0
+    (folder, _) = sorted(path.parent for path in (tmp_path / "set").glob("*/*/manifest.json"))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["emulator"] == "toy" and len(manifest["versions"]["plug-in mine"]) == 16
+    height = np.load(min((folder / "height").glob("*.npy")))
+    assert 0.5 < height.max() < 0.6001 and height.min() == 0, "of the ramp, world units"
+    status, said = command(tmp_path, "--plugin", "mine.py", "verify", "set", "--deep")
+    assert status == 0 and "serializ" not in said, said
     status, said = command(tmp_path, "verify", "set")
     assert status == 2 and "made with the plug-in mine (sha256" in said and "--plugin FILE" in said
+    converts = ["--plugin", "mine.py", "convert"]
+    assert command(tmp_path, *converts, str(folder / "events.h5"), "e.nine")[0] == 0
+    assert command(tmp_path, *converts, "e.nine", "back.h5")[0] == 0
+    there, here = (open_events(path).read() for path in (folder / "events.h5", tmp_path / "back.h5"))
+    assert len(there) > 300 and all(np.array_equal(getattr(there, k), getattr(here, k)) for k in "xytp")
+    (tmp_path / "e.nine").write_bytes((tmp_path / "e.nine").read_bytes() + b"x")
+    status, said = command(tmp_path, *converts, "e.nine", "back.h5")
+    assert status == 2 and "truncated" in said
     (tmp_path / "mine.py").write_text((tmp_path / "mine.py").read_text() + "\n# another\n")
     status, said = command(tmp_path, "--plugin", "mine.py", "verify", "set")
     assert status == 2 and "which differs here" in said
-    simulate = ["--plugin", "mine.py", "simulate", "frames.npy", "--fps", "30", "--emulator", "toy", "-o", "e.h5"]
-    assert command(tmp_path, *simulate)[0] == 0 and (tmp_path / "e.h5").is_file()
+    np.save(tmp_path / "frames.npy", (np.random.default_rng(0).random((6, 24, 32)) * 255).astype(np.uint8))
+    simulate = ["--plugin", "mine.py", "simulate", "frames.npy", "--fps", "30", "--emulator", "toy", "-o", "s.nine"]
+    assert command(tmp_path, *simulate)[0] == 0
+
+
+def test_a_label_of_ones_own_agrees_with_its_reference(tmp_path):
+    here = ["--plugin", str(MINE / "mine.py"), "shader", "diff", str(MINE / "mine.yaml"), "--time", "0.1"]
+    status, said = command(tmp_path, *here, "--pass", "height", "--out", "diff")
+    assert status == 0 and "agrees with the reference" in said
+
+
+def test_nodes_of_ray_load_the_file(tmp_path):
+    pytest.importorskip("ray")
+    small = ["--set", "camera.width=48", "--set", "camera.height=36", "--num", "2", "--workers", "2"]
+    words = ["generate", str(MINE / "mine.yaml"), "--out", "set", *small, "--executor", "ray"]
+    status, said = command(tmp_path, "--plugin", str(MINE / "mine.py"), *words)
+    assert status == 0, said
+
+
+EMULATOR = (
+    "from blinkgl.events import register\nfrom blinkgl.events.esim import Esim\nclass Other(Esim): ...\nregister(Other)"
+)
+FORMAT = "from blinkgl.io.formats import FORMATS, register\nregister(FORMATS['evt3'])"
+PRIMITIVE = "from blinkgl.scene.geometry.primitives import register\n@register\ndef cuboid(a: float = 1.0): ..."
+LAYOUT = "from blinkgl.layouts.export import LAYOUTS, register\nregister(LAYOUTS['dsec'])"
 
 
 @pytest.mark.parametrize(
@@ -59,11 +85,15 @@ def test_an_emulator_of_ones_own_reaches_everything(tmp_path):
         (None, "--plugin: no such file (got "),
         ("1 / 0", "mine.py: the plug-in fails (got 'ZeroDivisionError: division by zero')"),
         ("def", "mine.py: the plug-in fails (got 'SyntaxError: "),
-        ("TWICE", "TypeError: emulator 'toy': there is one already, Toy"),
+        ("import mine_again", "ModuleNotFoundError"),
+        (EMULATOR, "TypeError: emulator 'esim': there is one already, Esim"),
+        (FORMAT, "TypeError: event format 'evt3': there is one already"),
+        (PRIMITIVE, "TypeError: primitive 'cuboid': there is one already"),
+        (LAYOUT, "TypeError: layout 'dsec': there is one already"),
     ],
 )
 def test_one_that_cannot_be_loaded_is_a_line(tmp_path, text, said):
     if text is not None:
-        (tmp_path / "mine.py").write_text(text.replace("TWICE", 2 * (toy(tmp_path).read_text() + "\n")))
+        (tmp_path / "mine.py").write_text(text)
     status, line = command(tmp_path, "--plugin", "mine.py", "configs")
     assert status == 2 and said in line and line.startswith("error: ") and line.count("\n") == 1

@@ -21,9 +21,9 @@ from blinkgl.config.run import load_run
 from blinkgl.gl import create_context
 from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench
-from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
+from blinkgl.tools.shader_debugger import reference
 
 REQUEST = LabelRequest(
     "depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward"

@@ -10,11 +10,10 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
+from importlib import import_module
+from importlib.metadata import distribution
 
 import typer
-
-from blinkgl.cli import app as blinkgl_app
-from eflow.cli import app as eflow_app
 
 HEADER = """# Commands
 
@@ -32,8 +31,9 @@ REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 
 
 def page() -> str:
-    """The page as Markdown."""
-    roots = (("blinkgl", blinkgl_app), ("eflow", eflow_app))
+    """The page as Markdown, of the commands that the package installs."""
+    scripts = distribution("blinkgl").entry_points.select(group="console_scripts")
+    roots = [(script.name, import_module(script.module).app) for script in sorted(scripts)]
     commands = [found for root, app in roots for found in _commands(root, typer.main.get_command(app))]
     rows = {name: _rows(name, command) for name, command in commands}
     count = Counter(row for found in rows.values() for row in found)

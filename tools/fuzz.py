@@ -47,10 +47,9 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.flow import read_flo, read_flow_png, write_flo, write_flow_png
+from blinkgl.io.flow import read_flo, read_flow_png, write_flow
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import Declared, open_frames
-from blinkgl.io.images import write_pfm
 from blinkgl.io.reading import EventReading
 from blinkgl.io.records import sealed
 from blinkgl.layouts import export_layout
@@ -185,7 +184,7 @@ def _picture() -> np.ndarray:
 def _write_picture(path: Path) -> None:
     for file in (path, path.with_stem("1")):
         if path.suffix == ".pfm":
-            write_pfm(file, _picture().astype(np.float32) / 255)
+            cv2.imwrite(str(file), _picture().astype(np.float32) / 255)
         else:
             cv2.imwrite(str(file), _picture())
 
@@ -287,8 +286,8 @@ FORMATS = {
     "rows.hdf5": _events_as(_rows),
     "gzip.h5": _events_as(_h5({"compression": "gzip", "shuffle": True}, {"compression": "lzf"})),
     "zstd.h5": _events_as(_h5(dict(hdf5plugin.Zstd()), dict(hdf5plugin.LZ4()), dict(hdf5plugin.Blosc()))),
-    "flow.png": Format(lambda path: write_flow_png(path, *_flow()), lambda path: _sound(*read_flow_png(path))),
-    "flow.flo": Format(lambda path: write_flo(path, *_flow()), lambda path: _sound(*read_flo(path))),
+    "flow.png": Format(lambda path: write_flow(path, *_flow()), lambda path: _sound(*read_flow_png(path))),
+    "flow.flo": Format(lambda path: write_flow(path, *_flow()), lambda path: _sound(*read_flo(path))),
     **{f"0.{ending}": FRAMES for ending in ("png", "jpg", "tiff", "pfm", "hdr")},
     "frames.npy": Format(lambda path: np.save(path, np.stack([_picture()] * 2)), _read_frames),
     **{f"mesh.{ending}": MESH for ending in ("obj", "ply", "stl", "glb")},

@@ -7,7 +7,7 @@ measurement beside them.
 
 NAME is a setting of the suite. What the choice does not hold to (nothing beats it in three quarters of the scenes, and
 nowhere else by more than a tenth; `fast` is nowhere worse than 2 px without filtering) is printed, and written into
-its file. tests/trade/test_suite.py checks the result.
+its file. tests/tools/trade/test_suite.py checks the result.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from blinkgl.config.quality import QUALITIES
 from blinkgl.config.reader import apply_overrides, to_yaml
 from blinkgl.config.run import RunTemplate
-from blinkgl.trade.settings import excess, suite_design
+from blinkgl.tools.trade.settings import excess, suite_design
 
 KEPT = (
     "name",

@@ -113,6 +113,8 @@ def build(root: Path, out: Path) -> None:
                 shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
             else:
                 shutil.copy(source, target)
+        # Where the documentation of a module is looked for: the package lies in two places.
+        shutil.copytree(root / "tools", copy / "blinkgl/tools", ignore=shutil.ignore_patterns("__pycache__"))
         (copy / "docs/changelog.md").write_text(changelog(copy), encoding="utf-8")
         moved = moved_places((copy / "docs" / MOVED).read_text(encoding="utf-8"))
         (copy / "docs" / MOVED).unlink()

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl.errors import BlinkGLError
+from blinkgl.machine.closing import Closing
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 REMEDY = (
@@ -70,7 +71,7 @@ def environment(home: Path) -> dict[str, str]:
     return given
 
 
-class Blender:
+class Blender(Closing):
     """One process that runs ``program`` (a file, or a folder with a __main__.py) with ``folder`` as its argument.
 
     limit_s : seconds that it may take in total; None: no limit.
@@ -93,12 +94,6 @@ class Blender:
             stderr=self._log,
             start_new_session=True,
         )
-
-    def __enter__(self) -> Blender:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the process and its children."""

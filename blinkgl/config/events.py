@@ -402,9 +402,15 @@ class VoltmeterConfig(EmulatorConfig):
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> dict[str, Any]:
-        """Return the constants of the nearest calibrated camera, with the gain that gives the sensor's threshold."""
+        """Return the constants of the nearest calibrated camera, with the sensor's threshold and noise.
+
+        The leak is the drift k4 of a still pixel, as the preset's is of one camera in one light; unknown, it is V2E's.
+        In the dark only k6 diffuses: mean time to leave (-1, 1) is 1/k6^2, so the noise rate gives k6."""
         gain = None if sensor.contrast_threshold is None else 1 / sensor.contrast_threshold
-        return {"preset": "DVS346", "refractory_us": sensor.refractory_us, "k1": gain}
+        leak = V2eConfig.model_fields["leak_rate_hz"].default if sensor.leak_rate_hz is None else sensor.leak_rate_hz
+        noise = None if sensor.shot_noise_rate_hz is None else (sensor.shot_noise_rate_hz * 1e-6) ** 0.5
+        common = {"preset": "DVS346", "refractory_us": sensor.refractory_us, "k1": gain}
+        return {**common, "k4": leak * 1e-6, "k5": 0.0, "k6": noise}
 
 
 EmulatorConfig.members |= {"esim": EsimConfig, "v2e": V2eConfig, "voltmeter": VoltmeterConfig}

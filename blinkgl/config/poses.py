@@ -51,7 +51,7 @@ def rigid_matrix(matrix: Any) -> np.ndarray:
 
 
 @rule("quaternion")
-def SOME_ROTATION(quaternion: tuple[float, ...] | None) -> None:
+def some_rotation(quaternion: tuple[float, ...] | None) -> None:
     """A rule of the key ``quaternion``."""
     if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
         raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
@@ -75,7 +75,7 @@ class PoseConfig(Config):
         if len(given) > 1:
             raise Refused("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
 
-    _some_rotation = SOME_ROTATION
+    _some_rotation = some_rotation
 
     @rule("look_at", "position")
     def _some_direction(look_at, position):

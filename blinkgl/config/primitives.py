@@ -6,7 +6,8 @@ A new kind needs a row here and a builder in ``scene/geometry`` (docs/extending.
 from __future__ import annotations
 
 import zlib
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 
 class PrimitiveKind(NamedTuple):
@@ -48,3 +49,8 @@ def seed_of(name: str) -> int:
     """Return the seed of a kind's random shapes; adding another kind does not change it."""
     seed = PRIMITIVES[name].seed
     return zlib.crc32(name.encode()) if seed is None else seed
+
+
+def or_registered(value: Any, validate: Callable[[Any], Any]) -> Any:
+    """Accept a kind that a plug-in registered beside those that ``validate`` knows."""
+    return value if isinstance(value, str) and value in PRIMITIVES else validate(value)

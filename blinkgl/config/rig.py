@@ -28,7 +28,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.over_time import ImuConfig, TracksConfig
-from blinkgl.config.poses import SOME_ROTATION, Matrix, check_rigid, rigid_matrix
+from blinkgl.config.poses import Matrix, check_rigid, rigid_matrix, some_rotation
 from blinkgl.config.reader import merge, shipped
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import Sensor
@@ -65,7 +65,7 @@ class PlaceConfig(Config):
         if matrix is not None and any(position):
             raise Refused("the matrix contains the position", where="position", value=list(position))
 
-    _some_rotation = SOME_ROTATION
+    _some_rotation = some_rotation
 
     @rule("matrix")
     def _rigid(matrix):

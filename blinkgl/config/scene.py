@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WrapValidator
 
 from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
@@ -17,7 +17,7 @@ from blinkgl.config.lights import FOG, FogConfig, LightConfig, RandomLightsConfi
 from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, TextureKind
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.poses import KeyedMotionConfig, WayConfig
-from blinkgl.config.primitives import PRIMITIVES, kinds
+from blinkgl.config.primitives import PRIMITIVES, kinds, or_registered
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 from blinkgl.config.values import (
     Fraction,
@@ -31,7 +31,8 @@ from blinkgl.config.values import (
     word_or_list,
 )
 
-POOLED, ALL_PRIMITIVES = kinds("pool", "living"), tuple(PRIMITIVES)
+POOLED = kinds("pool", "living")
+_Primitive = Literal[tuple(PRIMITIVES)]  # type: ignore[invalid-literal]
 
 
 class ObjectsConfig(Config):
@@ -222,7 +223,7 @@ class RandomSceneConfig(Config):
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Literal[ALL_PRIMITIVES] | None = Field(  # type: ignore[invalid-literal]
+    primitive: Annotated[_Primitive, WrapValidator(or_registered), PlainSerializer(str)] | None = Field(
         None, description="kind of primitive"
     )
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(parameter_value)]] = Field(

@@ -21,6 +21,7 @@ from blinkgl.dataset.work import Job, Maker, environment_differences, thread_env
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 from blinkgl.machine.extras import install
+from blinkgl.machine.plugins import load_plugins, plugin_files
 
 _HELLO_S = 600.0
 _STOP_S = 15.0
@@ -67,7 +68,7 @@ class RayCluster:
         nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
         if not nodes:
             raise ConfigError("the cluster has no node with a CPU", where="--address", value=self._address)
-        self._job = ray.put(job.to_dict())
+        self._job = ray.put((job.to_dict(), plugin_files()))
         # A node that joins later is compared by its first task.
         hellos = [self._ask(node) for node in nodes]
         self._expected = hellos[0]["environment"], hellos[0]["assets"]
@@ -249,7 +250,7 @@ class _Board:
 _maker: Maker | None = None  # of this worker process: Ray gives it one task after another
 
 
-def _open(job: dict[str, Any]) -> tuple[Maker, Message]:
+def _open(job: dict[str, Any], plugins: list[str]) -> tuple[Maker, Message]:
     global _maker
     import numba
     import ray
@@ -260,6 +261,7 @@ def _open(job: dict[str, Any]) -> tuple[Maker, Message]:
     if _maker is not None:
         _maker.__exit__()
         _maker = None
+    load_plugins(plugins)
     made = Maker(Job(**job), _egl_device(ray.get_gpu_ids()))
     hello = made.open()
     _maker = made
@@ -275,17 +277,19 @@ def _egl_device(gpu_ids: list) -> int | None:
     return cards[int(gpu_ids[0])] if int(gpu_ids[0]) < len(cards) else None
 
 
-def _hello(job: dict[str, Any]) -> Message:
+def _hello(job: tuple[dict[str, Any], list[str]]) -> Message:
     try:
-        return _open(job)[1]
+        return _open(*job)[1]
     except BlinkGLError as error:
         return {"kind": "refused", "error": str(error)}
 
 
-def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str, str], str], board: Any) -> Message:
+def _work(
+    job: tuple[dict[str, Any], list[str]], task: int, attempt: int, expected: tuple[dict[str, str], str], board: Any
+) -> Message:
     try:
-        if _maker is None or _maker.job.to_dict() != job:
-            _, hello = _open(job)
+        if _maker is None or _maker.job.to_dict() != job[0]:
+            _, hello = _open(*job)
             if different := environment_differences(hello["environment"], expected[0]):
                 return {
                     "kind": "refused",

@@ -27,6 +27,16 @@ def _select(condition, a, b):
     return lambda condition, a, b: a if condition else b
 
 
+def bits_f64(v: float) -> int:
+    """Return the bits of float64 numbers, int64."""
+    return np.asarray(v, np.float64).view(np.int64)
+
+
+@overload(bits_f64)
+def _bits_f64(v):
+    return lambda v: np.float64(v).view(np.int64)
+
+
 # --- natural logarithm in 32-bit fixed point -------------------------------------------------------------
 Q = 25
 """Fraction bits of fixed-point log intensity: resolution 2^-25 = 3.0e-8, range +-64."""
@@ -141,6 +151,7 @@ def exp_f32(v: float) -> float:
 
 
 # --- double precision ------------------------------------------------------------------------------------
+# Integers become float64 by arithmetic: of an array of one, np.float64 makes a scalar before NumPy 2.4.
 _D1, _D2, _HALF = _D(1.0), _D(2.0), _D(0.5)
 # The bit pattern of sqrt(1/2) in float64, whose fraction has 52 bits.
 _SQRT_HALF_BITS_64, _EXP52, _LN2_64 = _L(0x3FE6A09E667F3BCD), _L(52), _D(np.log(2.0))
@@ -162,7 +173,7 @@ _B0, _B1, _B2, _B3, _B4, _B5, _B6 = (
 @register_jitable
 def log_f64(v: float) -> float:
     """Return ln(v), float64, v normal and positive; error < 4e-16 (1 + |ln v|)."""
-    bits = _D(v).view(np.int64)
+    bits = bits_f64(v)
     exponent = _L(_L(bits - _SQRT_HALF_BITS_64) >> _EXP52)
     m = _L(bits - _L(exponent << _EXP52)).view(np.float64)
     # ln m = 2 artanh(s) = 2 s + s^3 p(s^2): odd, so half as many terms.
@@ -174,7 +185,7 @@ def log_f64(v: float) -> float:
     p = p * z + _B2
     p = p * z + _B1
     p = p * z + _B0
-    return _D(exponent) * _LN2_64 + (_D2 * s + s * z * p)
+    return exponent * _LN2_64 + (_D2 * s + s * z * p)
 
 
 # log2(e), and ln 2 in two parts, the first with zeros at its end.
@@ -240,7 +251,7 @@ def fall_f64(x: float) -> float:
     t = select(x <= _HALF, _ROUND_64, v * _LOG2E_64 + _ROUND_64)
     n = t - _ROUND_64
     p = _exp_reduced((v - n * _LN2_HI_64) - n * _LN2_LO_64)
-    return p * _L((_D(t).view(np.int64) + _BIAS_64) << _EXP52).view(np.float64)
+    return p * _L((bits_f64(t) + _BIAS_64) << _EXP52).view(np.float64)
 
 
 # sin(pi/2 f) = f (s0 + s1 f^2 + ...) for |f| <= 1/2.
@@ -296,8 +307,8 @@ def cos_sin_turn(u: float) -> tuple[float, float]:
     c = c * z + _C1
     c = c * z + _C0
     # In odd quadrants sine and cosine of the rest are exchanged.
-    odd = _D(quadrant & _L1)  # blends rather than branches: exact, since odd is 0 or 1
+    odd = (quadrant & _L1) * _D1  # blends rather than branches: exact, since odd is 0 or 1
     # The cosine is negative in quadrants 1 and 2, the sine in 2 and 3.
-    cos_sign = _D1 - _D2 * _D(((quadrant + _L1) & _L2) >> _L1)
-    sin_sign = _D1 - _D2 * _D((quadrant & _L2) >> _L1)
+    cos_sign = _D1 - _D2 * (((quadrant + _L1) & _L2) >> _L1)
+    sin_sign = _D1 - _D2 * ((quadrant & _L2) >> _L1)
     return cos_sign * (c * (_D1 - odd) + s * odd), sin_sign * (s * (_D1 - odd) + c * odd)

@@ -69,7 +69,7 @@ def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, flo
     it)."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
     # The upper 53 of 64 bits, and a half: 0 and 1 cannot occur.
-    return (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53, (_D(((w3 << _S32) | w2) >> _S11) + _HALF) * _ULP53
+    return ((((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53, ((((w3 << _S32) | w2) >> _S11) + _HALF) * _ULP53
 
 
 @register_jitable
@@ -92,7 +92,7 @@ def rough_normal(seed: int, pixel: int, stream: int, index: int) -> float:
     of a normal, for jitters whose exact law has not been measured."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
     # Four uniforms of variance 1/12; their mean, 2 - 2^-31, is subtracted, and sqrt(3) makes the variance 1.
-    return (_D(w0 + w1 + w2 + w3) * _ULP32 + (_TWO * _ULP32 - _TWO)) * _THREE_ROOT
+    return ((w0 + w1 + w2 + w3) * _ULP32 + (_TWO * _ULP32 - _TWO)) * _THREE_ROOT
 
 
 @register_jitable
@@ -101,10 +101,10 @@ def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple
     block."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
     # Words 0 and 1 give the 53 bits of the radius, word 2 the angle, word 3 the spare uniform.
-    u = (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
-    c, s = cos_sin_turn((_D(w2) + _HALF) * _ULP32)
+    u = ((((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
+    c, s = cos_sin_turn((w2 + _HALF) * _ULP32)
     radius = np.sqrt(_MINUS2 * log_f64(u))
-    return radius * c, radius * s, (_D(w3) + _HALF) * _ULP32
+    return radius * c, radius * s, (w3 + _HALF) * _ULP32
 
 
 def pixel_counters(height: int, width: int) -> np.ndarray:

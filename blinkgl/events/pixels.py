@@ -75,7 +75,7 @@ class PixelNoise:
         """Return ``events`` without those of dead pixels, with the noise up to ``until_us`` (that microsecond
         included); within a microsecond the noise comes last. Noise begins with the first step."""
         if self.dead.any() and len(events):
-            events = events.part(~self.dead[events.y.astype(np.int64) * self._width + events.x])
+            events = events.part(~self.dead[events.pixel(self._width)])
         # No pixel has noise.
         if not (self._sums.size and self._sums[-1] > 0):
             return events
@@ -90,7 +90,7 @@ class PixelNoise:
         count = int(np.searchsorted(self._drawn.t, until_us, side="right"))
         own, self._drawn = self._drawn.part(slice(count)), self._drawn.part(slice(count, None))
         if self._last is not None:
-            pixel = own.y.astype(np.int64) * self._width + own.x
+            pixel = own.pixel(self._width)
             own = own.part(_awake(pixel, own.t, self.config.refractory_us, self._last))
         if not len(own):
             return events

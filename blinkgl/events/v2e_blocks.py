@@ -205,6 +205,7 @@ _LEAK_JITTER = _U(Stream.LEAK_JITTER)
 _CAUSE_LEAK, _CAUSE_SHOT, _CAUSE_HOT = int(Cause.LEAK), int(Cause.SHOT), int(Cause.HOT)
 _INF = np.float32(np.inf)
 _NEVER_NS = 2**62
+_NONE, _CROSSING, _BY_SHOT = 0, 1, 2
 _NANOSECONDS = 2**41 - 1  # bits 1 to 41 of a key: its time
 
 
@@ -231,7 +232,7 @@ def emit(
     x_before, lag_before, intensity_before, noise_before = p.x, p.lag, p.intensity, p.noise
     upper, lower, constants, leaks, release = p.upper, p.lower, p.constants, p.leak, p.release
     since, noise_at_reference, hot = p.since_ns, p.noise_then, p.hot
-    low_pass, noisy, leaking = lag_before.size > 0, noise_before.size > 0, leaks.size > 0
+    low_pass, leaking = lag_before.size > 0, leaks.size > 0
     dead_time, told = release.size > 0, since.size > 0
     intensity_now, x_now, lag_now, noise_now = now
     # Start of the interval after the microsecond base, 0 to 999 ns.
@@ -255,16 +256,13 @@ def emit(
         o = i - first
         on, off = np.float64(constants[i, 0]), np.float64(constants[i, 1])
         leak = np.float64(leaks[i]) if leaking else 0.0
-        noise, noise_change = 0.0, 0.0
-        if noisy:
-            noise = np.float64(noise_before[i])
-            noise_change = np.float64(noise_now[o]) - noise
-        x = np.float64(x_before[i])
-        dx = np.float64(x_now[o]) - x
+        noise, noise_end = _ends(noise_before, noise_now, i, o)
+        noise_change = noise_end - noise
+        x, x_end = _ends(x_before, x_now, i, o)
+        dx = x_end - x
         # k: time constants in the interval, as in v2e_model.relax; below 0 without a low-pass.
-        lag, lag_end, k = 0.0, 0.0, -1.0
+        (lag, lag_end), k = _ends(lag_before, lag_now, i, o), -1.0
         if low_pass:
-            lag, lag_end = np.float64(lag_before[i]), np.float64(lag_now[o])
             k = v.kappa * (0.5 * (np.float64(intensity_before[i]) + np.float64(intensity_now[o])) + 20.0)
         base, drift = x + noise + leak * v.since_epoch_0, noise_change + leak * dt
         c, rise, fall = curve_of(base, drift, dx, lag, k)
@@ -288,19 +286,12 @@ def emit(
             while _time_of(keys, key, o) < now_ns:
                 key += 1
             shot_ns = _time_of(keys, key, o)
-            polarity, crosses = np.int64(end >= up), end >= up or end <= down
-            if not crosses and shot_ns == _NEVER_NS:
+            kind, s, at_ns, polarity, reference = _next_event(shot_ns, dt_ns, s, c, rise, fall, k, end, up, down)
+            if kind == _NONE:
                 break
-            at_ns, reference = np.int64(0), 0.0
-            if crosses:
-                reference = up if polarity else down
-                s = crossing_fraction(s, reference, polarity, c, rise, fall, k, end)
-                at_ns = np.int64(s * dt_ns)
-            # The earlier one is the event; at the same ns that is the noise.
-            by_shot = shot_ns != _NEVER_NS and (not crosses or shot_ns <= at_ns)
+            by_shot = kind == _BY_SHOT
             if by_shot:
-                at_ns, polarity = shot_ns, keys[key] & 1
-                s = at_ns / dt_ns
+                polarity = keys[key] & 1
                 key += 1
             if emitted < cap:
                 word = bits | polarity
@@ -314,12 +305,8 @@ def emit(
             else:
                 cut += 1
             if v.leak_jitter > 0.0:
-                # The number of the draw is the event's time in ns, so that it does not depend on the frame times. The
-                # length of the next leak interval is normal around 1, at least a tenth; float32 as it is stored.
-                spread = 1.0 + v.leak_jitter * rough_normal(v.seed, _U(i), _LEAK_JITTER, _U(v.t0_ns + at_ns))
-                drawn = np.float64(np.float32(np.float64(constants[i, 2]) / max(spread, 0.1)))
                 # The reference stays; its value relative to the new drift changes.
-                change = drawn - leak
+                change = _drawn_leak(np.float64(constants[i, 2]), v.leak_jitter, v.seed, i, v.t0_ns + at_ns) - leak
                 leak += change
                 reference += change * (v.since_epoch_0 + s * dt)
                 c += change * v.since_epoch_0
@@ -346,6 +333,38 @@ def emit(
         if told:
             since[i], noise_at_reference[i] = v.t0_ns + since_ns, np.float32(noise_then)
     return out, cut
+
+
+@register_jitable
+def _ends(before, now, i, o):
+    """Return a signal of pixel ``i`` at both ends of the interval; zeros for one that the model does without."""
+    return (np.float64(before[i]), np.float64(now[o])) if before.size else (0.0, 0.0)
+
+
+@register_jitable
+def _next_event(shot_ns, dt_ns, s, c, rise, fall, k, end, up, down):
+    """Return (kind, fraction of the interval, ns from its start, polarity, level that is met) of a pixel's next event.
+
+    shot_ns : of its next shot noise, or _NEVER_NS.   s : fraction from which the signal (c, rise, fall, k; at last
+    ``end``) is compared with the levels ``up`` and ``down``."""
+    polarity, crosses = np.int64(end >= up), end >= up or end <= down
+    kind, at_ns, level = _NONE, np.int64(0), 0.0
+    if crosses:
+        kind, level = _CROSSING, up if polarity else down
+        s = crossing_fraction(s, level, polarity, c, rise, fall, k, end)
+        at_ns = np.int64(s * dt_ns)
+    # The earlier one is the event; at the same ns that is the noise.
+    if shot_ns != _NEVER_NS and (not crosses or shot_ns <= at_ns):
+        return _BY_SHOT, shot_ns / dt_ns, shot_ns, polarity, level
+    return kind, s, at_ns, polarity, level
+
+
+@register_jitable
+def _drawn_leak(nominal, jitter, seed, pixel, at_ns):
+    """Return the leak, ln units a second, until the next event. The number of the draw is the event's time, so that it
+    does not depend on the frame times; the interval is normal around 1, at least a tenth; float32 as it is stored."""
+    spread = 1.0 + jitter * rough_normal(seed, _U(pixel), _LEAK_JITTER, _U(at_ns))
+    return np.float64(np.float32(nominal / max(spread, 0.1)))
 
 
 @register_jitable

@@ -164,6 +164,30 @@ def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, l
     return cause_of(side * by_light, side * by_leak, 1.0 - side * (by_light + by_leak))
 
 
+@register_jitable
+def _passage(side, distance, toward, sigma, normal, uniform):
+    """Return the time, us, at which V passes the threshold ``distance`` away; infinity: never. side : 0 where neither
+    threshold is in reach.   toward : drift towards it, per us."""
+    # One uniform decides whether the threshold is ever met and, divided by the chance, which root the time is.
+    chance = reached(distance, toward, sigma) if side else 0.0
+    if uniform >= chance:
+        return np.inf
+    return hitting_time(distance, toward, sigma, normal, uniform if chance == 1.0 else uniform / chance)
+
+
+@register_jitable
+def _end_of_part(side, distance, mean, noise, seed, pixel, draw):
+    """Return (V at the end of a part in which no threshold is met, number of the last draw): V is drawn until it is
+    accepted, with the probability by which a Brownian bridge does not meet the threshold."""
+    stop = draw + _TRIES
+    while True:
+        draw += _U1
+        normal, _, uniform = normal2_and_uniform(seed, pixel, _DIFFUSION, draw)
+        end = mean + noise * normal
+        if side == 0 or draw >= stop or uniform >= crosses(distance, 1.0 - side * end, noise):
+            return max(min(end, NEAREST), -NEAREST), draw
+
+
 @kernel(error_model="numpy")
 def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
@@ -225,15 +249,9 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 draw += _U1
                 _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
             unused = False
-            distance, toward, fires = 1.0 - side * voltage, side * mu, False
-            # One uniform decides whether the threshold is ever met and, divided by the chance, which
-            # root the time is.
-            chance = reached(distance, toward, sigma) if side else 0.0
-            if uniform < chance:
-                which = uniform if chance == 1.0 else uniform / chance
-                after_us = hitting_time(distance, toward, sigma, normal, which)
-                fires = after_us <= part_us
-            if fires:
+            distance = 1.0 - side * voltage
+            after_us = _passage(side, distance, side * mu, sigma, normal, uniform)
+            if after_us <= part_us:
                 t_us += after_us
                 event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
                 voltage = 0.0
@@ -257,15 +275,10 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                     t_us = release_ns * 1e-3
                 since_us, light, leak = t_us, 0.0, 0.0
             else:
-                # Not met in this part: draw V at its end until it is accepted. A Brownian bridge gives the probability.
-                noise, stop = sigma * np.sqrt(part_us), draw + _TRIES
-                while True:
-                    draw += _U1
-                    normal, _, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
-                    end = voltage + mu * part_us + noise * normal
-                    if side == 0 or draw >= stop or uniform >= crosses(distance, 1.0 - side * end, noise):
-                        break
-                voltage, t_us = max(min(end, NEAREST), -NEAREST), t_us + part_us
+                # Not met in this part.
+                mean, noise = voltage + mu * part_us, sigma * np.sqrt(part_us)
+                voltage, draw = _end_of_part(side, distance, mean, noise, v.seed, np.uint64(i), draw)
+                t_us += part_us
                 if part_us == left_us or draw >= last:
                     break
         v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)

@@ -21,7 +21,9 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import CameraFrame, G, ImuSamples
+from blinkgl.io.fixed_records import read_records
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -50,7 +52,6 @@ _DVS, _PIN, _APS, _IMU = range(4)
 class Aedat2Reader:
     """A recording of a DAVIS camera; times are the file's own µs, unwrapped. height, width : px, by the chip's name, or
     as declared where the header names none (v2e's files).
-    frames_cut : frames without all of their samples (at the file's ends), known after :meth:`frames`.
 
     Raises AssetError: another magic or version, an unknown chip, a header without an end; while reading, naming the
     byte: stray bytes at the end (truncated), an address outside the sensor, decreasing times."""
@@ -70,7 +71,6 @@ class Aedat2Reader:
                 accepted=", ".join(SIZES) + ("" if chip else "; or --size WIDTHxHEIGHT"),
             )
         self.height, self.width = size
-        self.frames_cut = 0
 
     def chunks(self, records: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``records`` records at a time."""
@@ -91,7 +91,6 @@ class Aedat2Reader:
         for _, address, t in self._kind(_APS, records):
             yield from assembler.add(address, t)
         yield from assembler.end()
-        self.frames_cut = assembler.cut
 
     def imu(self) -> ImuSamples:
         """Return all complete samples. Scales are the header's (``ImuGyroScale``, ``ImuAccelScale``), or jAER's usual
@@ -122,7 +121,8 @@ class Aedat2Reader:
         that a damaged file is always refused."""
         # state: the last time, then the last time of each kind.
         state = np.full(5, -1, np.int64)
-        for first, raw in self._raw(records):
+        last = lambda count: f"record {count - 1}, at byte {self._byte(count)}"
+        for first, raw in read_records(self.path, self._start, _RECORD, records, last):
             # int64, so that shifts and differences cannot overflow.
             address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
             kinds = _kinds(address)
@@ -133,23 +133,6 @@ class Aedat2Reader:
             chosen = kinds == kind
             if chosen.any():
                 yield first, address[chosen], t[chosen]
-
-    def _raw(self, records: int) -> Iterator[tuple[int, np.ndarray]]:
-        first = 0
-        try:
-            with open(self.path, "rb") as file:
-                file.seek(self._start)
-                while data := file.read(records * _RECORD.itemsize):
-                    whole = len(data) // _RECORD.itemsize
-                    yield first, np.frombuffer(data, _RECORD, whole)
-                    first += whole
-                    if stray := len(data) - whole * _RECORD.itemsize:
-                        raise AssetError(
-                            f"truncated: {stray} stray bytes after record {first - 1}, at byte {self._byte(first)}",
-                            where=str(self.path),
-                        )
-        except OSError as error:
-            raise AssetError(f"cannot read: {error.strerror}", where=str(self.path)) from error
 
     def _byte(self, record: int) -> int:
         return self._start + record * _RECORD.itemsize
@@ -176,37 +159,25 @@ def _read_header(path: Path) -> tuple[str, int]:
     """Return the lines that begin with '#', and where they end. A record may also begin with that byte (y of 140 …
     143); but a line has no control characters, which its low bytes are, and newer files mark the end."""
     lines, size = [], 0
-    try:
-        with open(path, "rb") as file:
-            magic = file.read(len(MAGIC) + 3)
-            if not magic.startswith(MAGIC):
-                raise AssetError(
-                    "not an AEDAT file: wrong magic", where=str(path), value=magic, accepted="#!AER-DAT2.0"
-                )
-            if magic != MAGIC + b"2.0":
-                raise AssetError(
-                    "another version of AEDAT",
-                    where=str(path),
-                    value=magic[len(MAGIC) :].decode("latin-1"),
-                    accepted="2.0 (4.0 is .aedat4)",
-                )
-            file.seek(0)
-            while True:
-                start = file.tell()
-                line = file.readline(_MAX_LINE)
-                if not line.startswith(b"#") or (not line.endswith(b"\n") and len(line) < _MAX_LINE):
-                    break
-                if any(c < 32 and c not in b"\t\r\n" for c in line):
-                    break
-                size += len(line)
-                if len(line) == _MAX_LINE or size > _MAX_HEADER:
-                    raise AssetError(f"a header without an end, at byte {start}", where=str(path))
-                lines.append(line.decode("utf-8", "replace").rstrip())
-                if re.match(r"#\s*End Of ASCII Header", lines[-1], re.I):
-                    start = file.tell()
-                    break
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    with input_errors(path), open(path, "rb") as file:
+        magic = file.read(len(MAGIC) + 3)
+        if not magic.startswith(MAGIC):
+            raise AssetError("not an AEDAT file: wrong magic", where=str(path), value=magic, accepted="#!AER-DAT2.0")
+        if magic != MAGIC + b"2.0":
+            version, accepted = magic[len(MAGIC) :].decode("latin-1"), "2.0 (4.0 is .aedat4)"
+            raise AssetError("another version of AEDAT", where=str(path), value=version, accepted=accepted)
+        start = file.seek(0)
+        while (line := file.readline(_MAX_LINE)).startswith(b"#"):
+            cut = not line.endswith(b"\n") and len(line) < _MAX_LINE
+            if cut or any(c < 32 and c not in b"\t\r\n" for c in line):
+                break
+            size += len(line)
+            if len(line) == _MAX_LINE or size > _MAX_HEADER:
+                raise AssetError(f"a header without an end, at byte {start}", where=str(path))
+            lines.append(line.decode("utf-8", "replace").rstrip())
+            start = file.tell()
+            if re.match(r"#\s*End Of ASCII Header", lines[-1], re.I):
+                break
     return "\n".join(lines), start
 
 
@@ -254,10 +225,10 @@ def _unwrap(address, kinds, stamp, state, height, width, keep, t):
 
 
 class _Frames:
-    """Assembles frames from frame samples, in their order. cut : frames without all of their samples."""
+    """Assembles frames from frame samples, in their order. Those without all of their samples are left out."""
 
     def __init__(self, height: int, width: int):
-        self._shape, self.cut = (height, width), 0
+        self._shape = height, width
         self._clear()
 
     def _clear(self) -> None:
@@ -276,15 +247,12 @@ class _Frames:
         """Yield the frame so far, if it is one."""
         # A frame is complete where each pixel that was reset has also been read, in a rectangle.
         read, there = self._signal >= 0, self._reset >= 0
-        if read.any() or there.any():
-            if read.any() and np.array_equal(read, there) and _rectangular(read):
-                image = np.where(read, np.maximum(self._reset - self._signal, 0), 0).astype(np.uint16)
-                first, last, signal = self._times.tolist()
-                # A global shutter resets all rows before the first is read; a rolling one does not.
-                begin = last if last <= signal else first
-                yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
-            else:
-                self.cut += 1
+        if read.any() and np.array_equal(read, there) and _rectangular(read):
+            image = np.where(read, np.maximum(self._reset - self._signal, 0), 0).astype(np.uint16)
+            first, last, signal = self._times.tolist()
+            # A global shutter resets all rows before the first is read; a rolling one does not.
+            begin = last if last <= signal else first
+            yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
         self._clear()
 
 

@@ -177,8 +177,9 @@ class Aedat4Writer(CheckedWriter):
         try:
             import dv_processing as dv
         except ImportError:
-            accepted = f"run {install('dv-processing')}"
-            raise OutputError("AEDAT4 is written by the package dv-processing", accepted=accepted) from None
+            raise OutputError(
+                "AEDAT4 is written by the package dv-processing", accepted=f"run {install('dv-processing')}"
+            ) from None
         settings = dv.io.MonoCameraWriter.EventOnlyConfig("BlinkGL", (width, height))
         self._store = dv.EventStore
         with output_errors(path):

@@ -69,7 +69,7 @@ def remove_stale(folder: Path) -> list[Path]:
         match = _PATTERN.match(path.name)
         if not match or match.group(1) != token or _alive(int(match.group(2))) or path.is_symlink():
             continue
-        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+        _remove(path)
         removed.append(path)
     return removed
 
@@ -113,61 +113,65 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
         raise OutputError("is a folder", where=str(final), accepted="a file name")
     if final.exists() and not overwrite:
         raise OutputError("output file exists", where=str(final), accepted="a new name, or --overwrite")
+    with _appearing(final) as temporary:
+        yield temporary
+        with output_errors(final):
+            fsync(temporary)
+            os.replace(temporary, final)
+            fsync(final.parent)
+
+
+@contextlib.contextmanager
+def _appearing(final: Path) -> Iterator[Path]:
+    """Give a hidden name beside ``final``, whose folder is made. What is there is deleted on any exception, and one
+    that names it names ``final`` instead."""
     with output_errors(final):
         final.parent.mkdir(parents=True, exist_ok=True)
         remove_stale(final.parent)
     temporary = temporary_beside(final)
     try:
         yield temporary  # the format's own writer converts its errors; reading errors of the body are not handled here
-        with output_errors(final):
-            fsync(temporary)
-            os.replace(temporary, final)
-            fsync(final.parent)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if (named := _named(error, temporary, final)) is not None:
-            raise named from error
-        raise
+        _remove(temporary)
+        if not isinstance(error, BlinkGLError) or str(temporary) not in (error.where or ""):
+            raise
+        raise type(error)(
+            error.problem,
+            where=(error.where or "").replace(str(temporary), str(final)),
+            value=error.value,
+            accepted=error.accepted,
+        ) from error
 
 
-def _named(error: BaseException, temporary: Path, final: Path) -> BlinkGLError | None:
-    """Return an error that names the output, where it names the hidden one; None: it does not."""
-    if not isinstance(error, BlinkGLError) or str(temporary) not in (error.where or ""):
-        return None
-    where = (error.where or "").replace(str(temporary), str(final))
-    return type(error)(error.problem, where=where, value=error.value, accepted=error.accepted)
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def atomic_folder(final: str | os.PathLike) -> Iterator[Path]:
+def atomic_folder(final: str | os.PathLike, *, overwrite: bool = False) -> Iterator[Path]:
     """``with atomic_folder("out") as folder:`` write below ``folder``; it is renamed to ``out`` on success and deleted
     on any exception. The parent folder is made.
 
     Raises
     ------
-    OutputError : ``final`` exists (and is not an empty folder), or cannot be written.
+    OutputError : ``final`` exists (and is not an empty folder) and ``overwrite`` is False, or cannot be written.
     """
     final = Path(final)
-    refuse_existing(final)
-    with output_errors(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
-        remove_stale(final.parent)
-        temporary = temporary_beside(final)
-        temporary.mkdir()
-    try:
+    if not overwrite:
+        refuse_existing(final)
+    with _appearing(final) as temporary:
+        with output_errors(final):
+            temporary.mkdir()
         yield temporary
         with output_errors(final):
             for path in sorted(temporary.rglob("*"), reverse=True):  # what a folder holds comes before the folder
                 fsync(path)
             fsync(temporary)
+            if overwrite:
+                shutil.rmtree(final, ignore_errors=True)
             refuse_existing(final)
             os.rename(temporary, final)
             fsync(final.parent)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if (named := _named(error, temporary, final)) is not None:
-            raise named from error
-        raise
 
 
 def lock_folder(folder: Path) -> int | None:

@@ -14,13 +14,12 @@ and says all of the turn of such boxes alone. The .npz has the whole pose.
 
 from __future__ import annotations
 
-import io
 import os
 
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.images import NpzReader, numpy_errors
+from blinkgl.io.images import NpzReader, encoded, numpy_errors
 from blinkgl.types.boxes import SHAPES, Boxes
 
 _PARTLY, _LARGELY = 0.05, 0.5
@@ -28,9 +27,7 @@ _PARTLY, _LARGELY = 0.05, 0.5
 
 def encode_boxes(value: Boxes) -> bytes:
     """Return the bytes of the .npz; they do not depend on the clock."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **{name: getattr(value, name) for name in (*SHAPES, "resolution")})
-    return buffer.getvalue()
+    return encoded(np.savez, **{name: getattr(value, name) for name in (*SHAPES, "resolution")})
 
 
 def read_boxes(path: str | os.PathLike) -> Boxes:

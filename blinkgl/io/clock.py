@@ -6,10 +6,9 @@ One list of times has one unit. A guess is never made value by value, and :attr:
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 
@@ -79,6 +78,13 @@ def named_unit(heading: str) -> str | None:
     return _UNIT_OF.get(text) if len(text) > 1 else None
 
 
+def unit_of(declared: str | None, stated: str | None, guessed: Callable[[], TimeUnit]) -> TimeUnit:
+    """Return the unit that the user declares, else the one that the file states, else a guess."""
+    if declared is not None:
+        return TimeUnit(declared, "declared")
+    return guessed() if stated is None else TimeUnit(stated, "read")
+
+
 def guessed_frame_unit(values: np.ndarray, where: str) -> TimeUnit:
     """Return the unit in which times of frames, (N,) numbers of an unknown unit, make sense together.
 
@@ -123,11 +129,6 @@ def nanoseconds(values: Sequence[str] | np.ndarray, unit: TimeUnit) -> list[int]
             return [int(value) * scale for value in values]
         return [round(Fraction(float(value)) * scale) for value in values]
     return [round(Fraction(value) * scale) for value in values]
-
-
-def unit_of_file(path: Path) -> str | None:
-    """Return the unit that a file's name states: ``times_us.txt``."""
-    return named_unit(path.stem)
 
 
 _TYPICAL_DURATION_S, _TYPICAL_RATE_HZ = 3.0, 1e5

@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError, EventDataError, OutputError
 from blinkgl.io.atomic import output_errors
+from blinkgl.machine.closing import Finishing
 from blinkgl.types.events import Cause, Events
 
 MAX_SIDE, MAX_PIXELS = 65536, 1 << 25
@@ -154,7 +155,7 @@ def joined(pieces: Iterable[Events], least: int) -> Iterator[Events]:
         yield Events.concatenate(pending)
 
 
-class CheckedWriter:
+class CheckedWriter(Finishing):
     """Base of writers of event files: checks what it is given, counts, and closes ``_file``. A subclass has
     :meth:`_write`.
 
@@ -165,7 +166,7 @@ class CheckedWriter:
     limits: tuple[int, int, str] | None = None
 
     def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
-        self.path, self._size, self._count, self._last = Path(path), (height, width), 0, None
+        self.path, self._size, self.count, self._last = Path(path), (height, width), 0, None
         self._file: Any = None
         self.t_end_us: int | None = None
 
@@ -184,12 +185,16 @@ class CheckedWriter:
         if self.limits is not None:
             least, most, problem = self.limits
             if events.t[0] < least or events.t[-1] >= most:
-                value = int(events.t[0] if events.t[0] < least else events.t[-1])
-                raise EventDataError(problem, where=where, value=value, accepted=f"{least} to less than {most} µs")
-        self._last = check_events(events, where, self._count, height=height, width=width, after=self._last)
+                raise EventDataError(
+                    problem,
+                    where=where,
+                    value=int(events.t[0] if events.t[0] < least else events.t[-1]),
+                    accepted=f"{least} to less than {most} µs",
+                )
+        self._last = check_events(events, where, self.count, height=height, width=width, after=self._last)
         with output_errors(self.path):
             self._write(events)
-        self._count += len(events)
+        self.count += len(events)
 
     def _write(self, events: Events) -> None:
         raise NotImplementedError

@@ -12,9 +12,9 @@ import contextlib
 import os
 import queue
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import h5py
 import hdf5plugin
@@ -22,9 +22,10 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import MAX_SIDE, check_events, check_size, events_of
-from blinkgl.io.hdf5 import attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.columns import MAX_SIDE, CheckedWriter, check_events, check_size, events_of
+from blinkgl.io.hdf5 import Blocks, attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, packing, write_rows
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
 
 BLOCK = 1 << 17
@@ -36,7 +37,7 @@ _MS_PIECE = 1 << 20
 _MAX_RELATIVE_US = np.iinfo(np.uint32).max
 
 
-class DsecEventWriter:
+class DsecEventWriter(CheckedWriter):
     """Writes events of one sensor, chunk by chunk, in memory that does not grow with the sequence.
 
     Compression runs in a background thread (Blosc releases the GIL) behind a queue of a few blocks; an error
@@ -70,16 +71,10 @@ class DsecEventWriter:
                 value=(height, width),
                 accepted=f"1 to {MAX_SIDE} px a side",
             )
-        self.path, self.height, self.width, self.t_offset_us = Path(path), height, width, int(t_offset_us)
-        self.count = 0
-        self.t_end_us: int | None = None  # may be set any time before close
-        self._last_t = self.t_offset_us
-        self._codec = codec
-        # Entries of ms_to_idx written so far; events written so far; events in the block.
-        self._next_ms = 0
-        self._written = 0
-        self._fill = 0
-        self._block = _new_block(_COLUMNS)
+        super().__init__(path, height, width)
+        self.t_offset_us, self._codec = int(t_offset_us), codec
+        # Entries of ms_to_idx written so far; events written so far.
+        self._next_ms = self._written = 0
         self._error: BaseException | None = None
         self._closed = False
         with output_errors(path):
@@ -91,10 +86,11 @@ class DsecEventWriter:
             }
             self._ms_to_idx = growing_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,), codec)
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
-            # Compression runs beside the simulation; a full queue makes append wait.
             if height is not None and width is not None:
                 self._file.attrs["height"], self._file.attrs["width"] = int(height), int(width)
+        # Compression runs beside the simulation; a full queue makes append wait.
         self._queue: queue.Queue = queue.Queue(maxsize=4)
+        self._blocks = Blocks(self._columns, BLOCK, self._queue.put)
         self._thread = threading.Thread(target=self._run, name="dsec-writer", daemon=True)
         self._thread.start()
 
@@ -106,25 +102,31 @@ class DsecEventWriter:
         EventDataError : times not in order or outside the file's range, coordinates outside the sensor, polarity
             not 0 or 1. OutputError : the disk refused an earlier block.
         """
-        self._check(events)
-        if len(events):
-            self._check_causes(events)
-        self.count += len(events)
-        start = 0
-        while start < len(events):
-            # What fits into the block; a full one goes to the writer.
-            stop = min(len(events), start + BLOCK - self._fill)
-            # Relative times fit uint32, which _check has made sure of.
-            into = slice(self._fill, self._fill + stop - start)
-            for name in (name for name in self._columns if name != "t"):
-                self._block[name][into] = getattr(events, name)[start:stop]
-            np.subtract(events.t[start:stop], self.t_offset_us, out=self._block["t"][into], casting="unsafe")
-            self._fill += stop - start
-            start = stop
-            if self._fill == BLOCK:
-                self._queue.put(self._block)
-                self._block, self._fill = _new_block(self._columns), 0
+        if self._closed:
+            raise ValueError("append after close")
+        where, t = str(self.path), events.t
+        if len(t) and t[0] < self.t_offset_us:
+            raise EventDataError(
+                "event before the recording's start", where=where, value=int(t[0]), accepted=f">= {self.t_offset_us} µs"
+            )
+        if len(t) and t[-1] - self.t_offset_us > _MAX_RELATIVE_US:
+            raise EventDataError(
+                "event time beyond what DSEC's 32-bit µs can hold",
+                where=where,
+                value=int(t[-1]),
+                accepted=f"at most {self.t_offset_us + _MAX_RELATIVE_US} µs (71.6 minutes per file)",
+            )
+        super().append(events)
         self._raise_pending()
+
+    def _write(self, events: Events) -> None:
+        # All events have causes, or none: the first ones decide.
+        if self.count == 0 and events.cause is not None:
+            self._columns["cause"] = growing_dataset(self._file, "events/cause", (0,), np.uint8, (BLOCK,), self._codec)
+        if (events.cause is not None) != ("cause" in self._columns):
+            raise EventDataError("some events have causes and some do not", where=str(self.path))
+        rows = {name: getattr(events, name) for name in self._columns}
+        self._blocks.add({**rows, "t": events.t - self.t_offset_us}, len(events))
 
     def close(self, t_end_us: int | None = None) -> None:
         """Finish the file. ``t_end_us`` (image clock, exclusive) is the recording's end where it is later than the last
@@ -134,11 +136,11 @@ class DsecEventWriter:
         # The table covers the whole recording, events or not.
         t_end_us = self.t_end_us if t_end_us is None else t_end_us
         end = max(
-            self._last_t + 1 if self.count else self.t_offset_us,
+            self.t_offset_us if self._last is None else self._last + 1,
             self.t_offset_us if t_end_us is None else int(t_end_us),
         )
         try:
-            self._queue.put({k: v[: self._fill] for k, v in self._block.items()})
+            self._blocks.flush()
             self._queue.put(None)
             self._thread.join()
             self._raise_pending()
@@ -169,42 +171,6 @@ class DsecEventWriter:
         with contextlib.suppress(Exception):
             self._file.close()
 
-    def __enter__(self) -> DsecEventWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close() if kind is None else self.abort()
-
-    def _check(self, events: Events) -> None:
-        if self._closed:
-            raise ValueError("append after close")
-        if not len(events):
-            return
-        where, t = str(self.path), events.t
-        if t[0] < self.t_offset_us:
-            raise EventDataError(
-                "event before the recording's start", where=where, value=int(t[0]), accepted=f">= {self.t_offset_us} µs"
-            )
-        if t[-1] - self.t_offset_us > _MAX_RELATIVE_US:
-            raise EventDataError(
-                "event time beyond what DSEC's 32-bit µs can hold",
-                where=where,
-                value=int(t[-1]),
-                accepted=f"at most {self.t_offset_us + _MAX_RELATIVE_US} µs (71.6 minutes per file)",
-            )
-        self._last_t = check_events(events, where, self.count, height=self.height, width=self.width, after=self._last_t)
-
-    def _check_causes(self, events: Events) -> None:
-        """Check that all events have causes, or none: the first ones decide."""
-        if self.count == 0 and events.cause is not None:
-            with output_errors(self.path):
-                self._columns["cause"] = growing_dataset(
-                    self._file, "events/cause", (0,), np.uint8, (BLOCK,), self._codec
-                )
-            self._block = _new_block(self._columns)
-        if (events.cause is not None) != ("cause" in self._columns):
-            raise EventDataError("some events have causes and some do not", where=str(self.path))
-
     def _run(self) -> None:
         while (block := self._queue.get()) is not None:
             if self._error is not None:
@@ -226,11 +192,10 @@ class DsecEventWriter:
         start, stop = self._written, self._written + len(block["t"])
         for name, column in self._columns.items():
             write_rows(column, start, block[name])
-        if stop > start:
-            # Entries up to the last event's own millisecond are settled now; later ones wait for their event.
-            last_ms = int(block["t"][-1]) // 1000
-            bounds = np.arange(self._next_ms, last_ms + 1, dtype=np.int64) * 1000
-            self._store_ms(start + np.searchsorted(block["t"], bounds, side="left"))
+        # Entries up to the last event's own millisecond are settled now; later ones wait for their event.
+        last_ms = int(block["t"][-1]) // 1000
+        bounds = np.arange(self._next_ms, last_ms + 1, dtype=np.int64) * 1000
+        self._store_ms(start + np.searchsorted(block["t"], bounds, side="left"))
         self._written = stop
 
     def _store_ms(self, entries: np.ndarray) -> None:
@@ -239,11 +204,7 @@ class DsecEventWriter:
             self._next_ms += len(entries)
 
 
-def _new_block(names: Iterable[str]) -> dict[str, np.ndarray]:
-    return {name: np.empty(BLOCK, _COLUMNS.get(name, np.uint8)) for name in names}
-
-
-class DsecEventReader:
+class DsecEventReader(Closing):
     """Reads events of a DSEC file by time; times are returned as int64 µs on the image clock (t + t_offset).
 
     Also reads BlinkFlow's files, which lack ``t_offset`` (taken as 0), store t as u8, and whose ``ms_to_idx`` ends
@@ -370,28 +331,14 @@ class DsecEventReader:
     def close(self) -> None:
         self._file.close()
 
-    def __enter__(self) -> DsecEventReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: str = "zstd") -> None:
     """Write ``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A pinhole camera's is the identity;
     loaders such as E-RAFT's require the file. codec : "gzip", which h5py alone reads, or another, which is Blosc's
     zstd."""
-    if codec == "gzip":
-        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    else:
-        packed = {"compression": hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)}
     with output_errors(path), h5py.File(path, "w") as file:
-        file.create_dataset(
-            "rectify_map",
-            data=np.asarray(rectify_map, np.float32),
-            track_times=False,
-            **packed,
-        )
+        packed = packing("gzip" if codec == "gzip" else "zstd", hdf5plugin.Blosc.SHUFFLE)
+        file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False, **packed)
 
 
 def identity_rectify_map(height: int, width: int) -> np.ndarray:

@@ -8,6 +8,7 @@ cause     (N,)   u1   blinkgl.types.events.Cause, where the emulator records it
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,8 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import whole
-from blinkgl.io.hdf5 import dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import Blocks, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.machine.closing import Closing, Finishing
 from blinkgl.types.events import TOLD, TRUTH, Cause, Events
 
 EVENT_LABELS = "event_labels.h5"
@@ -26,70 +28,54 @@ BLOCK = 1 << 17
 """Rows per HDF5 chunk and per write, as in ``events.h5``."""
 
 
-class EventLabelsWriter:
+class EventLabelsWriter(Finishing):
     """Writes the truth of the events in ``events.h5``. The same events give the same bytes for any chunks. Raises
     OutputError: the disk refuses; the file is then unusable."""
 
     def __init__(self, path: str | os.PathLike, *, codec: str = "zstd"):
         self.path, self._codec = Path(path), codec
-        self._held: list[Events] = []
-        self._fill = self._written = 0
+        self._rows = 0
         with output_errors(self.path):
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
             self._columns = {
                 name: growing_dataset(self._file, name, (0, *shape), base, (BLOCK, *shape), codec)
                 for name, (base, shape) in {name: _parts(TRUTH[name]) for name in TOLD}.items()
             }
+        self._blocks = Blocks(self._columns, BLOCK, self._store)
 
     def append(self, events: Events) -> None:
-        """Append events, which are kept until a block is full and must not be changed. Raises TypeError where they have
-        no truth."""
+        """Append events. Raises TypeError where they have no truth."""
         if not len(events):
             return
         if events.truth is None:
             raise TypeError("event labels: events that do not say what made them")
-        if not self._held and not self._written and events.cause is not None:
-            with output_errors(self.path):
-                self._columns["cause"] = growing_dataset(
-                    self._file, "cause", (0,), np.uint8, (BLOCK,), codec=self._codec
-                )
-        self._held.append(events)
-        self._fill += len(events)
-        while self._fill >= BLOCK:
-            joined = Events.concatenate(self._held)
-            self._store(joined.part(slice(BLOCK)))
-            rest = joined.part(slice(BLOCK, None))
-            self._held, self._fill = ([rest] if len(rest) else []), len(rest)
+        rows = {name: events.truth[name] for name in TOLD}
+        with output_errors(self.path):
+            if not self._rows and events.cause is not None:
+                self._columns["cause"] = growing_dataset(self._file, "cause", (0,), np.uint8, (BLOCK,), self._codec)
+            self._rows += len(events)
+            self._blocks.add(rows if events.cause is None else {**rows, "cause": events.cause}, len(events))
 
     def close(self) -> None:
-        if self._fill:
-            self._store(Events.concatenate(self._held))
         with output_errors(self.path):
+            self._blocks.flush()
             self._file.close()
 
     def abort(self) -> None:
         """Stop without finishing; never raises."""
-        try:
+        with contextlib.suppress(Exception):  # a full disk refuses the flush; the file is deleted anyway
             self._file.close()
-        except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
-            pass
 
-    def _store(self, events: Events) -> None:
-        assert events.truth is not None
-        rows = {name: np.ascontiguousarray(events.truth[name]) for name in TOLD}
-        if events.cause is not None:
-            rows["cause"] = events.cause
-        with output_errors(self.path):
-            for name, column in self._columns.items():
-                write_rows(column, self._written, rows[name])
-        self._written += len(events)
+    def _store(self, block: dict[str, np.ndarray]) -> None:
+        for name, column in self._columns.items():
+            write_rows(column, len(column), block[name])
 
 
 def _parts(kind: np.dtype) -> tuple[np.dtype, tuple[int, ...]]:
     return (kind, ()) if kind.subdtype is None else kind.subdtype
 
 
-class EventLabelsReader:
+class EventLabelsReader(Closing):
     """The truth of a sequence's events, by their number in ``events.h5``: ``reader.read(i, j)``. Use as a context
     manager.
 
@@ -110,10 +96,7 @@ class EventLabelsReader:
                 raise AssetError("columns of events differ in length", where=str(self.path), value=sorted(lengths))
             self.count = lengths.pop()
 
-    def __enter__(self) -> EventLabelsReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._file.close()
 
     def _column(self, name: str, kind: np.dtype, shape: tuple[int, ...]) -> h5py.Dataset:

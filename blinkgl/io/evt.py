@@ -24,7 +24,9 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import CheckedWriter
+from blinkgl.io.fixed_records import read_records
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -66,7 +68,7 @@ class EvtWriter(CheckedWriter):
         # An event takes at most TIME_LOW, ADDR_Y and ADDR_X, and a TIME_HIGH for every 4096 us passed.
         t = events.t
         words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
-        n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
+        n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self.count, words)
         self._file.write(words[:n].astype(_WORD["evt3"], copy=False).data)
 
 
@@ -99,38 +101,31 @@ class EvtReader:
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``words`` words at a time."""
         dtype, state = _WORD[self.version], START[self.version].copy()
-        position, lost, stray = self._start, 0, 0
+        name, lost = self.version.upper(), 0
         buffers = room(self.version, words)  # one for all pieces: fresh memory costs as much as decoding
-        with open(self.path, "rb") as file:
-            file.seek(self._start)
-            while not stray and (data := file.read(words * dtype.itemsize)):
-                # A file that ends within a word is truncated, which is said after its whole words.
-                stray = len(data) % dtype.itemsize
-                raw = np.frombuffer(data[: len(data) - stray], dtype)
+        try:
+            for first, raw in read_records(self.path, self._start, dtype, words, lambda _: f"the last {name} word"):
                 events, bad = self._decode(raw, state, buffers)
                 while bad >= 0 and self._keep:
-                    raw, lost, position = raw[bad + 1 :], lost + 1, position + (bad + 1) * dtype.itemsize
+                    first, raw, lost = first + bad + 1, raw[bad + 1 :], lost + 1
                     more, bad = self._decode(raw, state, buffers)
                     events = Events.concatenate([events, more])
                 if bad >= 0:
                     raise AssetError(
-                        f"damaged at byte {position + bad * dtype.itemsize}: no valid {self.version.upper()} word",
+                        f"damaged at byte {self._start + (first + bad) * dtype.itemsize}: no valid {name} word",
                         where=str(self.path),
                         value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}",
                     )
-                position += len(raw) * dtype.itemsize
                 if len(events):
                     yield events
-        said = [f"left out: words that {self.version.upper()} does not have: {lost:,}" if lost else ""]
-        if self.version == "evt3" and state[-2]:
-            said.append(f"4096 µs counted for each of {state[-2]:,} TIME_HIGH words that are missing")
-        if state[-1]:
-            said.append(f"left out: events before the first TIME_HIGH, which have no time: {state[-1]:,}")
-        self.notes = [line for line in said if line]
-        if stray:
-            raise AssetError(
-                f"truncated: {stray} stray bytes after the last {self.version.upper()} word", where=str(self.path)
+        finally:
+            missing = state[-2] if self.version == "evt3" else 0
+            said = (
+                (lost, f"left out: words that {name} does not have: {lost:,}"),
+                (missing, f"4096 µs counted for each of {missing:,} TIME_HIGH words that are missing"),
+                (state[-1], f"left out: events before the first TIME_HIGH, which have no time: {state[-1]:,}"),
             )
+            self.notes = [line for count, line in said if count]
         if state[0] < 0 and state[-1]:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
@@ -185,27 +180,16 @@ def decode(
 
 
 def _read_header(path: Path) -> tuple[str, int]:
-    lines = []
-    try:
-        with open(path, "rb") as file:
-            while True:
-                start = file.tell()
-                if file.read(1) != b"%":
-                    break
-                line = file.readline(_LONGEST_LINE)
-                if line.startswith(b" ") and len(line) == _LONGEST_LINE:
-                    raise AssetError(
-                        f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path)
-                    )
-                if not line.startswith(b" ") or not line.endswith(b"\n"):
-                    # The data begins here: this is a word whose first byte happens to be '%'.
-                    break
-                lines.append("%" + line.decode("latin-1").rstrip())
-                if lines[-1] == "% end":
-                    start = file.tell()
-                    break
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    lines, start = [], 0
+    with input_errors(path), open(path, "rb") as file:
+        # A word of the data may begin with '%', too, but hardly goes on as a line.
+        while (line := file.readline(_LONGEST_LINE)).startswith(b"% ") and lines[-1:] != ["% end"]:
+            if len(line) == _LONGEST_LINE:
+                raise AssetError(f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path))
+            if not line.endswith(b"\n"):
+                break
+            lines.append(line.decode("latin-1").rstrip())
+            start = file.tell()
     return "\n".join(lines), start
 
 

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import input_errors
 from blinkgl.types.events import Events
 
 _DAT = np.dtype([("t", "<u4"), ("address", "<u4")])
@@ -30,12 +30,22 @@ _SHORT, _LONG = (0x1FF, 9, 0xFF, 17), (0x3FFF, 14, 0x3FFF, 28)
 """Masks and shifts of a .dat address: x, then y, then polarity; of version 1 and 2."""
 
 
-def _records(file: BinaryIO, path: Path, dtype: np.dtype, count: int) -> Iterator[np.ndarray]:
-    while data := file.read(count * dtype.itemsize):
-        if len(data) >= dtype.itemsize:
-            yield np.frombuffer(data, dtype, len(data) // dtype.itemsize)
-        if stray := len(data) % dtype.itemsize:
-            raise AssetError(f"truncated: {stray} stray bytes after the last event", where=str(path))
+def read_records(
+    path: Path, start: int, dtype: np.dtype, count: int, last: Callable[[int], str] = lambda _: "the last event"
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the records behind the first ``start`` bytes of a file, ``count`` at a time, and the number of the first of
+    them.   last : names the last record, by the number of them, for messages. Raises AssetError: unreadable; after all
+    whole records: truncated."""
+    first = 0
+    with input_errors(path), open(path, "rb") as file:
+        file.seek(start)
+        while data := file.read(count * dtype.itemsize):
+            whole, stray = divmod(len(data), dtype.itemsize)
+            if whole:
+                yield first, np.frombuffer(data, dtype, whole)
+            first += whole
+            if stray:
+                raise AssetError(f"truncated: {stray} stray bytes after {last(first)}", where=str(path))
 
 
 class DatReader:
@@ -61,16 +71,14 @@ class DatReader:
         """Yield all events."""
         x_mask, y_from, y_mask, p_from = self._places
         wraps, last = 0, 0
-        with open(self.path, "rb") as file:
-            file.seek(self._start)
-            for rows in _records(file, self.path, _DAT, count):
-                t, address = rows["t"].astype(np.int64), rows["address"]
-                # A step back by more than half of the counter's range is its wrap.
-                turns = wraps + np.cumsum(np.diff(t, prepend=last) < -(1 << 31))
-                wraps, last = int(turns[-1]), int(t[-1])
-                x, y = address & x_mask, address >> y_from & y_mask
-                p = (address >> p_from & 1).astype(np.uint8)
-                yield Events(x.astype(np.uint16), y.astype(np.uint16), t + (turns << 32), p)
+        for _, rows in read_records(self.path, self._start, _DAT, count):
+            t, address = rows["t"].astype(np.int64), rows["address"]
+            # A step back by more than half of the counter's range is its wrap.
+            turns = wraps + np.cumsum(np.diff(t, prepend=last) < -(1 << 31))
+            wraps, last = int(turns[-1]), int(t[-1])
+            x, y = address & x_mask, address >> y_from & y_mask
+            p = (address >> p_from & 1).astype(np.uint8)
+            yield Events(x.astype(np.uint16), y.astype(np.uint16), t + (turns << 32), p)
 
 
 class NMnistReader:
@@ -84,11 +92,10 @@ class NMnistReader:
     def chunks(self, count: int = 1 << 20) -> Iterator[Events]:
         """Yield all events."""
         passed = 0
-        with open(self.path, "rb") as file:
-            for rows in _records(file, self.path, _NMNIST, count):
-                marks = rows["y"] == _PASSES
-                base = passed + np.cumsum(marks) * _PASSED_US
-                passed = int(base[-1])
-                t = ((rows["high"].astype(np.int64) & 0x7F) << 16) + rows["low"] + base
-                x, y, p = rows["x"].astype(np.uint16), rows["y"].astype(np.uint16), rows["high"] >> 7
-                yield Events(x, y, t, p).part(~marks)
+        for _, rows in read_records(self.path, 0, _NMNIST, count):
+            marks = rows["y"] == _PASSES
+            base = passed + np.cumsum(marks) * _PASSED_US
+            passed = int(base[-1])
+            t = ((rows["high"].astype(np.int64) & 0x7F) << 16) + rows["low"] + base
+            x, y, p = rows["x"].astype(np.uint16), rows["y"].astype(np.uint16), rows["high"] >> 7
+            yield Events(x, y, t, p).part(~marks)

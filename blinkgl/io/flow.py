@@ -13,6 +13,7 @@ from blinkgl.config.frames import FLOW_FORMATS
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.images import encode_npy, encode_png, read_npy, read_pfm, read_png
+from blinkgl.io.records import input_errors
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Flow as 16-bit PNG: DSEC's (quantum 1/128 px, ±256 px) and KITTI's (1/64 px, ±512 px).
@@ -83,19 +84,11 @@ def encode_flo(flow: np.ndarray, valid: np.ndarray | None = None) -> bytes:
     return struct.pack("<fii", _TAG, data.shape[1], data.shape[0]) + data.tobytes()
 
 
-def write_flo(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
-    """Write :func:`encode_flo`. Raises OutputError."""
-    with output_errors(path):
-        Path(path).write_bytes(encode_flo(flow, valid))
-
-
 def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px (0 where unknown), valid (H, W) bool. Raises AssetError: wrong tag, size or
     length."""
-    try:
+    with input_errors(path):
         data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
     if len(data) < 12 or struct.unpack_from("<f", data)[0] != _TAG:
         raise AssetError("not a .flo file: wrong tag", where=str(path), accepted=f"{_TAG}")
     width, height = struct.unpack_from("<ii", data, 4)
@@ -154,8 +147,9 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
     flow."""
     path = Path(path)
     if path.suffix.lower() not in READ_ENDINGS:
-        accepted = ", ".join(READ_ENDINGS)
-        raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=accepted)
+        raise AssetError(
+            "unknown flow file ending", where=str(path), value=path.suffix, accepted=", ".join(READ_ENDINGS)
+        )
     form = form or {".png": "dsec"}.get(path.suffix.lower(), path.suffix.lower()[1:])
     if form == "flo":
         return read_flo(path)
@@ -165,23 +159,22 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
         # u is the third channel, and 0 in the first means that the point is seen in both images.
         raw = _sixteen_bits(path)
         return (raw[..., :2].astype(np.float32) - np.float32(_ZERO)) / np.float32(KITTI_SCALE), raw[..., 2] == 0
+    stated: np.ndarray | bool = True
     if form == "vkitti2":
         # Shares of the width and height less one, from -1 to 1.
         raw = _sixteen_bits(path)
         size = np.array([raw.shape[1] - 1, raw.shape[0] - 1], np.float32)
-        flow, valid = (raw[..., 2:0:-1].astype(np.float32) * np.float32(2 / 65535) - 1) * size, raw[..., 0] > 0
+        flow, stated = (raw[..., 2:0:-1].astype(np.float32) * np.float32(2 / 65535) - 1) * size, raw[..., 0] > 0
     elif form == "pfm":
         data = read_pfm(path)
         if data.ndim != 3:
             raise AssetError("not a flow field", where=str(path), value=data.shape, accepted="PFM of three channels")
         flow = data[..., :2]
-        valid = np.isfinite(flow).all(-1)
     elif form == "flo5":
         flow = read_flo5(path)
-        valid = np.isfinite(flow).all(-1)
     else:
         flow, stated = read_flow_npy(path)
-        valid = stated & np.isfinite(flow).all(-1)
+    valid = stated & np.isfinite(flow).all(-1)
     return np.where(valid[..., None], flow, np.float32(0)), valid
 
 

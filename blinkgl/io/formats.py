@@ -11,32 +11,34 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.io.atomic import atomic_file
-from blinkgl.io.columns import MAX_SIDE, CameraFrame, ImuSamples, check_events, check_size, on_or_off
+from blinkgl.io.columns import MAX_SIDE, CameraFrame, CheckedWriter, ImuSamples, check_events, check_size, on_or_off
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
 
 
 @dataclass(frozen=True)
 class EventFormat:
-    """One event format.
+    """One event format; :func:`register` adds it.
 
-    endings : of its files.   module : of ``blinkgl.io``, imported when a file of it is opened or written.
-    reader : class made from (path, :class:`~blinkgl.io.reading.EventReading`).   writer : class made from (path,
-    height, width) and ``fixed``; "": the format is only read.   magic : first bytes of its files, which decide where
-    several formats share an ending.   takes : options of :func:`event_writer` that the writer has.   causes : it can
-    store the causes of events.   sized : it cannot be written without the sensor's size."""
+    endings : of its files.   reader : class made from (path, :class:`~blinkgl.io.reading.EventReading`).
+    writer : class made from (path, height, width) and ``fixed``; "": the format is only read. Either is the class, or
+    its name in ``module`` of ``blinkgl.io``, which is imported when a file is opened or written.   magic : first bytes
+    of its files, which decide where several formats share an ending.   takes : options of :func:`event_writer` that
+    the writer has.   causes : it can store the causes of events.   sized : it cannot be written without the sensor's
+    size."""
 
     name: str
     endings: tuple[str, ...]
-    module: str
-    reader: str
-    writer: str = ""
+    module: str = ""
+    reader: str | type = ""
+    writer: str | type = ""
     magic: bytes = b""
     fixed: Mapping[str, Any] = field(default_factory=dict)
     takes: tuple[str, ...] = ()
@@ -45,49 +47,54 @@ class EventFormat:
 
     def open(self, path: Path, reading: EventReading) -> Any:
         """Return a reader of the file. Raises AssetError: not what the ending says."""
-        return getattr(import_module(f"blinkgl.io.{self.module}"), self.reader)(path, reading)
+        return self._class(self.reader)(path, reading)
 
-    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> EventWriter:
+    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> CheckedWriter:
         """Return a writer of the file. options : those that it takes are used."""
         given = {name: options[name] for name in self.takes}
-        return getattr(import_module(f"blinkgl.io.{self.module}"), self.writer)(
-            path, height, width, **self.fixed, **given
-        )
+        return self._class(self.writer)(path, height, width, **self.fixed, **given)
+
+    def _class(self, named: str | type) -> Any:
+        return getattr(import_module(f"blinkgl.io.{self.module}"), named) if isinstance(named, str) else named
 
 
 HDF5 = (".h5", ".hdf5")
 _TEXT = {"module": "text", "reader": "TextReader", "writer": "TextWriter", "takes": ("write_unit",)}
-FORMATS = {
-    one.name: one
-    for one in (
-        EventFormat("dsec", HDF5, "dsec", "DsecEventReader", "DsecEventWriter", takes=("t_offset_us",), causes=True),
-        EventFormat("hdf5", HDF5, "hdf5_tables", "Hdf5TableReader"),
-        EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter"),
-        EventFormat("aedat2", (".aedat",), "aedat2", "Aedat2Reader"),
-        EventFormat(
-            "aedat4", (".aedat4", ".aedat"), "aedat4", "Aedat4Reader", "Aedat4Writer", b"#!AER-DAT4", sized=True
-        ),
-        EventFormat("text", (".txt",), fixed={"separator": " "}, **_TEXT),
-        EventFormat("csv", (".csv",), fixed={"separator": ","}, **_TEXT),
-        EventFormat("gzip", (".txt.gz", ".csv.gz"), "text", "TextReader"),
-        EventFormat("es", (".es",), "event_stream", "EventStreamReader"),
-        EventFormat("dat", (".dat",), "fixed_records", "DatReader"),
-        EventFormat("nmnist", (".bin",), "fixed_records", "NMnistReader"),
-        EventFormat("mat", (".mat",), "arrays", "MatReader"),
-        EventFormat("mat73", (".mat",), "hdf5_tables", "Hdf5TableReader", magic=b"MATLAB 7.3"),
-        EventFormat("rosbag", (".bag", ".mcap", ".db3"), "ros", "BagReader"),
-        EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
-        EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
-    )
-}
+FORMATS: dict[str, EventFormat] = {}
 """Formats by name. Of formats that share an ending the first is written."""
 ENDINGS: dict[str, str] = {}
 """Ending -> the format that is written for it."""
-for _one in FORMATS.values():
-    for _ending in _one.endings:
-        ENDINGS.setdefault(_ending, _one.name)
-WITH_CAUSES = tuple(name for name, one in FORMATS.items() if one.causes)
-"""Formats that can store the causes of events; the others refuse events with causes."""
+
+
+def register(one: EventFormat) -> EventFormat:
+    """Add a format to the table that every command reads, and return it. Raises TypeError: its name is taken."""
+    if one.name in FORMATS:
+        raise TypeError(f"event format '{one.name}': there is one already")
+    FORMATS[one.name] = one
+    for ending in one.endings:
+        ENDINGS.setdefault(ending, one.name)
+    return one
+
+
+for _one in (
+    EventFormat("dsec", HDF5, "dsec", "DsecEventReader", "DsecEventWriter", takes=("t_offset_us",), causes=True),
+    EventFormat("hdf5", HDF5, "hdf5_tables", "Hdf5TableReader"),
+    EventFormat("evt3", (".raw",), "evt", "EvtReader", "EvtWriter"),
+    EventFormat("aedat2", (".aedat",), "aedat2", "Aedat2Reader"),
+    EventFormat("aedat4", (".aedat4", ".aedat"), "aedat4", "Aedat4Reader", "Aedat4Writer", b"#!AER-DAT4", sized=True),
+    EventFormat("text", (".txt",), fixed={"separator": " "}, **_TEXT),
+    EventFormat("csv", (".csv",), fixed={"separator": ","}, **_TEXT),
+    EventFormat("gzip", (".txt.gz", ".csv.gz"), "text", "TextReader"),
+    EventFormat("es", (".es",), "event_stream", "EventStreamReader"),
+    EventFormat("dat", (".dat",), "fixed_records", "DatReader"),
+    EventFormat("nmnist", (".bin",), "fixed_records", "NMnistReader"),
+    EventFormat("mat", (".mat",), "arrays", "MatReader"),
+    EventFormat("mat73", (".mat",), "hdf5_tables", "Hdf5TableReader", magic=b"MATLAB 7.3"),
+    EventFormat("rosbag", (".bag", ".mcap", ".db3"), "ros", "BagReader"),
+    EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
+    EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
+):
+    register(_one)
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files without a size."""
 _FOUND = ("moved", "late", "cut", "outside")
@@ -96,19 +103,8 @@ _OVERLAP_US = 10_000
 """With ``damaged="keep"``, events that come up to so much too late are put in their place."""
 
 
-class EventWriter(Protocol):
-    """Interface of every format's writer; ``abort`` never raises. ``t_end_us`` may be set before the end: the
-    recording's, where it is later than the last event's (used by DSEC's table)."""
-
-    t_end_us: int | None
-
-    def append(self, events: Events) -> None: ...
-    def close(self, t_end_us: int | None = None) -> None: ...
-    def abort(self) -> None: ...
-
-
 @dataclass(frozen=True)
-class EventFile:
+class EventFile(Closing):
     """An event file opened for reading, in any format.
 
     height, width : px, None when neither the file nor the user gives them. t_offset_us : DSEC's, else 0 (already added
@@ -177,8 +173,12 @@ class EventFile:
             for events in self._reader.chunks():
                 yield replace(events, p=on_or_off(events.p, pair, str(self.path))) if pair else events
         except (AssetError, EventDataError) as error:
-            accepted = f"{error.accepted or 'a whole file'}; or --damaged keep"
-            raise type(error)(error.problem, where=error.where, value=error.value, accepted=accepted) from error
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                value=error.value,
+                accepted=f"{error.accepted or 'a whole file'}; or --damaged keep",
+            ) from error
 
     def _salvaged(self) -> Iterator[Events]:
         """Yield what is whole, in order of time; count the rest."""
@@ -257,12 +257,6 @@ class EventFile:
     def close(self) -> None:
         """Close the file (only HDF5 files stay open between reads)."""
         getattr(self._reader, "close", lambda: None)()
-
-    def __enter__(self) -> EventFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def read(self) -> Events:
         """Return all events at once."""
@@ -350,7 +344,7 @@ def output_format(path: str | os.PathLike) -> str:
 
 def _writer(
     path: Path, kind: str, height: int | None, width: int | None, t_offset_us: int, write_unit: str
-) -> EventWriter:
+) -> CheckedWriter:
     check_size(height, width, str(path), MAX_SIDE**2)
     if write_unit != "s" and "write_unit" not in FORMATS[kind].takes:
         raise OutputError(
@@ -375,7 +369,7 @@ def event_writer(
     t_offset_us: int = 0,
     write_unit: str = "s",
     overwrite: bool = True,
-) -> Iterator[EventWriter]:
+) -> Iterator[CheckedWriter]:
     """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the
     block ends without an exception, and not at all otherwise.
 
@@ -383,14 +377,11 @@ def event_writer(
     write_unit : text and CSV only, "s" or "us". Raises OutputError, EventDataError.
     """
     kind = output_format(path)
-    with atomic_file(path, overwrite=overwrite) as temporary:
-        writer = _writer(temporary, kind, height, width, t_offset_us, write_unit)
-        try:
-            yield writer
-            writer.close()
-        except BaseException:
-            writer.abort()
-            raise
+    with (
+        atomic_file(path, overwrite=overwrite) as temporary,
+        _writer(temporary, kind, height, width, t_offset_us, write_unit) as writer,
+    ):
+        yield writer
 
 
 def write_events(
@@ -442,7 +433,7 @@ def convert(
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
         offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
         shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
-        if file.causes and kind not in WITH_CAUSES:
+        if file.causes and not FORMATS[kind].causes:
             shifted = (replace(e, cause=None) for e in shifted)
         count = write_events(
             target,

@@ -10,17 +10,15 @@ frame_camera/
 from __future__ import annotations
 
 import csv
-import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError
-from blinkgl.io.images import encode_png, read_image
 
 FOLDER = "frame_camera"
 STAMPS = f"{FOLDER}/images/timestamps.txt"
@@ -59,16 +57,6 @@ def files_of(images: ImagesConfig, count: int) -> Iterator[str]:
         yield from (picture_file(picture, k) for k in range(count))
 
 
-def encode_codes(codes: np.ndarray) -> bytes:
-    """Return a PNG of (H, W, 3) RGB or (H, W), uint8 or uint16, unchanged."""
-    return encode_png(codes[..., ::-1] if codes.ndim == 3 else codes)
-
-
-def read_codes(path: str | os.PathLike) -> np.ndarray:
-    """Return the codes of :func:`encode_codes`. Raises AssetError."""
-    return read_image(path)
-
-
 def exposures_csv(lines: Iterable[ExposureLine]) -> str:
     """Return the text of ``exposures.csv``: a heading, then a line per image. Times to the nanosecond."""
     rows = [",".join(f.name for f in fields(ExposureLine))]
@@ -93,12 +81,12 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
             first, *rows = csv.reader(file)
         if first != heading or any(len(row) != len(heading) for row in rows):
             raise ValueError("not the columns " + ", ".join(heading))
-        lines = []
-        for row in rows:
-            start, end, exposure, row_us, gain_db = (float(v) for v in row[:5])
-            if not math.isfinite(start + end + exposure + row_us + gain_db):
-                raise ValueError("a number that is not finite")
-            lines.append(ExposureLine(start, end, exposure, row_us, gain_db, int(row[5])))
+        lines = [
+            ExposureLine(float(start), float(end), float(exposure), float(row_us), float(gain_db), int(instants))
+            for start, end, exposure, row_us, gain_db, instants in rows
+        ]
+        if not np.isfinite([astuple(line) for line in lines]).all():
+            raise ValueError("a number that is not finite")
         return lines
     except FileNotFoundError:
         raise AssetError(

@@ -327,9 +327,8 @@ def _array(path: Path, declared: Declared) -> FrameSource:
         raise AssetError(
             "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
         )
-    levels = None
-    if frames.dtype == np.uint16 and declared.white_level is None and declared.range is None:
-        levels = _white_of(int(max(frame.max() for frame in frames)), notes)
+    guessed = frames.dtype == np.uint16 and declared.white_level is None and declared.range is None
+    levels = _white_of(int(max(frame.max() for frame in frames)), notes) if guessed else None
 
     def read() -> Frames:
         for i, frame in enumerate(frames):

@@ -12,7 +12,7 @@ import ctypes
 import functools
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -191,13 +191,17 @@ def growing_dataset(
     """Return a new data set that grows along its first axis. codec : of :data:`CODECS`, packed by Blosc, level 1 with
     bit shuffle (filter 32001), zstd as in DSEC's files; or "gzip", level 1 with byte shuffle, which every HDF5
     unpacks."""
-    if codec == "gzip":
-        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
-    else:
-        packed = {"compression": hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=_BIT_SHUFFLE)}
+    packed = packing(codec, _BIT_SHUFFLE)
     return file.create_dataset(
         name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, **packed
     )
+
+
+def packing(codec: str, shuffle: int) -> dict[str, Any]:
+    """Return the arguments of ``create_dataset`` for a codec of :func:`growing_dataset`.   shuffle : of Blosc."""
+    if codec == "gzip":
+        return {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
+    return {"compression": hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=shuffle)}
 
 
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
@@ -226,6 +230,37 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
         data.id.write_direct_chunk(
             (begin + i, *(0,) * (data.ndim - 1)), piece.tobytes() if skipped else packed, skipped
         )
+
+
+class Blocks:
+    """Rows of several data sets of :func:`growing_dataset`, collected to blocks, so that a file's bytes do not depend
+    on the pieces in which its rows come.
+
+    columns : by name; more may be added before the first row.   size : rows of a block.   store : takes each block,
+    rows by name, which nobody changes any more."""
+
+    def __init__(self, columns: dict[str, h5py.Dataset], size: int, store: Callable[[dict[str, np.ndarray]], None]):
+        self._columns, self._size, self._store, self._fill = columns, size, store, 0
+        self._block: dict[str, np.ndarray] = {}
+
+    def add(self, rows: Mapping[str, np.ndarray], count: int) -> None:
+        """Append ``count`` rows, which are copied."""
+        start = 0
+        while start < count:
+            if not self._fill:
+                self._block = {k: np.empty((self._size, *c.shape[1:]), c.dtype) for k, c in self._columns.items()}
+            taken = min(count - start, self._size - self._fill)
+            for name, column in self._block.items():
+                column[self._fill : self._fill + taken] = rows[name][start : start + taken]
+            self._fill, start = self._fill + taken, start + taken
+            if self._fill == self._size:
+                self.flush()
+
+    def flush(self) -> None:
+        """Store the rows of the last block, which need not be full."""
+        if self._fill:
+            self._store({name: column[: self._fill] for name, column in self._block.items()})
+            self._fill = 0
 
 
 def joined(pieces: list[np.ndarray]) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
 import os
@@ -11,16 +10,18 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
 from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import output_errors
+from blinkgl.io.records import decoding, input_errors
+from blinkgl.machine.closing import Closing
 from blinkgl.srgb import to_srgb8
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -48,10 +49,7 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 def read_mask(path: str | os.PathLike) -> np.ndarray:
     """Return a mask, (H, W) bool."""
-    image = read_png(path)
-    if image.ndim != 2:
-        raise AssetError("not a mask", where=str(path), value=image.shape, accepted="one channel")
-    return image > 0
+    return _one_channel(path, "a mask") > 0
 
 
 def encode_ids(ids: np.ndarray) -> bytes:
@@ -64,16 +62,25 @@ def encode_ids(ids: np.ndarray) -> bytes:
 
 def read_ids(path: str | os.PathLike) -> np.ndarray:
     """Return (H, W) integers as stored. Raises AssetError."""
+    return _one_channel(path, "a picture of ids")
+
+
+def _one_channel(path: str | os.PathLike, what: str) -> np.ndarray:
     image = read_png(path)
     if image.ndim != 2:
-        raise AssetError("not a picture of ids", where=str(path), value=image.shape, accepted="one channel")
+        raise AssetError(f"not {what}", where=str(path), value=image.shape, accepted="one channel")
     return image
 
 
 def encode_npy(array: np.ndarray) -> bytes:
     """Return .npy bytes; object arrays are refused (they would be pickled)."""
+    return encoded(np.save, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def encoded(save: Callable[..., None], *given: Any, **named: Any) -> bytes:
+    """Return the bytes that ``save(file, …)`` writes, one of NumPy's."""
     buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    save(buffer, *given, **named)
     return buffer.getvalue()
 
 
@@ -117,7 +124,7 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
     return shape, fortran, dtype
 
 
-class NpzReader:
+class NpzReader(Closing):
     """The arrays of an .npz by name; each is read when requested. Never unpickles. Use as a context manager.
 
     Raises (inside :func:`numpy_errors`) AssetError: an entry that is not a plain array of numbers, or that would not
@@ -127,10 +134,7 @@ class NpzReader:
         self.path, self._archive = path, zipfile.ZipFile(path)
         self.names = [n.removesuffix(".npy") for n in self._archive.namelist()]
 
-    def __enter__(self) -> NpzReader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._archive.close()
 
     def __contains__(self, name: str) -> bool:
@@ -187,18 +191,10 @@ def memory_limit() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
-@contextlib.contextmanager
-def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
+def numpy_errors(path: str | os.PathLike) -> AbstractContextManager[None]:
     """Convert any failure to load ``path`` with NumPy to an AssetError: on damaged bytes it raises exceptions of its
     header parser, zipfile and zlib (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
-    try:
-        yield
-    except AssetError:
-        raise
-    except Exception as error:
-        raise AssetError(
-            f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)
-        ) from error
+    return decoding(path, "cannot read")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -209,32 +205,10 @@ _HEADER = re.compile(
 )
 
 
-def encode_pfm(image: np.ndarray) -> bytes:
-    """Return the bytes of (H, W) or (H, W, 3) float32, row 0 = top."""
-    image = np.asarray(image)
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise ValueError(f"PFM holds (H, W) or (H, W, 3), got {image.shape}")
-    kind = b"PF" if image.ndim == 3 else b"Pf"
-    return kind + f"\n{image.shape[1]} {image.shape[0]}\n-1.0\n".encode() + image[::-1].astype("<f4").tobytes()
-
-
-def write_pfm(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write :func:`encode_pfm`. Raises OutputError."""
-    with output_errors(path):
-        Path(path).write_bytes(encode_pfm(image))
-
-
 def read_pfm(path: str | os.PathLike) -> np.ndarray:
     """Return (H, W) or (H, W, 3) float32, row 0 = top. Raises AssetError: wrong header or length."""
-    try:
+    with input_errors(path):
         data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    return decode_pfm(data, path)
-
-
-def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
-    """Return :func:`read_pfm` of bytes; ``path`` is for messages."""
     header = _HEADER.match(data)
     if not header:
         raise AssetError("not a PFM file: wrong header", where=str(path))
@@ -261,11 +235,8 @@ def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) 
 def read_png(path: str | os.PathLike) -> np.ndarray:
     """Return pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes. Raises
     AssetError when missing, truncated, undecodable, or of more than 2^28 px (checked before unpacking)."""
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
-    return decode_image(data, path)
+    with input_errors(path, "cannot read image"):
+        return decode_image(Path(path).read_bytes(), path)
 
 
 def decode_image(data: bytes, path: str | os.PathLike) -> np.ndarray:
@@ -306,15 +277,22 @@ def _png_problem(data: bytes) -> str | None:
     if data[12:16] != b"IHDR" or len(data) < 33:
         return "cannot decode image (corrupt or truncated)"
     at = 8
-    while at + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 12 + length
-        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+    for at, kind, body in png_chunks(data):
+        if zlib.crc32(kind + body).to_bytes(4, "big") != data[at + 8 + len(body) : at + 12 + len(body)]:
             break
         if kind == b"IEND":
             return size_problem(*struct.unpack_from(">II", data, 16))
-        at = end
+        at += 12 + len(body)
     return f"cannot decode image (corrupt or truncated at byte {at})"
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield where each chunk begins, its type, and its content, of which the last one's may be cut."""
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        yield at, kind, data[at + 8 : at + 8 + length]
+        at += 12 + length
 
 
 def size_problem(width: int, height: int) -> str | None:

@@ -96,20 +96,9 @@ def _rectangle(picture: np.ndarray, edges: np.ndarray, colour: list[int]) -> Non
 
 
 def _word(picture: np.ndarray, text: str, x: float, y: float, colour: list[int]) -> None:
-    picture[:] = _written(picture, text, (int(x) + 2, int(y) + 1), tuple(colour), back=(12, 12, 14))
-
-
-def _written(
-    picture: np.ndarray,
-    text: str,
-    at: tuple[int, int],
-    colour: tuple[int, ...],
-    back: tuple[int, int, int] | None = None,
-) -> np.ndarray:
-    """Return a copy with text at its upper left corner. back : background of the text; None: none."""
-    made = Image.fromarray(picture)
+    """Write text on a dark ground, its upper left corner beside (x, y)."""
+    made, at = Image.fromarray(picture), (int(x) + 2, int(y) + 1)
     draw, font = ImageDraw.Draw(made), ImageFont.load_default(10)
-    if back is not None:
-        draw.rectangle(draw.textbbox(at, text, font=font), fill=back)
+    draw.rectangle(draw.textbbox(at, text, font=font), fill=(12, 12, 14))
     draw.text(at, text, fill=tuple(colour), font=font)
-    return np.asarray(made).copy()
+    picture[:] = np.asarray(made)

@@ -6,6 +6,7 @@ that says what is wrong.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -31,6 +32,27 @@ def open_regular(path: str | os.PathLike) -> int:
         os.close(descriptor)
         raise AssetError("not a regular file", where=str(path))
     return descriptor
+
+
+@contextlib.contextmanager
+def input_errors(path: str | os.PathLike, problem: str = "cannot read") -> Iterator[None]:
+    """Convert an ``OSError`` of reading ``path`` to an :class:`AssetError` of one line."""
+    try:
+        yield
+    except OSError as error:
+        raise AssetError(f"{problem}: {error.strerror}", where=str(path)) from error
+
+
+@contextlib.contextmanager
+def decoding(path: str | os.PathLike, problem: str) -> Iterator[None]:
+    """Convert whatever a library raises on damaged bytes to an :class:`AssetError` of one line."""
+    try:
+        yield
+    except AssetError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise AssetError(f"{problem}: {reason}", where=str(path)) from error
 
 
 def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:

@@ -19,6 +19,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.columns import events_of, joined
 from blinkgl.io.evt import START, decode
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import decoding
 from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
 
@@ -91,14 +92,8 @@ class BagReader:
         store = typestore(ros2)
         from rosbags.highlevel import AnyReader
 
-        try:
-            with AnyReader([self.path], default_typestore=store) as bag:
-                yield bag
-        except (AssetError, GeneratorExit):
-            raise
-        except Exception as error:
-            text = " ".join(str(error).split())[:160] or type(error).__name__
-            raise AssetError(f"damaged bag: {text}", where=str(self.path)) from error
+        with decoding(self.path, "damaged bag"), AnyReader([self.path], default_typestore=store) as bag:
+            yield bag
 
     def _messages(self, bag: Any) -> Iterator[tuple[Any, Any, tuple[int, int]]]:
         """Yield, for each message of the topic, its connection, its content, and (height, width)."""

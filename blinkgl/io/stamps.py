@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.clock import TimeUnit, guessed_frame_unit, named_unit, nanoseconds, unit_of_file
-from blinkgl.io.records import read_text
+from blinkgl.io.clock import guessed_frame_unit, named_unit, nanoseconds, unit_of
+from blinkgl.io.records import input_errors, read_text
 from blinkgl.io.rows import is_number, read_rows, titles_of
 
 
@@ -38,11 +38,8 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
 
     Raises AssetError: unreadable. EventDataError: not a time, with its line; two units in one list; no times.
     ConfigError: "frames" without fps."""
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    heading, numbered = read_rows(text)
+    with input_errors(path):
+        heading, numbered = read_rows(path.read_text(encoding="utf-8-sig", errors="replace"))
     rows = [fields for _, fields in numbered]
     if not rows:
         raise EventDataError("no time stamps", where=str(path))
@@ -66,7 +63,8 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
                 "times in frames need a frame rate", where="--time-unit", value=unit, accepted="--fps, too"
             )
         return Stamps([round(Fraction(text) * 10**9 / Fraction(fps)) for text in texts], names)
-    found = _unit(unit, titles, columns, heading, path, texts)
+    guessed = lambda: guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+    found = unit_of(unit, _stated(titles, columns, heading, path), guessed)
     return Stamps(nanoseconds(texts, found), names, None if found.line is None else f"{path.name}: {found.line}")
 
 
@@ -88,8 +86,12 @@ def read_label_times(path: Path, columns: int, count: int | None = None) -> list
         if not line.strip() or line.startswith("#"):
             continue
         if len(fields) != columns or not all(map(_MICROSECONDS.fullmatch, fields)):
-            accepted = "from_us, to_us" if columns == 2 else "a time in µs"
-            raise AssetError(f"line {number} is no time", where=str(path), value=line, accepted=accepted)
+            raise AssetError(
+                f"line {number} is no time",
+                where=str(path),
+                value=line,
+                accepted="from_us, to_us" if columns == 2 else "a time in µs",
+            )
         rows.append(tuple(map(int, fields)))
         if columns == 2 and rows[-1][0] == rows[-1][1]:
             raise AssetError(f"line {number} is not an interval", where=str(path), value=line, accepted="two times")
@@ -110,9 +112,8 @@ def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str)
             value=values[bad : bad + 1].tolist(),
             accepted="a finite number",
         )
-    stated = unit or named_unit(name)
-    how = "declared" if unit else "read"
-    found = TimeUnit(stated, how) if stated else guessed_frame_unit(values.astype(np.float64), f"{where}: '{name}'")
+    guessed = lambda: guessed_frame_unit(values.astype(np.float64), f"{where}: '{name}'")
+    found = unit_of(unit, named_unit(name), guessed)
     return Stamps(nanoseconds(values, found), None, found.line)
 
 
@@ -150,15 +151,9 @@ def _names(rows: Sequence[Sequence[str]], columns: Sequence[int], path: Path) ->
             for k, name in enumerate(names)]  # fmt: skip
 
 
-def _unit(
-    unit: str | None, titles: Sequence[str], columns: Sequence[int], heading: str, path: Path, texts: Sequence[str]
-) -> TimeUnit:
-    if unit is not None:
-        return TimeUnit(unit, "declared")
+def _stated(titles: Sequence[str], columns: Sequence[int], heading: str, path: Path) -> str | None:
+    """Return the unit that a title, the heading or the file's name states."""
     stated = named_unit(titles[columns[0]]) if columns[0] < len(titles) else None
     if stated is None and re.search(r"time(code|stamp)s? format v2", heading, re.I):
         stated = "ms"  # mkvextract
-    stated = stated or (named_unit(heading) if not titles[1:] else None) or unit_of_file(path)
-    if stated is not None:
-        return TimeUnit(stated, "read")
-    return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+    return stated or (named_unit(heading) if not titles[1:] else None) or named_unit(path.stem)

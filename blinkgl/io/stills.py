@@ -9,9 +9,9 @@ from __future__ import annotations
 import io
 import logging
 import re
-import struct
 import warnings
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from PIL import Image, ImageSequence
 
 from blinkgl.errors import AssetError
 from blinkgl.io.alpha import over
-from blinkgl.io.images import decode_image, read_pfm, size_problem
+from blinkgl.io.images import decode_image, png_chunks, read_pfm, size_problem
+from blinkgl.io.records import decoding, input_errors
 
 SUFFIXES = frozenset(".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pgm .ppm .pnm .exr .hdr .pfm".split())
 _ANIMATED = {".gif", ".webp", ".png", ".apng"}
@@ -69,9 +70,9 @@ class Stills:
         if suffix == ".pfm":
             yield read_pfm(self.path)
         elif suffix == ".exr":
-            from blinkgl.io.video import read_exr
+            from blinkgl.io.video import decode_exr
 
-            yield read_exr(self.path)
+            yield decode_exr(_bytes(self.path), str(self.path))
         elif suffix in _TIFF:
             yield from self._tiff_pages(first)
         elif self.delays_ms is not None:
@@ -133,10 +134,8 @@ def open_stills(path: Path) -> Stills:
 
 def _png(path: Path, head: bytes) -> Stills:
     """Read the chunks before the pixels that say what codes mean (PNG specification, 11.3.2)."""
-    stills, at, bits = Stills(path), 8, 0
-    while at + 12 <= len(head):
-        length, kind = struct.unpack_from(">I4s", head, at)
-        body = head[at + 8 : at + 8 + length]
+    stills, bits = Stills(path), 0
+    for _, kind, body in png_chunks(head):
         if kind == b"IHDR":
             bits = body[8]
         elif kind == b"cICP" and len(body) == 4:
@@ -154,10 +153,9 @@ def _png(path: Path, head: bytes) -> Stills:
             stills.white = 2 ** body[0] - 1  # only where the codes are no larger, which the reader of the clip checks
         elif kind in (b"IDAT", b"IEND"):
             break
-        at += 12 + length
     if stills.transfer is not None:
-        stills.notes.append(f"the images state the curve {stills.transfer:.4g}" if isinstance(stills.transfer, float)
-                            else f"the images state the curve {stills.transfer}")  # fmt: skip
+        curve = f"{stills.transfer:.4g}" if isinstance(stills.transfer, float) else stills.transfer
+        stills.notes.append(f"the images state the curve {curve}")
     return stills
 
 
@@ -167,10 +165,9 @@ def _animated(path: Path) -> Stills:
             raise AssetError(problem, where=str(path))
         delays = []
         for page in ImageSequence.Iterator(image):
-            delays.append(float(page.info.get("duration", 0) or 0))
             if image.format == "WEBP":
                 page.load()  # its delay is known then
-                delays[-1] = float(page.info.get("duration", 0) or 0)
+            delays.append(float(page.info.get("duration", 0) or 0))
     notes = []
     if zero := sum(delay <= 0 for delay in delays):
         notes.append(f"{zero} frames state no delay: {_UNSTATED_MS} ms each, as browsers show them (--fps)")
@@ -269,29 +266,15 @@ def _orientation(data: bytes, path: Path) -> int:
 
 
 def _bytes(path: Path, most: int = -1) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            return file.read(most)
-    except OSError as error:
-        raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
+    with input_errors(path, "cannot read image"), open(path, "rb") as file:
+        return file.read(most)
+
+
+def _decoding(path: Path) -> AbstractContextManager[None]:
+    return decoding(path, "cannot decode image (corrupt or truncated)")
 
 
 def _pillow(path: Path) -> Image.Image:
     with _decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return Image.open(path)
-
-
-class _decoding:
-    """Convert whatever a decoder raises on damaged bytes into an AssetError."""
-
-    def __init__(self, path: Path):
-        self._path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, *_: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, AssetError):
-            reason = " ".join(str(error).split())[:160] or type(error).__name__
-            raise AssetError(f"cannot decode image (corrupt or truncated): {reason}", where=str(self._path)) from error

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
+from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit, unit_of
 from blinkgl.io.columns import events_of, microseconds
 from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
@@ -94,8 +94,11 @@ def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Ta
     AssetError: columns of different lengths, or no numbers."""
     lengths = {slot: max(column.shape, default=0) for slot, column in columns.items() if _is_vector(column)}
     if len(lengths) != len(columns) or len(set(lengths.values())) != 1:
-        shapes = {slot: getattr(column, "shape", None) for slot, column in columns.items()}
-        raise AssetError("event columns differ in length", where=where, value=shapes)
+        raise AssetError(
+            "event columns differ in length",
+            where=where,
+            value={slot: getattr(column, "shape", None) for slot, column in columns.items()},
+        )
 
     def read(part: slice) -> dict[str, np.ndarray]:
         flat = {slot: column for slot, column in columns.items() if len(column.shape) == 1}
@@ -149,8 +152,9 @@ class TableReader:
         self.path, self._keep, self._polarity, self.unread = path, reading.keep, reading.polarity, 0
         number = reading.stream or 0
         if not 0 <= number < len(tables):
-            accepted = f"--stream 0 to {len(tables) - 1}"
-            raise AssetError("no such stream", where=str(path), value=number, accepted=accepted)
+            raise AssetError(
+                "no such stream", where=str(path), value=number, accepted=f"--stream 0 to {len(tables) - 1}"
+            )
         self._table = table = tables[number]
         self.notes = [*table.notes]
         if len(tables) > 1:
@@ -159,14 +163,12 @@ class TableReader:
         self.height, self.width = table.size or (None, None)
         first = table.read(slice(0, 1))
         self.count, self.causes = table.count, "cause" in first
-        if reading.time_unit:
-            self.unit = TimeUnit(reading.time_unit, "declared")
-        elif said := table.unit or named_unit(table.heading):
-            self.unit = TimeUnit(said, "read")
-        else:
-            self.unit = self._guessed() if first["t"].dtype.kind in "iufb" else TimeUnit("us", "read")
+        self._numbers = first["t"].dtype.kind in "iufb"
+        self.unit = unit_of(reading.time_unit, table.unit or named_unit(table.heading), self._guessed)
 
     def _guessed(self) -> TimeUnit:
+        if not self._numbers:
+            return TimeUnit("us", "read")
         ends = (slice(0, _SAMPLE), slice(max(self.count - _SAMPLE, _SAMPLE), self.count))
         t = np.concatenate([self._table.read(part)["t"] for part in ends]).astype(np.float64) + self._table.offset
         t = t[np.isfinite(t)]

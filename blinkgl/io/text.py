@@ -23,7 +23,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit
+from blinkgl.io.clock import guessed_event_unit, named_unit, unit_of
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import guessed_order, order_line, slot_of
@@ -62,14 +62,19 @@ class TextReader:
                 size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
                 if size and self.width is None:
                     self.width, self.height = int(size[1]), int(size[2])
-                elif text and (comment or _is_heading(text)):
+                elif text and (comment or re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I)):
                     names = _names(text.lstrip("#% "))
                     order = tuple(slot_of(name.partition("@")[0]) for name in names)
                     named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
                     if not self._order and named:
                         self._order, unit = order, self._heading(dict(zip(order, names)))
                     elif not comment and not reading.columns:
-                        self._refuse_heading(text)
+                        raise AssetError(
+                            f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
+                            where=str(path),
+                            value=text,
+                            accepted="a heading such as t x y p, or --columns",
+                        )
                 elif text:
                     self._start += 3 if line.startswith(codecs.BOM_UTF8) else 0
                     break
@@ -79,11 +84,9 @@ class TextReader:
         if not self._order:
             self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
             self.notes.append(order_line(self._order))
-        self.unit = TimeUnit("us", "read")
-        if reading.time_unit or unit:
-            self.unit = TimeUnit(reading.time_unit or unit or "", "declared" if reading.time_unit else "read")
-        elif len(sample) and sample.shape[1] == len(self._order):
-            self.unit = guessed_event_unit(sample[:, self._order.index("t")], count)
+        known = len(sample) and sample.shape[1] == len(self._order)
+        guessed = lambda: guessed_event_unit(sample[:, self._order.index("t")], count)
+        self.unit = unit_of(reading.time_unit, unit if unit or known else "us", guessed)
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:
@@ -92,8 +95,9 @@ class TextReader:
             with gzip.open(self.path) if self.path.suffix.lower() == ".gz" else open(self.path, "rb") as file:
                 yield cast(BinaryIO, file)
         except (OSError, EOFError, zlib.error) as error:
-            problem = f"cannot read: {getattr(error, 'strerror', None) or error}"
-            raise AssetError(problem, where=str(self.path)) from error
+            raise AssetError(
+                f"cannot read: {getattr(error, 'strerror', None) or error}", where=str(self.path)
+            ) from error
 
     def _heading(self, names: dict[str, str]) -> str | None:
         """Return the unit that the name of t states; take the sizes that faery adds to the names of x and y."""
@@ -102,14 +106,6 @@ class TextReader:
             self.width, self.height = map(int, sizes)
             return "us"
         return named_unit(names["t"])
-
-    def _refuse_heading(self, text: str) -> None:
-        raise AssetError(
-            f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
-            where=str(self.path),
-            value=text,
-            accepted="a heading such as t x y p, or --columns",
-        )
 
     def _sample(self, file: BinaryIO, size: int = 1 << 15) -> tuple[np.ndarray, int]:
         """Return events of both ends of the file as (N, K) numbers, and about how many events it holds."""
@@ -170,10 +166,6 @@ class TextReader:
                     yield Events(x[:n], y[:n], t[:n], p[:n])
                 if not data:
                     return
-
-
-def _is_heading(text: str) -> bool:
-    return bool(re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I))
 
 
 def _names(heading: str) -> list[str]:

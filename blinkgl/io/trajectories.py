@@ -27,8 +27,9 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds
+from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds, unit_of
 from blinkgl.io.names import natural_order
+from blinkgl.io.records import decoding
 from blinkgl.io.rows import is_number, read_rows, titles_of
 from blinkgl.io.stamps import read_timestamps
 
@@ -113,16 +114,15 @@ def read_trajectory(
     Raises AssetError, naming the line: a wrong count of numbers, not finite, times that do not increase, a quaternion
     of length other than 1, a gap of 20 usual steps, no times; ConfigError as :class:`PoseFile`."""
     path = Path(path)
-    try:
+    with decoding(path, "cannot be read"):
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeError) as error:
-        raise AssetError(f"cannot be read: {' '.join(str(error).split())[:120]}", where=str(path)) from None
     form = declared.form or _form(path, text)
     readers = {"kitti": _kitti, "colmap": _colmap, "nerf": _nerf}
     table = readers.get(form or "", _columns)(path, text, replace(declared, form=form))
     if len(table.positions) < 2:
-        value = f"{len(table.positions)} poses"
-        raise AssetError("no trajectory", where=str(path), value=value, accepted="two or more")
+        raise AssetError(
+            "no trajectory", where=str(path), value=f"{len(table.positions)} poses", accepted="two or more"
+        )
     said = [] if notes is None else notes
     said += table.notes
     t_ns = _times(table, declared, path, said)
@@ -160,9 +160,8 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     heading, rows = read_rows(text)
     titles = titles_of(heading)
     roles = (declared.columns or "").replace(",", " ").split() or _roles(titles)
+    roles = roles or _COLUMNS.get(declared.form or "", "").split()
     notes: list[str] = []
-    if not roles and declared.form is not None:
-        roles = _COLUMNS[declared.form].split()
     if not rows:
         return _Table(None, np.empty((0, 3)), Rotation.identity(), [])
     if not roles:
@@ -251,8 +250,12 @@ def _matrices(path: Path, given: np.ndarray, lines: list[int]) -> tuple[np.ndarr
     wrong = (off > 0.01) | (np.linalg.det(R) < 0) if len(R) else np.zeros(0, bool)
     if wrong.any():
         i = int(np.argmax(wrong))
-        value = " ".join(f"{v:.4g}" for v in given[i].ravel()[:12])
-        raise AssetError(f"line {lines[i]} is no pose", where=str(path), value=value, accepted="rows of a rotation")
+        raise AssetError(
+            f"line {lines[i]} is no pose",
+            where=str(path),
+            value=" ".join(f"{v:.4g}" for v in given[i].ravel()[:12]),
+            accepted="rows of a rotation",
+        )
     return given[:, :3, 3], Rotation.from_matrix(R)
 
 
@@ -285,8 +288,11 @@ def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
             raise ValueError("transform_matrix")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split())[:80]
-        accepted = "frames: [{transform_matrix: 4 rows of 4, time: s}, …]"
-        raise AssetError(f"no transforms.json: {reason}", where=str(path), accepted=accepted) from None
+        raise AssetError(
+            f"no transforms.json: {reason}",
+            where=str(path),
+            accepted="frames: [{transform_matrix: 4 rows of 4, time: s}, …]",
+        ) from None
     lines = list(range(1, len(frames) + 1))
     times = [str(frame["time"]) for frame in frames] if all("time" in frame for frame in frames) else None
     return _Table(times, *_matrices(path, given, lines), lines, "s")
@@ -315,31 +321,35 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
         for number, text in zip(table.lines, texts):
             if not is_number(text):
                 raise _no_pose(path, number, [text], "a time first, a finite number")
-        unit = _unit(table, texts, declared, path)
+        # Two equal times are refused in a moment, whatever the unit.
+        stated = table.unit or ("s" if any(a == b for a, b in pairwise(texts)) else None)
+        unit = unit_of(declared.time_unit, stated, lambda: _guessed(texts, path))
         if unit.line is not None:
             notes.append(f"{path.name}: {unit.line.replace('--time-unit', 'time_unit:')}")
         values = nanoseconds(texts, unit)
         if max(map(abs, values)) >= 2**62:
             value = f"{texts[-1]} {unit.name}"
-            accepted = "time_unit: s, ms, us or ns"
-            raise AssetError("times are too large: another unit?", where=str(path), value=value, accepted=accepted)
+            raise AssetError(
+                "times are too large: another unit?",
+                where=str(path),
+                value=value,
+                accepted="time_unit: s, ms, us or ns",
+            )
         t_ns = np.array(values, np.int64)
     _check_times(t_ns, table.lines, path)
     return t_ns
 
 
-def _unit(table: _Table, texts: Sequence[str], declared: PoseFile, path: Path) -> TimeUnit:
-    if declared.time_unit is not None:
-        return TimeUnit(declared.time_unit, "declared")
-    if table.unit is not None:
-        return TimeUnit(table.unit, "read")
-    if any(a == b for a, b in pairwise(texts)):
-        return TimeUnit("s", "read")  # refused in a moment, whatever the unit
+def _guessed(texts: Sequence[str], path: Path) -> TimeUnit:
     try:
         return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
     except EventDataError as error:
-        accepted = "one unit for all, or time_unit: s, ms, us or ns"
-        raise AssetError(error.problem, where=error.where, value=error.value, accepted=accepted) from None
+        raise AssetError(
+            error.problem,
+            where=error.where,
+            value=error.value,
+            accepted="one unit for all, or time_unit: s, ms, us or ns",
+        ) from None
 
 
 def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:

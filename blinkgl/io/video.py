@@ -24,6 +24,7 @@ from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.alpha import over
 from blinkgl.io.ticks import frame_times
 from blinkgl.io.yuv import known, rgb_from_yuv
+from blinkgl.machine.closing import Finishing
 from blinkgl.machine.interrupts import uninterrupted
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ _PACKED = {
 """Formats with interleaved samples, by the planar one with the same samples."""
 
 
-class VideoWriter:
+class VideoWriter(Finishing):
     """H.264 (yuv420p, plays everywhere) from uint8 RGB frames; the container goes by the ending (.mp4, .mkv, .avi).
 
     width and height have to be even. One encoder thread: the bytes do not depend on the machine's core count. Use as a
@@ -91,20 +92,11 @@ class VideoWriter:
                 self._file.close()
             self._file = None
 
-    def __enter__(self) -> VideoWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close() if kind is None else self.abort()
-
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:  # PyAV's errors are OSErrors, or ValueErrors of a bad argument
-            self.abort()
-            raise OutputError(f"cannot write video: {_gist(error)}", where=str(self.path)) from error
-        except ValueError as error:
+        except (OSError, ValueError) as error:  # PyAV's errors are OSErrors, or ValueErrors of a bad argument
             self.abort()
             raise OutputError(f"cannot write video: {_gist(error)}", where=str(self.path)) from error
 
@@ -204,29 +196,24 @@ class VideoReader:
     def __iter__(self) -> Iterator[tuple[np.ndarray, int | None]]:
         pts, at, count = self._scan.pts, 0, 0
         damage = self._scan.damage
-        frames = self._decoded()
-        while True:
-            try:
-                frame = next(frames, None)
-            except AssetError as error:
-                damage = error.problem
-                break
-            if frame is None:
-                break
-            if frame.is_corrupt:
-                damage = damage or "a frame is corrupt"
-                break
-            time = None if pts or count >= self.count else self.times_ns[count]
-            if pts and frame.pts is not None:
-                # Packets that gave no frame are passed over, so that the others keep their times.
-                while at < len(pts) and pts[at] < frame.pts:
-                    at += 1
-                if at < len(pts) and pts[at] == frame.pts:
-                    time, at = self._scan.times_ns[at], at + 1
-                else:  # it runs back, which whoever reads the frames refuses
-                    time = round((frame.pts * self._tick - self._start) * 10**9)
-            yield self._pixels(frame), time
-            count += 1
+        try:
+            for frame in self._decoded():
+                if frame.is_corrupt:
+                    damage = damage or "a frame is corrupt"
+                    break
+                time = None if pts or count >= self.count else self.times_ns[count]
+                if pts and frame.pts is not None:
+                    # Packets that gave no frame are passed over, so that the others keep their times.
+                    while at < len(pts) and pts[at] < frame.pts:
+                        at += 1
+                    if at < len(pts) and pts[at] == frame.pts:
+                        time, at = self._scan.times_ns[at], at + 1
+                    else:  # it runs back, which whoever reads the frames refuses
+                        time = round((frame.pts * self._tick - self._start) * 10**9)
+                yield self._pixels(frame), time
+                count += 1
+        except AssetError as error:
+            damage = error.problem
         if damage or count < self.count:
             raise AssetError(
                 f"video truncated or corrupt after frame {count}{_because(damage)}",
@@ -345,9 +332,11 @@ class VideoReader:
             if stream.codec_context is None:
                 raise AssetError("cannot read video: unknown codec", where=str(self.path))
             if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
-                size = f"{stream.codec_context.width}x{stream.codec_context.height}"
                 raise AssetError(
-                    "video too large", where=str(self.path), value=size, accepted="at most 268 Mpx a frame"
+                    "video too large",
+                    where=str(self.path),
+                    value=f"{stream.codec_context.width}x{stream.codec_context.height}",
+                    accepted="at most 268 Mpx a frame",
                 )
             yield file, stream
 
@@ -381,16 +370,9 @@ def _floats(frame: av.VideoFrame) -> np.ndarray:
     return planes[0] if len(planes) == 1 else np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
 
 
-def read_exr(path: str | os.PathLike) -> np.ndarray:
+def decode_exr(data: bytes, where: str) -> np.ndarray:
     """Return (H, W, 3), (H, W, 4) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; FFmpeg
     has. Raises AssetError: undecodable."""
-    if not os.path.isfile(path):
-        raise AssetError("no such file", where=str(path))
-    return decode_exr(Path(path).read_bytes(), str(path))
-
-
-def decode_exr(data: bytes, where: str) -> np.ndarray:
-    """Return :func:`read_exr` of bytes already read."""
     av = _av(AssetError, where)
     try:
         frames = av.CodecContext.create("exr", "r").decode(av.Packet(data))

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from blinkgl.labels import grading
-from blinkgl.labels.label import Drawn, Label
+from blinkgl.labels.label import Drawn, Label, ReferenceFrame
 from blinkgl.scene.types import Scene
-
-if TYPE_CHECKING:
-    from blinkgl.render.reference import ReferenceFrame
 
 
 class Disparity(Label):

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import Drawn, Label, Towards, View
+from blinkgl.labels.label import Drawn, Label, Shot, Towards, View
 from blinkgl.labels.values import Flow
-
-if TYPE_CHECKING:
-    from blinkgl.render.passes.base import Shot
 
 
 def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:

@@ -21,8 +21,6 @@ from blinkgl.types.boxes import Boxes
 
 if TYPE_CHECKING:
     from blinkgl.labels.values import Flow
-    from blinkgl.render.passes.base import Shot
-    from blinkgl.render.reference import ReferenceFrame
 
 Towards = Literal["forward", "backward"]
 
@@ -50,13 +48,42 @@ _NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
 
 
+class Shot(Protocol):
+    """What is drawn, as a label's uniforms see it: :class:`blinkgl.render.passes.base.Shot`. ends : moments at other
+    times, by name ("forward", "backward")."""
+
+    @property
+    def moment(self) -> Any: ...
+    @property
+    def ends(self) -> Mapping[str, Any]: ...
+    @property
+    def scene(self) -> Scene: ...
+
+
+class ReferenceFrame(Protocol):
+    """What float64 rays through the pixel centres hit, (H, W, ...); :mod:`blinkgl.tools.shader_debugger.reference`
+    makes it, and tests and the shader debugger compare the labels with it."""
+
+    t_ns: int
+    hit: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    normal: np.ndarray
+    xy: np.ndarray
+    velocity: np.ndarray
+
+    def scene_flow(self, scene: Scene) -> np.ndarray:
+        """Return (H, W, 3) world units to the forward flow's time; 0 where nothing is hit."""
+        ...
+
+
 @dataclass(frozen=True)
 class View:
     """One array of a label that is shown and graded separately; most labels have only one.
 
     name, title, unit, kind : as of :class:`Label`.   of : the array (H, W[, C]) in a value.   reference : its correct
-    value, from a scene and a :class:`~blinkgl.render.reference.ReferenceFrame`.   judged_in, tolerance : unit of its
-    error, and the largest error that passes.
+    value, from a scene and a :class:`ReferenceFrame`.   judged_in, tolerance : unit of its error, and the largest error
+    that passes.
     error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the pixels' errors, or their
     "mean".
     same_triangle : compare only where both see the same triangle.   note : remark beside the result."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +13,8 @@ from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.errors import ConfigError
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import Drawn, Label, View
+from blinkgl.labels.label import Drawn, Label, ReferenceFrame, View
 from blinkgl.scene.types import Scene, SceneObject
-
-if TYPE_CHECKING:
-    from blinkgl.render.reference import ReferenceFrame
 
 Categories = tuple[tuple[str, int], ...]
 """Pattern -> number, in order."""

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import Drawn, Label, View
+from blinkgl.labels.label import Drawn, Label, ReferenceFrame, Shot, View
 from blinkgl.scene.types import FARTHEST, Scene
-
-if TYPE_CHECKING:
-    from blinkgl.render.passes.base import Shot
-    from blinkgl.render.reference import ReferenceFrame
 
 
 class Depth(Label):

@@ -20,7 +20,7 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.flow import encode_flow_npy
 from blinkgl.io.images import encode_npy
-from blinkgl.layouts.layout import Layout, Missing, append, forward_flow, growing, write_bytes
+from blinkgl.layouts.layout import BEFORE, Layout, Missing, append, forward_flow, growing, need, write_bytes
 from blinkgl.layouts.source import Source
 
 
@@ -35,11 +35,9 @@ def _divided_second(source: Source) -> Missing | None:
     return Missing(said, f"time: {{label_rate: {rate}}}")
 
 
-def _events_before(source: Source) -> Missing | None:
-    times = source.flow_times("forward")
-    if not times or times[0][0] == source.start_us + _interval_us(source):
-        return None
-    return Missing("a recording that begins a label interval before the first label", "time: {start: 0}")
+_events_before = need(
+    *BEFORE, lambda source: not (t := source.flow_times("forward")) or t[0][0] == source.start_us + _interval_us(source)
+)
 
 
 class BlinkFlow(Layout):

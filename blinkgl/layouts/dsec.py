@@ -24,7 +24,7 @@ from blinkgl.camera.pinhole import rectify_map
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml
 from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
 from blinkgl.io.images import encode_png
-from blinkgl.layouts.layout import Layout, Missing, copy, events_before, forward_flow, write_bytes, write_lines
+from blinkgl.layouts.layout import Layout, Missing, copy, events_before, forward_flow, need, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 
 DISPARITY_SCALE = 256.0
@@ -34,11 +34,17 @@ _INTERVAL_US = 100_000
 """Windows of E-RAFT, fixed in its loader."""
 
 
-def _rectified(source: Source) -> Missing | None:
-    """Return what is missing: DSEC's labels are in the rectified image; its loaders rectify only the events."""
-    if source.camera is None or source.rectified:
-        return None
-    return Missing("labels in rectified pixels", "labels: {pixels: rectified}")
+# DSEC's labels are in the rectified image; its loaders rectify only the events.
+_rectified = need(
+    "labels in rectified pixels",
+    "labels: {pixels: rectified}",
+    lambda source: source.camera is None or source.rectified,
+)
+_two_labels = need(
+    "a second label",
+    "time: {duration: 0.3, label_rate: 10}",
+    lambda source: len(source.flow_times("forward")) != 1,
+)
 
 
 def _over_100_ms(source: Source) -> Missing | None:
@@ -47,12 +53,6 @@ def _over_100_ms(source: Source) -> Missing | None:
         return None
     rate = 1e6 / (times[0][1] - times[0][0])
     return Missing(f"flow over 100 ms (labels come at {rate:g} Hz)", "time: {label_rate: 10}")
-
-
-def _two_labels(source: Source) -> Missing | None:
-    if len(source.flow_times("forward")) != 1:
-        return None
-    return Missing("a second label", "time: {duration: 0.3, label_rate: 10}")
 
 
 class Dsec(Layout):

@@ -10,13 +10,13 @@ A sample has 96 times over 2 s, the first and the last included; its clock begin
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.images import encoded
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.layouts.layout import Layout, Missing, append, growing, images, write_bytes
 from blinkgl.layouts.source import Source
@@ -59,9 +59,8 @@ class EventKubric(Layout):
             if len(part):
                 arrays = dict(x=part.x.astype(np.int16), y=part.y.astype(np.int16), t=(part.t - start_us) * 1000)
                 arrays["time_unit"] = np.array("ns")  # for readers other than ETAP's
-                buffer = io.BytesIO()
-                np.savez_compressed(buffer, p=2 * part.p.astype(np.int8) - 1, **arrays)
-                write_bytes(folder / f"events/{number:010d}.npz", buffer.getvalue())
+                packed = encoded(np.savez_compressed, p=2 * part.p.astype(np.int8) - 1, **arrays)
+                write_bytes(folder / f"events/{number:010d}.npz", packed)
         return []
 
     @staticmethod
@@ -71,6 +70,6 @@ class EventKubric(Layout):
             "target_points": (tracks["target_points"][:, :TIMES] + 0.5).astype(np.float32),
             "occluded": tracks["occluded"][:, :TIMES],
         }
-        buffer = io.BytesIO()
-        np.save(buffer, np.array(table, dtype=object), allow_pickle=True)  # the loader reads a pickled table
-        write_bytes(folder / "annotations.npy", buffer.getvalue())
+        # The loader reads a pickled table.
+        pickled = encoded(np.save, np.array(table, dtype=object), allow_pickle=True)
+        write_bytes(folder / "annotations.npy", pickled)

@@ -24,8 +24,19 @@ from blinkgl.layouts.tapvid import TapVid
 # ---------------------------------------------------------------------------------------------------------------------
 # The available layouts.
 
-_ROWS = (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag())
-LAYOUTS: dict[str, Layout] = {row.name: row for row in _ROWS}
+LAYOUTS: dict[str, Layout] = {}
+
+
+def register(layout: Layout) -> Layout:
+    """Add a layout to the table that `blinkgl export` reads, and return it. Raises TypeError: its name is taken."""
+    if layout.name in LAYOUTS:
+        raise TypeError(f"layout '{layout.name}': there is one already")
+    LAYOUTS[layout.name] = layout
+    return layout
+
+
+for _layout in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()):
+    register(_layout)
 
 
 def layout_of(name: str) -> Layout:

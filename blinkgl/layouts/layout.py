@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.hdf5 import growing_dataset, packing, write_rows
 from blinkgl.layouts.source import Source
 
 
@@ -58,28 +59,25 @@ class Layout:
         raise NotImplementedError
 
 
-def forward_flow(source: Source) -> Missing | None:
-    """Require forward flow, as nearly every layout does."""
-    return None if source.flow_times("forward") else Missing("forward flow", "labels: {flow: [forward]}")
+def need(what: str, yaml: str, there: Callable[[Source], Any]) -> Need:
+    """Return a check for what is always called the same.   there : whether a sequence has it, or another check reports
+    it."""
+    return lambda source: None if there(source) else Missing(what, yaml)
 
 
-def events_before(source: Source) -> Missing | None:
-    """Require events of an interval before the first label, where loaders begin."""
-    times = source.flow_times("forward")
-    if not times or source.start_us <= 2 * times[0][0] - times[0][1]:
-        return None
-    return Missing("a recording that begins a label interval before the first label", "time: {start: 0}")
-
-
-def images(source: Source) -> Missing | None:
-    """Require images of the event camera."""
-    return None if source.image_times else Missing("images", "labels: {images: true}")
+forward_flow = need("forward flow", "labels: {flow: [forward]}", lambda source: source.flow_times("forward"))
+images = need("images", "labels: {images: true}", lambda source: source.image_times)
+BEFORE = "a recording that begins a label interval before the first label", "time: {start: 0}"
+events_before = need(
+    *BEFORE, lambda source: not (t := source.flow_times("forward")) or source.start_us <= 2 * t[0][0] - t[0][1]
+)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Writing below an export's folder.
 
 _ROWS = 1 << 16
+GZIP = packing("gzip", 0)
 
 
 def copy(source: Path, target: Path) -> None:
@@ -106,21 +104,9 @@ def growing(
 ) -> h5py.Dataset:
     """Return an empty data set of rows of ``shape``, for :func:`append`: gzip, which every HDF5 reads without a
     plugin."""
-    return file.create_dataset(
-        name,
-        (0, *shape),
-        dtype,
-        maxshape=(None, *shape),
-        chunks=(rows, *shape),
-        compression="gzip",
-        compression_opts=1,
-        shuffle=True,
-        track_times=False,
-    )
+    return growing_dataset(file, name, (0, *shape), dtype, (rows, *shape), "gzip")
 
 
 def append(data: h5py.Dataset, rows: np.ndarray) -> None:
     """Append ``rows``."""
-    start = len(data)
-    data.resize(start + len(rows), axis=0)
-    data[start:] = rows
+    write_rows(data, len(data), rows)

@@ -19,31 +19,28 @@ import numpy as np
 
 from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
-from blinkgl.layouts.layout import Layout, Missing, append, copy, growing, images
+from blinkgl.layouts.layout import GZIP, Layout, append, copy, growing, images, need
 from blinkgl.layouts.source import Source
 
 LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000
-_FLOW = "labels: {flow: [0.1, 0.2, 0.3, 0.4, 0.5]}"
 
 
-def _flow_over_half_a_second(source: Source) -> Missing | None:
-    if any(_leads(source, k) for k in range(len(source.interval_times))):
-        return None
-    return Missing("flow to several times, the last one 0.5 s after the label", _FLOW)
-
-
-def _samples(source: Source) -> Missing | None:
-    if _flow_over_half_a_second(source) or not source.image_times or labels_of(source):
-        return None
-    said = "a label with 0.4 s before it, 0.6 s after it, and images at it and 0.5 s later"
-    return Missing(said, "time: {duration: 1, label_rate: 2}")
-
-
-def _sensor_pixels(source: Source) -> Missing | None:
-    """Require events in the sensor's pixels, which MultiFlow does not rectify."""
-    if source.camera is None or isinstance(source.camera, PinHole) or not source.rectified:
-        return None
-    return Missing("labels in the sensor's pixels", "labels: {pixels: sensor}")
+_flow_over_half_a_second = need(
+    "flow to several times, the last one 0.5 s after the label",
+    "labels: {flow: [0.1, 0.2, 0.3, 0.4, 0.5]}",
+    lambda source: any(_leads(source, k) for k in range(len(source.interval_times))),
+)
+_samples = need(
+    "a label with 0.4 s before it, 0.6 s after it, and images at it and 0.5 s later",
+    "time: {duration: 1, label_rate: 2}",
+    lambda source: _flow_over_half_a_second(source) or not source.image_times or labels_of(source),
+)
+# MultiFlow does not rectify.
+_sensor_pixels = need(
+    "labels in the sensor's pixels",
+    "labels: {pixels: sensor}",
+    lambda source: source.camera is None or isinstance(source.camera, PinHole) or not source.rectified,
+)
 
 
 class MultiFlow(Layout):
@@ -105,14 +102,7 @@ def _write_flow(flow: np.ndarray, path: Path) -> None:
     with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with h5py.File(path, "w") as file:
-            file.create_dataset(
-                "flow",
-                data=flow.astype(np.float32),
-                compression="gzip",
-                compression_opts=1,
-                shuffle=True,
-                track_times=False,
-            )
+            file.create_dataset("flow", data=flow.astype(np.float32), track_times=False, **GZIP)
 
 
 def _write_events(source: Source, label_us: int, path: Path) -> None:

@@ -13,20 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.io.tracks import TRACKS, read_tracks
-from blinkgl.layouts.layout import Layout, Missing, images, write_bytes
+from blinkgl.layouts.layout import Layout, images, need, write_bytes
 from blinkgl.layouts.source import Source
 
-
-def _tracks(source: Source) -> Missing | None:
-    return None if source.has(TRACKS) else Missing("point tracks", "tracks: {points: 256}")
-
-
-def _at_images(source: Source) -> Missing | None:
-    if not source.has(TRACKS) or not source.image_times:
-        return None
-    if len(_common(source, np.array(source.track_times))[0]) > 1:
-        return None
-    return Missing("tracks at the images' times", "tracks: {points: 256}, without a rate")
+_tracks = need("point tracks", "tracks: {points: 256}", lambda source: source.has(TRACKS))
+_at_images = need(
+    "tracks at the images' times",
+    "tracks: {points: 256}, without a rate",
+    lambda source: (
+        _tracks(source) or not source.image_times or len(_common(source, np.array(source.track_times))[0]) > 1
+    ),
+)
 
 
 class TapVid(Layout):

@@ -64,6 +64,11 @@ def _guarded(where: str, load):
         raise ConfigError("the plug-in fails", where=where, value=said, accepted="a file that imports") from error
 
 
+def plugin_files() -> list[str]:
+    """Return the paths of the files that are loaded here, for workers on other machines."""
+    return [str(path) for path in _PATHS.values()]
+
+
 def plugin_versions() -> dict[str, str]:
     """Return what manifests say of the loaded plug-ins: "plug-in NAME" -> the beginning of its SHA-256."""
     return {_PREFIX + name: _LOADED[name] for name in sorted(_LOADED)}

@@ -32,6 +32,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.executor import Executor, Inline, Local, StartError, several_cards
 from blinkgl.dataset.messages import Message
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.machine.closing import Closing
 from blinkgl.online.cuts import Sample
 from blinkgl.online.job import MIX, StreamJob, flow_labels
 from blinkgl.online.maker import sample_file
@@ -66,7 +67,7 @@ class StreamStats:
         return time.monotonic() - self.opened
 
 
-class SampleStream:
+class SampleStream(Closing):
     """Endless samples. Sample n does not depend on who requests it; :meth:`take` returns it once.
 
     workers : rendering processes; 0 renders in this process, when a sample is requested. (A copy in a loader process
@@ -196,12 +197,6 @@ class SampleStream:
             self._executor.close()
         self._executor = None
         shutil.rmtree(self.spool, ignore_errors=True)
-
-    def __enter__(self) -> SampleStream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- the owner's side --
 

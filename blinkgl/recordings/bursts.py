@@ -9,7 +9,7 @@ so pixels near their level fire. Their number depends on light, their times do n
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_dilation, median_filter
 
 from blinkgl.types.events import Events
 
@@ -39,9 +39,7 @@ def frame_bursts(events: Events, interval_us: float) -> np.ndarray:
     pure = np.maximum(on, count - on) >= ONE_POLARITY * count
     high = (count > TIMES * usual + LEAST) & pure
     # A burst's flanks: bins beside it that are higher than usual.
-    wide = high.copy()
-    wide[1:] |= high[:-1]
-    wide[:-1] |= high[1:]
+    wide = binary_dilation(high)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wide, [False]]).astype(np.int8)))
     spans = begin + BIN_US * edges.reshape(-1, 2).astype(np.int64)
     middle = spans.mean(axis=1)

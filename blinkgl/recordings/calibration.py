@@ -42,23 +42,24 @@ _STILL = "A still scene of middle brightness was assumed: what depends on light,
 
 @dataclass(frozen=True)
 class Judged:
-    """A simulation against the recording in one half. Rates are over all pixels that count."""
+    """A simulation against the recording in one half. Rates are over all pixels that count.
+
+    interval_distance : Kolmogorov-Smirnov distance of the intervals between the events of a pixel.
+    polarity_correlation : of polarity sums per interval, blurred by a pixel; NaN for a still scene.
+    count_correlation : of the events of single pixels.   still_hz : rate of the pixels that saw no change, events per
+    second and pixel; NaN where there are too few of them.   told : AUC of the judge (:mod:`~blinkgl.recordings.judge`);
+    NaN where there are too few patches."""
 
     events: int
     recorded: int
     on_off: float
     recorded_on_off: float
     interval_distance: float
-    """Kolmogorov-Smirnov distance of the intervals between the events of a pixel"""
     polarity_correlation: float
-    """of polarity sums per interval, blurred by a pixel; NaN for a still scene"""
     count_correlation: float
-    """of the events of single pixels"""
     still_hz: float
-    """rate of the pixels that saw no change, events per second and pixel; NaN where there are too few of them"""
     recorded_still_hz: float
     told: float = float("nan")
-    """AUC of the judge (:mod:`~blinkgl.recordings.judge`); NaN where there are too few patches"""
 
     @property
     def rate_ratio(self) -> float:

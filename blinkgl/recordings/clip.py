@@ -23,7 +23,7 @@ from blinkgl.io.formats import open_events
 from blinkgl.io.frames import NOTHING, Declared, FrameSource, open_frames
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.bursts import frame_bursts, inside_any
-from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
+from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET, spanned
 from blinkgl.recordings.decoding import UNKNOWN, Codes, OwnFrames, meaning
 from blinkgl.recordings.frame_noise import Steadied
 from blinkgl.timeline.interpolate import Displacement, motion
@@ -253,9 +253,7 @@ def _delay(found_us: int, correlation: float, reading: FrameReading) -> int:
 
 def _spanned(events: Events, clock: np.ndarray, where: str) -> np.ndarray:
     """Return the indices of the intervals between frames that the events span."""
-    # The first interval may begin a little before the first event, the last end a little after the last.
-    slack = (clock[1:] - clock[:-1]) // 4
-    inside = np.flatnonzero((clock[:-1] >= events.t[0] - slack) & (clock[1:] <= events.t[-1] + 1 + slack))
+    inside = spanned(clock, int(events.t[0]), int(events.t[-1]) + 1)
     if len(inside) < 2:
         raise EventDataError(
             "the recording spans fewer than two intervals between frames",
@@ -418,7 +416,7 @@ def _match(events: Events, changes: np.ndarray, clock_us: np.ndarray, pairs: lis
 def stuck_pixels(events: Events, size: tuple[int, int]) -> np.ndarray:
     """Return pixels that fire many times as often as those around them, (H, W) bool. Their events do not depend on
     light (``readout.pixels`` models them), and two of them can dominate a correlation of counts."""
-    where = events.y.astype(np.int64) * size[1] + events.x
+    where = events.pixel(size[1])
     count = np.bincount(where, minlength=size[0] * size[1]).reshape(size)
     return count > STUCK_TIMES * median_filter(count, 5, mode="nearest") + STUCK_LEAST
 
@@ -431,7 +429,7 @@ def polarity_sums(events: Events, size: tuple[int, int]) -> np.ndarray:
 
 def polarity_counts(events: Events, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return ON and OFF events of the pixels, (H, W) float64 each."""
-    where = events.y.astype(np.int64) * size[1] + events.x
+    where = events.pixel(size[1])
     count = lambda kind: np.bincount(where[events.p == kind], minlength=size[0] * size[1]).reshape(size).astype(float)
     return count(1), count(0)
 

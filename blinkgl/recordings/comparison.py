@@ -39,21 +39,21 @@ shifts."""
 
 @dataclass(eq=False)
 class RecordingSide:
-    """One recording inside the compared time span. Maps are (H, W), times µs."""
+    """One recording inside the compared time span. Maps are (H, W), times µs.
+
+    rate_hz : (K,) events per second in each interval.   iei : (70,) inter-event intervals per bin of IEI_EDGES_US.
+    frame_correlation : (K,) Pearson correlation over the pixels of the polarity sum with the change of ln(I + 10), both
+    blurred by BLUR_PX.   implied_threshold : (K,) change of ln(I + 10) per event, slope through 0 of change on polarity
+    sum."""
 
     name: str
     count: int = 0
     on: int = 0
     rate_hz: np.ndarray = field(default=None, repr=False)
-    """(K,) events per second in each interval"""
     counts: np.ndarray = field(default=None, repr=False)
     iei: np.ndarray = field(default=None, repr=False)
-    """(70,) inter-event intervals per bin of IEI_EDGES_US"""
     frame_correlation: np.ndarray | None = field(default=None, repr=False)
-    """(K,) Pearson correlation over the pixels of the polarity sum with the change of ln(I +
-    10), both blurred by BLUR_PX"""
     implied_threshold: np.ndarray | None = field(default=None, repr=False)
-    """(K,) change of ln(I + 10) per event: slope through 0 of change on polarity sum"""
 
     @property
     def size(self) -> str:
@@ -76,21 +76,21 @@ class RecordingSide:
 @dataclass(eq=False)
 class Comparison:
     """Result of :func:`compare`. ``b`` is None when there was one recording. Pixel-wise results are None where the two
-    differ in size."""
+    differ in size.
+
+    pixel_correlation : Pearson correlation over the pixels of the event counts of a and b.   polarity_correlation :
+    (K,) the same of their blurred polarity sums in each interval.   told_apart : how well a judge distinguishes b from
+    a; None: not requested, or there is no b.   halves : how well it distinguishes the halves of each recording, a's
+    first.   notes : what was guessed, left out or unusual when files and frames were read, a line each."""
 
     edges_us: np.ndarray
     a: RecordingSide
     b: RecordingSide | None
     pixel_correlation: float | None = None
-    """Pearson correlation over the pixels of the event counts of a and b"""
     polarity_correlation: np.ndarray | None = None
-    """(K,) Pearson correlation over the pixels of the blurred polarity sums of a and b in each interval"""
     told_apart: Judgement | None = None
-    """how well a judge distinguishes b from a; None: not requested, or there is no b"""
     halves: tuple[Judgement, ...] = ()
-    """how well it distinguishes the halves of each recording, a's first"""
     notes: list[str] = field(default_factory=list)
-    """what was guessed, left out or unusual when files and frames were read, a line each"""
 
     @property
     def same_size(self) -> bool:
@@ -111,8 +111,7 @@ class Comparison:
     def iei_distance(self) -> float:
         """Return the largest difference of the two cumulative distributions of the inter-event interval
         (Kolmogorov-Smirnov distance)."""
-        cdf = [np.cumsum(s.iei) / max(s.iei.sum(), 1) for s in (self.a, self.b)]
-        return float(np.abs(cdf[0] - cdf[1]).max())
+        return histogram_distance(self.a.iei, self.b.iei)
 
     def rows(self) -> list[tuple[str, str, str]]:
         """Return (quantity, a, b) as text, for a table; quantities of the pair are in the last column."""
@@ -225,10 +224,8 @@ def compare(
     changes: Iterator[np.ndarray | None]
     notes: list[str] = []
     if frames is not None:
-        declared = replace(declared, zero_time=zero_time or declared.zero_time)
-        edges, changes, notes = _frame_intervals(
-            frames, declared, gamma, round(frame_delay_ms * 1000), start, stop, files
-        )
+        zero = replace(declared, zero_time=zero_time or declared.zero_time)
+        edges, changes, notes = _frame_intervals(frames, zero, gamma, round(frame_delay_ms * 1000), start, stop, files)
     else:
         step = round(interval_ms * 1000)
         # What remains at the end is an interval of its own length, or lengthens the last one.
@@ -243,8 +240,7 @@ def compare(
             accepted="recordings that overlap (seconds shown), or --zero-time",
         )
     result = _accumulate(files, shifts, edges, changes)
-    result.notes += [f"{file.path}: {line}" for file in files for line in file.notes]
-    result.notes += notes
+    result.notes += [f"{file.path}: {line}" for file in files for line in file.notes] + notes
     if judge:
         result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))
     return result
@@ -396,15 +392,9 @@ def _frame_intervals(
             where="compare",
             accepted="frames of the recordings' size",
         )
-    # The first interval may begin a little before the first event, the last end a little after the last one.
-    slack = lambda a, b: (b - a) // 4
     times = np.array([t // 1000 + delay_us for _, t, _ in source], np.int64)
-    inside = [
-        k
-        for k in range(len(times) - 1)
-        if times[k] >= start - slack(times[k], times[k + 1]) and times[k + 1] <= stop + slack(times[k], times[k + 1])
-    ]
-    if not inside:
+    inside = spanned(times, start, stop)
+    if not len(inside):
         return np.empty(0, np.int64), iter(()), source.notes
     lo, hi = inside[0], inside[-1] + 1
     own = OwnFrames((source.height, source.width), "linear")
@@ -421,6 +411,18 @@ def _frame_intervals(
                 before = log
 
     return times[lo : hi + 1], changes(), [*source.notes, *found.notes]
+
+
+def histogram_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the Kolmogorov-Smirnov distance of two histograms with the same bins."""
+    return float(np.abs(np.cumsum(a) / max(a.sum(), 1) - np.cumsum(b) / max(b.sum(), 1)).max())
+
+
+def spanned(times: np.ndarray, start: int, stop: int) -> np.ndarray:
+    """Return the indices of the intervals between times (µs) that [start, stop) spans: the first may begin a little
+    earlier, the last end a little later."""
+    slack = np.diff(times) // 4
+    return np.flatnonzero((times[:-1] >= start - slack) & (times[1:] <= stop + slack))
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,14 +106,9 @@ def _judged(x: np.ndarray, label: np.ndarray, window: np.ndarray, window_us: flo
         raise EventDataError(
             "all events have the same time, so a judge cannot be trained and tested", where="compare --judge"
         )
-    return Judgement(
-        float(np.mean(found)), float(np.std(found)), len(x), float(window_us), telling=tuple(_telling(gains))
-    )
-
-
-def _telling(gains: np.ndarray) -> Iterator[tuple[str, float]]:
-    for k in np.argsort(-gains)[:_TELLING]:
-        yield NAMES[k], float(gains[k] / max(gains.sum(), 1e-30))
+    shares = gains / max(gains.sum(), 1e-30)
+    telling = tuple((NAMES[k], float(shares[k])) for k in np.argsort(-gains)[:_TELLING])
+    return Judgement(float(np.mean(found)), float(np.std(found)), len(x), float(window_us), telling=telling)
 
 
 def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -145,8 +139,8 @@ def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.nda
 def area(score: np.ndarray, label: np.ndarray) -> float:
     """Return the area under the curve of true against false positives: how often one of the second kind has the higher
     score (Mann and Whitney), ties half."""
-    from scipy.stats import rankdata
+    from scipy.stats import mannwhitneyu
 
     positive = label > 0.5
-    n, m = int(positive.sum()), int((~positive).sum())
-    return float((rankdata(score)[positive].sum() - n * (n + 1) / 2) / (n * m))
+    above = mannwhitneyu(score[positive], score[~positive], method="asymptotic").statistic
+    return float(above / (positive.sum() * (~positive).sum()))

@@ -125,7 +125,7 @@ def fit_pixels_of(
     say = progress or (lambda *_: None)
     height, width = size
     looked = np.ones(height * width, bool) if used is None else np.asarray(used, bool).reshape(-1)
-    events = events.part(looked[events.y.astype(np.int64) * width + events.x])
+    events = events.part(looked[events.pixel(width)])
     if len(events) < 2 * LEAST_EVENTS:
         raise _too_few(name, len(events) // 2)
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
@@ -134,7 +134,7 @@ def fit_pixels_of(
     if min(map(len, halves)) < LEAST_EVENTS:
         raise _too_few(name, min(map(len, halves)))
     seconds = ((middle - t0) / 1e6, (t1 - middle) / 1e6)
-    pixel = halves[0].y.astype(np.int64) * width + halves[0].x
+    pixel = halves[0].pixel(width)
     counts = np.bincount(pixel, minlength=height * width)
     untold: dict[str, str] = {}
     say("counts of pixels", 0.1)
@@ -184,10 +184,8 @@ def fit_pixels_of(
     noise.step(Events.empty(), 0)
     # As long as the half that was not fitted, with another seed: the law is judged, not its draws.
     made = noise.step(Events.empty(), t1 - middle)
-    made = made.part(looked[made.y.astype(np.int64) * width + made.x])
-    ours, theirs = (
-        np.bincount(e.y.astype(np.int64) * width + e.x, minlength=height * width) for e in (made, halves[1])
-    )
+    made = made.part(looked[made.pixel(width)])
+    ours, theirs = (np.bincount(e.pixel(width), minlength=height * width) for e in (made, halves[1]))
     return PixelFit(
         name,
         size,
@@ -197,7 +195,7 @@ def fit_pixels_of(
         len(halves[1]),
         len(made),
         (theirs[theirs > 0], ours[ours > 0]),
-        (_gaps(halves[1], width), _gaps(made, width)),
+        (_gaps(halves[1], halves[1].pixel(width)), _gaps(made, made.pixel(width))),
         seconds,
     )
 
@@ -223,9 +221,8 @@ def _within(key: str, value: float) -> float:
     return float(np.clip(value, ends["ge"], ends["le"]))
 
 
-def _gaps(events: Events, width: int) -> np.ndarray:
-    """Return times between a pixel's events, µs."""
-    pixel = events.y.astype(np.int64) * width + events.x
+def _gaps(events: Events, pixel: np.ndarray) -> np.ndarray:
+    """Return times between a pixel's events, µs.   pixel : (N,) where each is."""
     order = np.lexsort((events.t, pixel))
     return np.diff(events.t[order])[np.diff(pixel[order]) == 0]
 
@@ -292,9 +289,7 @@ def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: f
     if no shorter ones are expected; 0 where no pixel is active enough."""
     # Only pixels that fire nearly without a pause show the shortest possible interval.
     busy = counts >= max(100, 0.3 * counts.max())
-    inside = busy[pixel]
-    order = np.lexsort((events.t[inside], pixel[inside]))
-    gap = np.diff(events.t[inside][order])[np.diff(pixel[inside][order]) == 0] * 1e-6
+    gap = _gaps(events.part(busy[pixel]), pixel[busy[pixel]]) * 1e-6
     if len(gap) < 200:
         return 0.0
     low = float(np.percentile(gap, 2))
@@ -332,8 +327,8 @@ class _Counts:
         decades = int(np.ceil(_PER_DECADE * np.log10(top / _EXACT))) + 1
         # Hot pixels have up to millions of events; bins of equal ratio keep the table small.
         edges = _EXACT * 10 ** (np.arange(decades + 1) / _PER_DECADE)
+        # Upper ends of the bins; the last one is open.
         self._edges = np.concatenate([np.arange(_EXACT + 1), edges[1:]]) + 0.5
-        """upper ends of the bins; the last one is open"""
         where = np.searchsorted(self._edges, counts)
         self._observed = np.bincount(where, minlength=len(self._edges) + 1)
         self._mean = float(counts.mean())

@@ -55,20 +55,22 @@ class Search:
         progress: Callable[[float], None] = lambda _: None,
     ):
         """Prepare a search. parts : clips of one camera, and the number of intervals used of each: one set of
-        parameters for all."""
+        parameters for all. ``keys`` are the parameters of the search, ``place`` their logarithms so far."""
         self._parts, self._base, self._seed, self._progress = parts, base, seed, progress
         # What a model has no parameter for it would buy with those that are for something else.
         one = lambda clip, stop: target(sums(clip.events, clip, 0, stop), together=base.one_threshold)
         self.target = Targets([one(*part) for part in parts])
         if not len(self.target.values):
-            pixels = sum(int(clip.used.sum()) for clip, _ in parts)
-            raise EventDataError("too few pixels to estimate an emulator's parameters", value=pixels)
+            raise EventDataError(
+                "too few pixels to estimate an emulator's parameters",
+                value=sum(int(clip.used.sum()) for clip, _ in parts),
+            )
         self.evaluations = 0
         self.untold: dict[str, str] = {}
         self.cost = float("nan")
         self._set: dict[str, Any] = {}
-        self._keys: list[str] = []
-        self._at: np.ndarray = np.empty(0)
+        self.keys: list[str] = []
+        self.place: np.ndarray = np.empty(0)
         self._jacobian: np.ndarray = np.empty((0, 0))
         self._residual: np.ndarray = np.empty(0)
         self._planned = 1
@@ -95,23 +97,13 @@ class Search:
         tried = qmc.scale(qmc.Sobol(len(keys), seed=self._seed).random(TRIED), *ends.T)
         tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
         self._planned = len(tried) + starts * 20 * (len(keys) + 2)
-        ordered = tried[np.argsort(self._costs(keys, tried))]
+        ordered = tried[np.argsort([_loss(self._difference(keys, at)) for at in tried])]
         self.target.beside(self._sums(keys, ordered[0]), floor="expected")
         first = [self._descend(keys, one, steps=_FEW_STEPS) for one in _apart(ordered, _EACH * starts)]
         first.sort(key=lambda found: found[0])
-        self._keys = keys
-        self._at = min((self._descend(keys, at) for _, at in first[:starts]), key=lambda found: found[0])[1]
-        return self._at
-
-    @property
-    def keys(self) -> list[str]:
-        """Return the parameters of the search."""
-        return self._keys
-
-    @property
-    def place(self) -> np.ndarray:
-        """Return the logarithms of the present parameters."""
-        return self._at
+        self.keys = keys
+        self.place = min((self._descend(keys, at) for _, at in first[:starts]), key=lambda found: found[0])[1]
+        return self.place
 
     def run(self, keys: list[str], start: np.ndarray) -> None:
         """Run the search. start : logarithms of the parameters, where :meth:`roughly` ended."""
@@ -128,7 +120,7 @@ class Search:
             if floor == "lowest":
                 best = self._scanned(keys, best)
         while True:
-            self.cost, self._at, self._keys = best[0], best[1], keys
+            self.cost, self.place, self.keys = best[0], best[1], keys
             self._residual = self._difference(keys, best[1])
             self._jacobian = self._derivatives(keys, best[1], self._residual)
             spread = self._spread()
@@ -154,12 +146,12 @@ class Search:
                 self.untold[key] = f"told only to be {side} than its default ({within})"
                 best = self._descend(keys, others)
             if not keys:
-                self.cost, self._at = best
-                self._keys = []
+                self.cost, self.place = best
+                self.keys = []
                 return
 
     def config(self, keys: list[str] | None = None, at: np.ndarray | None = None) -> EmulatorConfig:
-        keys, at = (self._keys, self._at) if keys is None or at is None else (keys, at)
+        keys, at = (self.keys, self.place) if keys is None or at is None else (keys, at)
         values = {key: float(np.exp(v)) for key, v in zip(keys, at)}
         base = self._base.model_dump()
         if base.get("threshold_ratio") is not None:  # of two thresholds that now go their own ways
@@ -167,12 +159,12 @@ class Search:
         return emulator_config({**base, **self._set, **values})
 
     def values(self) -> dict[str, float]:
-        return {key: float(np.exp(v)) for key, v in zip(self._keys, self._at)}
+        return {key: float(np.exp(v)) for key, v in zip(self.keys, self.place)}
 
     def uncertainty(self) -> dict[str, float]:
         """Return the uncertainty by chance of the recording and the simulation, larger where the model does not fit:
         from the change of the fit when a group of pixels is left out."""
-        if not self._keys:
+        if not self.keys:
             return {}
         t = self.target
         weights = self._robust()
@@ -187,7 +179,7 @@ class Search:
         known = t.chance > LEAST_CHANCE * t.error
         off = self._residual[:count][known] / t.weight[known] * t.error[known] / t.chance[known]
         misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
-        return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self._keys, self._at, spread)}
+        return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self.keys, self.place, spread)}
 
     def _spread(self) -> np.ndarray:
         told = (self._jacobian * self._robust()[:, None])[: len(self.target.values)]
@@ -200,9 +192,9 @@ class Search:
     def _prior(self) -> np.ndarray:
         """Return the information on the logarithms from typical cameras; where only the ends of a range are known, a
         normal law of the same width."""
-        ends = self._ends(self._keys)
+        ends = self._ends(self.keys)
         wide = 12 / np.diff(ends, axis=1)[:, 0] ** 2
-        _, scale = self._usual(self._keys)
+        _, scale = self._usual(self.keys)
         return np.diag(np.where(scale > 0, scale**2, wide))
 
     def _usual(self, keys: list[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -246,9 +238,6 @@ class Search:
     def _off(self, keys: list[str], at: np.ndarray) -> np.ndarray:
         return self.target.residual(self._sums(keys, at))
 
-    def _costs(self, keys: list[str], places: np.ndarray) -> np.ndarray:
-        return np.array([_loss(self._difference(keys, at)) for at in places])
-
     def _derivatives(self, keys: list[str], at: np.ndarray, here: np.ndarray) -> np.ndarray:
         """Return derivatives by steps of ``STEP``, or wider ones where that has hardly any effect."""
         columns = []
@@ -267,7 +256,7 @@ class Search:
         """Search where a descent has no gradient: far from where a parameter matters (a dead time shorter than any
         interval, an offset darker than any pixel). Each weakly determined parameter is held at values over its whole
         range while the others follow; the descent restarts from a better point."""
-        self._keys, self._at, self._residual = keys, best[1], self._difference(keys, best[1])
+        self.keys, self.place, self._residual = keys, best[1], self._difference(keys, best[1])
         self._jacobian = self._derivatives(keys, best[1], self._residual)
         vague = [i for i, spread in enumerate(self._spread()) if spread > VAGUE]
         start, numbers = best, len(self.target.values)

@@ -61,39 +61,36 @@ class FrameUse:
 
 @dataclass
 class SimulationReport:
-    """Record of a simulation; complete when the generator is exhausted."""
+    """Record of a simulation; complete when the generator is exhausted.
+
+    frames : given.   steps : frames that the emulator saw, interpolated ones included.   saturated : events cut by the
+    emulator's max_events_per_step.   lost : events that found the queue of the sensor's read-out full.   late : events
+    that were still on the read-out's bus at the last frame.   causes : events by cause, "signal", "leak", "shot" and
+    "hot"; empty unless ``causes`` of the emulator is set.   displacement : for interpolate="motion".   moved_px : for
+    interpolate="linear", 99th percentile of the dense flow between a few pairs of given frames.   assumed_gamma :
+    assumed curve of codes without a given one, that of the sensor's own frames, srgb of integers, linear of floats.
+    fitting : conversion of frames to the sensor's size; None: not needed.   noise : of the frames, from which no events
+    were made; None: exact frames, or it was kept.   notes : what was read that is unusual, guessed or left out, a line
+    each, with the option that overrules it.   caveats : problems of the frames, a line each: few codes, clipped,
+    repeated, flicker."""
 
     frames: int = 0
-    """given"""
     steps: int = 0
-    """frames that the emulator saw, interpolated ones included"""
     first_ns: int = 0
     last_ns: int = 0
     events: int = 0
     on: int = 0
     saturated: int = 0
-    """events cut by the emulator's max_events_per_step"""
     lost: int = 0
-    """events that found the queue of the sensor's read-out full"""
     late: int = 0
-    """events that were still on the read-out's bus at the last frame"""
     causes: dict[str, int] = field(default_factory=dict)
-    """events by cause, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
-    """for interpolate="motion" """
     moved_px: list[float] = field(default_factory=list)
-    """for interpolate="linear": 99th percentile of the dense flow between a few pairs of given frames"""
     assumed_gamma: str | float | None = None
-    """assumed curve of codes without a given one: that of the sensor's own frames, srgb of integers, linear of
-    floats"""
     fitting: Fitting | None = None
-    """conversion of frames to the sensor's size; None: not needed"""
     noise: FrameNoise | None = None
-    """noise of the frames, from which no events were made; None: exact frames, or it was kept"""
     notes: list[str] = field(default_factory=list)
-    """what was read that is unusual, guessed or left out, a line each, with the option that overrules it"""
     caveats: list[str] = field(default_factory=list)
-    """problems of the frames, a line each: few codes, clipped, repeated, flicker"""
 
     @property
     def duration_s(self) -> float:
@@ -368,25 +365,22 @@ def file_to_events(
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
     iterator = iter(frames)
-    first = next(iterator)
-    second = next(iterator, None)
-    start_us = first[1] // 1000
-    gap_ns = (second[1] - first[1]) if second else 10**9
-
-    def given() -> Iterator:
-        for i, (frame, t_ns, name) in enumerate(itertools.chain([first], [second] if second else [], iterator)):
-            yield frame, t_ns, f"{source}: frame {i} ({name})"
-
+    first = list(itertools.islice(iterator, 2))
+    start_us, gap_ns = first[0][1] // 1000, first[-1][1] - first[0][1]
+    given = enumerate(itertools.chain(first, iterator))
     steps = simulated_steps(
-        given(), use, emulator=emulator, seed=seed, readout=readout, report=report, fitting=report.fitting
+        ((frame, t_ns, f"{source}: frame {i} ({name})") for i, (frame, t_ns, name) in given),
+        use,
+        emulator=emulator,
+        seed=seed,
+        readout=readout,
+        report=report,
+        fitting=report.fitting,
     )
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
-        video = None
-        if preview is not None:
-            shown = _preview(preview, height, width, start_us, gap_ns, overwrite)
-            video = stack.enter_context(shown)
-        done = 0
+        shown = None if preview is None else _preview(preview, height, width, start_us, gap_ns, overwrite)
+        video, done = shown and stack.enter_context(shown), 0
         for step in steps:
             if video is not None:
                 video.panels[0].add_events(step.events)
@@ -403,10 +397,10 @@ def file_to_events(
 def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | dict) -> None:
     """Raise OutputError for an ending that is not an event file's, or a format that cannot store the emulator's
     causes."""
-    from blinkgl.io.formats import WITH_CAUSES, output_format
+    from blinkgl.io.formats import FORMATS, output_format
 
     kind = output_format(target)
-    if getattr(emulator_config(emulator), "causes", False) and kind not in WITH_CAUSES:
+    if getattr(emulator_config(emulator), "causes", False) and not FORMATS[kind].causes:
         raise OutputError(
             f"{kind} cannot hold the causes of events",
             where=str(target),

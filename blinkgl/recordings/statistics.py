@@ -15,7 +15,7 @@ import numpy as np
 from blinkgl.machine.kernels import kernel
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
-from blinkgl.recordings.comparison import BLUR_PX
+from blinkgl.recordings.comparison import BLUR_PX, histogram_distance
 from blinkgl.recordings.judge import LEAST_IN_PATCH, LEAST_PATCHES
 from blinkgl.recordings.patches import NAMES, SIDE_PX, patches
 from blinkgl.types.events import Events
@@ -87,7 +87,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     span_us = int(clip.edges_us[first]), int(clip.edges_us[stop])
     part = events.window(*span_us)
     part = part.part(~inside_any(part.t, clip.bursts))
-    where = part.y.astype(np.int64) * width + part.x
+    where = part.pixel(width)
     _collect(where, part.t, part.p, clip.edges_us[first : stop + 1], clip.bursts, group, total, isi)
     used, still = clip.used.ravel(), clip.still.ravel()
     moving = used & ~still
@@ -96,13 +96,11 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     per_pixel = total.sum(axis=2)
     rates = np.stack([_by(on_group, total[k, :, p]) for k in range(count) for p in (0, 1)], 1).reshape(GROUPS, count, 2)
     both = total.sum(axis=0, dtype=np.int64)
-    lights = np.zeros((GROUPS, LIGHTS, 2))
-    for part_of in range(LIGHTS):
-        here = np.where(clip.light.ravel() == part_of, on_group, GROUPS)
-        lights[:, part_of] = np.stack([_by(here, both[:, p]) for p in (0, 1)], 1)
+    light, of_both = clip.light.ravel(), lambda groups: np.stack([_by(groups, both[:, p]) for p in (0, 1)], 1)
+    lights = np.stack([of_both(np.where(light == part, on_group, GROUPS)) for part in range(LIGHTS)], 1)
     counts = _histogram(per_pixel[:, moving], np.broadcast_to(group[moving], (count, int(moving.sum()))))
     still_counts = _histogram(both.sum(axis=1)[still], group[still])
-    quiet = np.stack([_by(np.where(still, group, GROUPS), both[:, p]) for p in (0, 1)], 1)
+    quiet = of_both(np.where(still, group, GROUPS))
     raw = (total[..., 1] - total[..., 0]).reshape(count, height, width).astype(np.float32)
     # Quantisation and sub-pixel shifts are not compared, as in `compare`.
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
@@ -358,5 +356,4 @@ def numbers(
 
 def interval_distance(a: Sums, b: Sums) -> float:
     """Return the Kolmogorov-Smirnov distance of the intervals between events of a pixel."""
-    cdf = [np.cumsum(s.isi.sum(axis=(0, 1))) / max(s.isi.sum(), 1) for s in (a, b)]
-    return float(np.abs(cdf[0] - cdf[1]).max())
+    return histogram_distance(*(s.isi.sum(axis=(0, 1)) for s in (a, b)))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from blinkgl.gl import GLContext
-from blinkgl.render.canvas import Rectangle
+from blinkgl.render.frames import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.lights import is_coloured
-from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.sweep import sweep
 from blinkgl.scene.shapes.table import define_of
-from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.scene.types import Deformer, Light, Material, Mesh, Part, Scene, SceneObject
 
 
 class Kind(NamedTuple):
@@ -215,7 +215,8 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
         radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
     else:
         # The box of a deforming shape at all times.
-        low, high = mesh.deformer.bounds(mesh, scene.t0_ns, scene.t1_ns)
+        swept = sweep(mesh, scene.t0_ns, scene.t1_ns)
+        low, high = swept.low, swept.high
         centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     # Also refuses NaN.
     if not radius <= MAX_RADIUS:

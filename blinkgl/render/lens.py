@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import moderngl
 
     from blinkgl.gl import GLContext
-    from blinkgl.render.painter import Uniforms
-    from blinkgl.render.passes.base import Shot
+    from blinkgl.gl.shader import Uniforms
+    from blinkgl.render.moment import Moment
 
 
 class Places(NamedTuple):
@@ -118,13 +118,13 @@ class Lens:
     def _numbers(self) -> tuple[float, ...]:
         return (*self.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
 
-    def set(self, uniforms: Uniforms, shot: Shot, unit: int) -> None:
+    def set(self, uniforms: Uniforms, moment: Moment, unit: int) -> None:
         """Set the uniforms of lens.glsl and along_ray.glsl. unit : a free texture unit."""
         if "lens_claims" in uniforms:
             self.claims.use(unit)
             uniforms["lens_claims"].value = unit
         if "lens_plane" in uniforms:
-            P = shot.moment.view.projection
+            P = moment.view.projection
             uniforms["lens_plane"].value = 1 / P[0, 0], 1 / P[1, 1], -P[0, 2] / P[0, 0], -P[1, 2] / P[1, 1]
         if "lens_focal" in uniforms:
             uniforms["lens_focal"].value = self.camera.intrinsics[:2]

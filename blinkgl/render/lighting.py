@@ -6,11 +6,13 @@ shaders/include/light.glsl without LIGHTS, and :meth:`Painter.place` sets their 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from blinkgl.gl.shader import Uniforms
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import is_coloured, lamps_of, quadric_of, quartic_of
 from blinkgl.scene.types import Light
@@ -18,8 +20,6 @@ from blinkgl.scene.types import Light
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
-    from blinkgl.render.painter import Uniforms
-    from blinkgl.render.passes.base import Pass
 
 EXAMPLES: tuple[dict[str, Any], ...] = (
     {"LIGHTS": 1, "AMBIENT": 3},
@@ -68,15 +68,15 @@ class Lighting:
         self._bytes: dict[tuple, bytes] = {}  # constant values, by uniform and by the channel that one value represents
         self._last: tuple[Moment | None, bool, dict[str, np.ndarray]] = None, False, {}
 
-    def defines(self, pass_: Pass, kind: Kind) -> dict[str, Any]:
-        """Return the defines of a pass's variant. HUED: light of three channels, where one is not enough: for colour
-        pictures, and for the luminance of surfaces with several colours."""
-        hued = {"HUED": 1} if kind.hued and pass_.one_channel else {}
-        if not (kind.lit and pass_.lit):
-            return hued if pass_.lit else {}
+    def defines(self, kind: Kind, one_channel: bool, maps: Sequence[Any]) -> dict[str, Any]:
+        """Return the defines of a lit pass's variant. HUED: light of three channels, where one is not enough: for
+        colour pictures, and for the luminance of surfaces with several colours. maps : shadow maps of the pass."""
+        hued = {"HUED": 1} if kind.hued and one_channel else {}
+        if not kind.lit:
+            return hued
+        shadows, lamps = self._shadows(maps), len(self.lamps) > self._suns
         if self.plain and not kind.whole:
-            return self._shadows(pass_)
-        shadows, lamps = self._shadows(pass_), len(self.lamps) > self._suns
+            return shadows
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
         ambient = 3 if self._quartic is not None else 2 if self._quadric[:, :3, :3].any() else 1
         return (
@@ -85,11 +85,10 @@ class Lighting:
             | ({"AMBIENT": ambient} if self._quadric.any() else {})
             | shadows
             | ({"FACETED": 1} if kind.faceted and not (shadows or lamps) else {})
-            | (hued or ({"HUED": 1} if not pass_.one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
+            | (hued or ({"HUED": 1} if not one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
 
-    def _shadows(self, pass_: Pass) -> dict[str, Any]:
-        maps = getattr(pass_, "shadows", ())
+    def _shadows(self, maps: Sequence[Any]) -> dict[str, Any]:
         suns = sum(one.lamp.kind == "sun" for one in maps)
         counts = {"SHADOWS": len(maps), "SHADOW_SUNS": suns, "SHADOW_SPOTS": len(maps) - suns}
         return {name: n for name, n in counts.items() if n} | ({"SOFT": 1} if any(one.soft for one in maps) else {})

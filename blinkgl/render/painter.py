@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +13,6 @@ import numpy as np
 from blinkgl.gl import GLContext, Target
 from blinkgl.gl.shader import Uniforms
 from blinkgl.machine.compiling import working_clock
-from blinkgl.render.frames import RenderStats
 from blinkgl.render.lens import Lens
 from blinkgl.render.lighting import Lighting
 from blinkgl.render.moment import Moment, linear_xyw_bytes
@@ -20,7 +21,6 @@ from blinkgl.scene.types import Map, Scene
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.passes.base import Pass, Shot
     from blinkgl.render.resources import SceneResources
 
 FREE_UNIT = 8
@@ -34,24 +34,14 @@ MATERIAL_UNITS = {
 """Texture units of a material's maps besides the base colour."""
 
 
-class Programs(dict["Kind", Uniforms]):
-    """The programs of one pass: uniforms per kind of material, compiled when first needed."""
+@dataclass
+class RenderStats:
+    """Wall seconds since the renderer was made; triangles submitted after culling."""
 
-    def __init__(self, painter: Painter, pass_: Pass):
-        self._painter, self._pass = painter, pass_
-
-    def __missing__(self, kind: Kind) -> Uniforms:
-        # Defines of the pass, of the material, of the light and of the fog make the variant.
-        foggy = {"FOG": 1} if self._pass.lit and self._painter.scene.fog is not None else {}
-        defines = (
-            self._pass.defines(kind)
-            | kind.defines(self._pass.lit)
-            | self._painter.lighting.defines(self._pass, kind)
-            | foggy
-        )
-        program = self._painter.gl.program(self._pass.program, defines)
-        uniforms = self[kind] = self._painter.uniforms(program)
-        return uniforms
+    frames: int = 0
+    triangles: int = 0
+    render_s: float = 0.0
+    readback_s: float = 0.0
 
 
 class Painter:
@@ -64,8 +54,8 @@ class Painter:
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
         self.lighting = Lighting(scene.light)
         self.lens: Lens | None = None
-        self._programs: dict[Pass, Programs] = {}
-        self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
+        self.programs: dict[Hashable, dict[Kind, Uniforms]] = {}
+        self._covers: dict[Hashable, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._side = 0
         self.strokes = Strokes(gl, self.uniforms)
 
@@ -86,12 +76,6 @@ class Painter:
         # Reversed depth: 1 at the near plane, so larger is nearer.
         ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
         self._side = 0
-
-    def programs(self, pass_: Pass) -> Programs:
-        programs = self._programs.get(pass_)
-        if programs is None:
-            programs = self._programs[pass_] = Programs(self, pass_)
-        return programs
 
     def uniforms(self, program: moderngl.Program) -> Uniforms:
         """Return the table of uniforms that a pass sets."""
@@ -168,27 +152,28 @@ class Painter:
             a, b, c, d, e, f = map_.at
             uniforms[f"{name}_place"].value = (a, d, b, e, c, f)
 
-    def deform(self, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-        """Set the further uniforms of a deforming shape's vertex stage; call it after :meth:`place`."""
-        moment, index, deformer = shot.moment, item.object_index, item.deformer
+    def deform(self, uniforms: Uniforms, item: DrawItem, moment: Moment, ends: Mapping[str, Moment]) -> None:
+        """Set the further uniforms of a deforming shape's vertex stage; call it after :meth:`place`. ends : moments at
+        other times, by name."""
+        index, deformer = item.object_index, item.deformer
         assert deformer is not None
         shape, t_ns = self.resources.shape(deformer), moment.t_ns
         shape.put("now", t_ns, partial(deformer.numbers, t_ns))
         if "clip_rate" in uniforms:
             shape.put("rate", t_ns, partial(deformer.rates, t_ns))
             uniforms["clip_rate"].write(linear_xyw_bytes(moment.mvp[index]))
-        for towards, there in shot.ends.items():
+        for towards, there in ends.items():
             if f"clip_{towards}" in uniforms:
                 shape.put(towards, (t_ns, there.t_ns), partial(deformer.changes, t_ns, there.t_ns))
                 uniforms[f"clip_{towards}"].write(linear_xyw_bytes(there.mvp[index]))
         shape.use(uniforms[""], FREE_UNIT)
 
-    def fog(self, uniforms: Uniforms, shot: Shot) -> None:
+    def fog(self, uniforms: Uniforms, moment: Moment, size: tuple[int, int]) -> None:
         """Set the uniforms of fog.glsl: the fog, and the transform from a fragment's position to its ray (X, Y) / Z."""
         # NDC x is P00 X/Z + P02; solved for X/Z, with 2 px / width - 1 for NDC.
-        fog, P = self.scene.fog, shot.moment.view.projection
+        fog, P = self.scene.fog, moment.view.projection
         assert fog is not None
-        width, height = shot.size
+        width, height = size
         uniforms["fog"].value = fog.density, fog.radiance
         uniforms["fog_ray"].value = (
             2 / (width * P[0, 0]),
@@ -207,13 +192,13 @@ class Painter:
         self.resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)
         self.stats.triangles += len(item.mesh.faces)
 
-    def cover(self, pass_: Pass) -> tuple[Uniforms, moderngl.VertexArray]:
-        """Return the program of a pass over the whole target, and the empty vertex array that draws its one
-        triangle."""
-        if pass_ not in self._covers:
-            program = self.gl.program(pass_.program, pass_.defines(None))
-            self._covers[pass_] = self.uniforms(program), self.gl.ctx.vertex_array(program, [])
-        return self._covers[pass_]
+    def cover(self, source: str, defines: Mapping[str, Any]) -> tuple[Uniforms, moderngl.VertexArray]:
+        """Return the program over the whole target, and the empty vertex array that draws its one triangle."""
+        key = (source, *defines.items())
+        if key not in self._covers:
+            program = self.gl.program(source, defines)
+            self._covers[key] = self.uniforms(program), self.gl.ctx.vertex_array(program, [])
+        return self._covers[key]
 
     def fill(self, array: moderngl.VertexArray, target: Target) -> None:
         """Draw one triangle over all of ``target``."""
@@ -232,6 +217,6 @@ class Painter:
         """Drop all programs, before the context's programs are replaced."""
         for _, array in self._covers.values():
             array.release()
-        self._programs, self._covers = {}, {}
+        self.programs, self._covers = {}, {}
         self.strokes.release()
         self.resources.forget_vertex_arrays()

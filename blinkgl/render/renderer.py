@@ -15,20 +15,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.gl import GLContext
-from blinkgl.labels import LabelFrame, LabelRequest
+from blinkgl.labels import LABELS, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.canvas import Canvas, Frame, StillCanvas
+from blinkgl.render.canvas import Canvas, StillCanvas
 from blinkgl.render.draw_items import DrawItem
-from blinkgl.render.frames import RenderStats
-from blinkgl.render.labels import Labels
+from blinkgl.render.frames import Frame
+from blinkgl.render.labels import DrawnLabel, Seen
 from blinkgl.render.lens import Lens
-from blinkgl.render.moment import Moment, Moments
-from blinkgl.render.painter import Painter
+from blinkgl.render.moment import Moment, Moments, View
+from blinkgl.render.painter import Painter, RenderStats
 from blinkgl.render.passes import (
     Brightness,
     Colour,
@@ -269,3 +271,89 @@ class Renderer:
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """Return what is seen at the centre of pixel (x, y) at t_ns, as text for messages."""
         return self._labels_in(None).shown_at(x, y, t_ns)
+
+
+KEPT = 3
+"""Number of times whose buffers are kept: neighbouring labels use the same moments."""
+
+
+class Labels:
+    """Makes the label frames of one renderer: draws the buffers of the label pass and finishes the labels' rows.
+
+    camera : of another picture at the same place; None: the scene's."""
+
+    def __init__(self, renderer: Renderer, camera: PinHole | None = None):
+        self._renderer, self._view = renderer, None if camera is None else View.of(camera)
+        self.scene = renderer.scene if camera is None else renderer.scene.with_camera(camera)
+        self._kept: dict[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = {}
+
+    def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
+        """Return the label frame; see :meth:`Renderer.labels`."""
+        draw = self._renderer
+        ends: dict[str, int] = {}
+        for towards, end_ns in (("forward", forward_ns), ("backward", backward_ns)):
+            if who := [name for name in request if LABELS[name].towards == towards]:
+                if end_ns is None:
+                    raise TypeError(f"label '{who[0]}' leads to another time: t_{towards}_ns")
+                ends[towards] = end_ns
+        there = {
+            towards: self._buffers(end_ns, names)
+            for towards, end_ns in ends.items()
+            if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)
+        }
+        each = request.each
+        leading = {ns: self.frame(t_ns, each, t_ns + ns, None) for ns in request.intervals_ns} if each else {}
+        drawn: dict[str, np.ndarray] = {}
+        if names := request.buffers:
+            frame = self._drawn(names, t_ns, ends)
+            drawn = {name: frame.read(name) for name in names}
+        values: dict[str, Any] = {}
+        for name in request:
+            if LABELS[name].anti_aliased:
+                at = self._moment(t_ns)
+                values[name] = (draw.colour(t_ns) if self._view is None else draw.flat_colour(at)).read()
+        started = working_clock()
+        for name in request:
+            self._finished(name, Seen(t_ns, drawn, ends, there, leading, request.categories), values)
+        draw.stats.render_s += working_clock() - started
+        return LabelFrame(t_ns, {name: values[name] for name in request})
+
+    def _finished(self, name: str, seen: Seen, values: dict[str, Any]) -> Any:
+        if name not in values:
+            label = LABELS[name]
+            value = label.finish(DrawnLabel(label, self.scene, seen, lambda other: self._finished(other, seen, values)))
+            camera = self.scene.camera
+            if (wrong := label.wrong(value, camera.height, camera.width)) is not None:
+                raise TypeError(f"label '{name}': `finish` gives {wrong}")
+            values[name] = value
+        return values[name]
+
+    def shown_at(self, x: int, y: int, t_ns: int) -> str:
+        """Return the text of :meth:`Renderer.shown_at`."""
+        number = int(self._buffers(t_ns, LabelRequest("ids").buffers)["ids"][y, x])
+        names = [
+            f"object '{o.name}' (id {number})"
+            for o in self._renderer.scene.objects
+            if number and o.instance_id == number
+        ]
+        return names[0] if names else "the background"
+
+    def _moment(self, t_ns: int) -> Moment:
+        moment = self._renderer.moment(t_ns)
+        return moment if self._view is None else moment.through(self._view)
+
+    def _drawn(self, names: tuple[str, ...], t_ns: int, ends: dict[str, int]) -> Frame:
+        draw = self._renderer
+        pass_ = draw.geometry(names) if self._view is None else Geometry(names)
+        return draw.draw(pass_, self._moment(t_ns), {name: self._moment(t) for name, t in ends.items()})
+
+    def _buffers(self, t_ns: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """Return buffers of these labels at a time, as the shader wrote them."""
+        key = (t_ns, names)
+        if key not in self._kept:
+            frame = self._drawn(names, t_ns, {})
+            self._kept[key] = {name: frame.read(name) for name in names}
+            # Neighbouring labels use the same moments; the oldest is dropped first.
+            while len(self._kept) > KEPT:
+                self._kept.pop(next(iter(self._kept)))
+        return self._kept[key]

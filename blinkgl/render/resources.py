@@ -17,10 +17,9 @@ from blinkgl.render.colour import LUMA, linear_image, luminance_image
 from blinkgl.render.draw_items import DrawItem, draw_items, padded_rows
 from blinkgl.scene.geometry.tangents import tangents
 from blinkgl.scene.lights import surroundings_of
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.table import includes
 from blinkgl.scene.surfaces.gloss import energy, looks, mean_energy
-from blinkgl.scene.types import IDENTITY, REPEAT, Map, Material, Mesh, Scene, Texture, Wrap
+from blinkgl.scene.types import IDENTITY, REPEAT, Deformer, Map, Material, Mesh, Scene, Texture, Wrap
 
 MADE.append(includes)
 

@@ -96,7 +96,7 @@ def size(count: float) -> str:
 
 
 def render(name: str, **values: Any) -> str:
-    """Return the HTML text of a template ``"ROOM/FILE.html"``, which is blinkgl/ROOM/templates/FILE.html."""
+    """Return the HTML text of a template ``"ROOM/FILE.html"``, which is templates/FILE.html of ``blinkgl.ROOM``."""
     return _environment().get_template(name).render(values)
 
 
@@ -130,4 +130,4 @@ def _environment() -> jinja2.Environment:
 
 def _source(name: str) -> str:
     room, _, file = name.partition("/")
-    return resources.files("blinkgl").joinpath(room, "templates", file).read_text(encoding="utf-8")
+    return resources.files(f"blinkgl.{room}").joinpath("templates", file).read_text(encoding="utf-8")

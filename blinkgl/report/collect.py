@@ -18,7 +18,7 @@ from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.colour import count_events, event_colour, flow_colour
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_png
-from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
+from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
 from blinkgl.io.images import read_image
 from blinkgl.io.overlays import TrackLines, with_tracks
 from blinkgl.io.pictures import picture
@@ -243,7 +243,7 @@ def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[
     k = min(range(len(lines)), key=lambda k: abs(lines[k].middle_us - t_us))
     pictures = []
     for name in about["pictures"]:
-        codes = read_codes(folder / picture_file(name, k)).astype(np.uint32) >> (about["bits"] - 8)
+        codes = read_image(folder / picture_file(name, k)).astype(np.uint32) >> (about["bits"] - 8)
         codes = codes.astype(np.uint8)
         title = f"frame camera, {lines[k].exposure_us / 1000:g} ms" if name == "images" else f"frame camera, {name}"
         pictures.append((title, np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes))

@@ -11,8 +11,10 @@ Time: int64 nanoseconds. Poses: 4x4 float64, rigid (scale is baked into the vert
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -21,9 +23,9 @@ from blinkgl.config.lights import LightConfig
 from blinkgl.errors import ConfigError
 
 if TYPE_CHECKING:
+    from blinkgl.config.deform import DeformConfig
     from blinkgl.scene.motion.pose_path import PosePath
     from blinkgl.scene.rig import Rig, Sensor
-    from blinkgl.scene.shapes.deformer import Deformer
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,103 @@ class Mesh:
     def radius(self) -> float:
         """Return the radius of the bounding sphere around the local origin."""
         return float(np.sqrt((self.vertices**2).sum(axis=1).max())) if len(self.vertices) else 0.0
+
+
+class Deformer(ABC):
+    """Deformation of one mesh: a shape q(p, t) replaces the vertex p, in the frame of its object. It belongs to a mesh
+    (``Mesh.deformer``), whose vertices are the shape at rest; :mod:`blinkgl.scene.shapes.sweep` has what it sweeps.
+
+    A rigid body's point is at ``T(t) p``, a deforming one's at ``T(t) q(p, t)``. With the clip matrix ``MVP`` the
+    motion from t to t' is
+
+        MVP' (q' - q) + (MVP' - MVP) q,
+
+    in which neither difference is one of rounded numbers: the second is composed in float64, and every deformer
+    computes the first in its own form (:meth:`changes`), so a motion of 1e-6 px is as exact as one of 10 px. Likewise
+    for rates: ``MVP dq/dt + dMVP/dt q``.
+
+    For the vertex stage
+        glsl : name of the source, ``shaders/include/deform/NAME.glsl``, or of ``source`` where that is given.
+        source : the text itself: the five functions that ``shaders/include/deform.glsl`` names.
+        rows : numbers per time, as vec4.   attributes : further vertex attributes, (V, 1 to 4) float32 by GLSL name.
+        textures : (h, w, 4) float32 by sampler name.   sizes : further macros, whole numbers.
+
+    examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
+
+    goes : orientation of a moving body: "anyhow"; "upright" on the ground, "level" above it, both along its x axis.
+    speed : units/s that fit the motion, such as steps; 0: it may stay in place.
+
+    mirrors : whether the shape is a mirror image at some time (:meth:`side`).
+
+    Config : its model in ``deform:``; None: none.   period_ns : period of the shape; None: not periodic.   span_ns :
+    time from 0 after which the shape no longer changes."""
+
+    glsl: ClassVar[str]
+    source: ClassVar[str | None] = None
+    Config: ClassVar[type[DeformConfig] | None] = None
+
+    attributes: Mapping[str, np.ndarray] = {}
+    textures: Mapping[str, np.ndarray] = {}
+    sizes: Mapping[str, int] = {}
+    period_ns: int | None = None
+    span_ns: int = 0
+    goes: str = "anyhow"
+    speed: float = 0.0
+    mirrors: bool = False
+    examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
+
+    @classmethod
+    def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Deformer:
+        """Return the deformer of a ``deform:`` configuration, for an object whose box at rest is (3,) low to high. Only
+        for classes with a ``Config``."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def rows(self) -> int:
+        """Return the rows of the arrays of :meth:`numbers`, :meth:`rates` and :meth:`changes`."""
+
+    @property
+    def is_static(self) -> bool:
+        """Return whether the shape is the same at all times."""
+        return False
+
+    def side(self, t_ns: int) -> int:
+        """Return 1; where faces are mirrored at a time, -1; 0 where some are and others are not."""
+        return 1
+
+    # ---- the shape, on the CPU -----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def positions(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        """Return q(p, t) of the mesh's vertices, (V, 3) float64."""
+
+    @abstractmethod
+    def velocity(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        """Return dq/dt, analytic, (V, 3) float64, units/s."""
+
+    @abstractmethod
+    def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        """Return directions of the normals, not normalised, (V, 3) float64."""
+
+    def transformed(self, matrix: np.ndarray) -> Deformer:
+        """Return the deformer of the mesh under an affine (4, 4) map A: q_A(A p) = A q(p). Raises TypeError where that
+        would be another kind of deformer."""
+        raise TypeError(f"{type(self).__name__} cannot be transformed")
+
+    # ---- the shape, for the vertex stage -------------------------------------------------------------------------
+
+    @abstractmethod
+    def numbers(self, t_ns: int) -> np.ndarray:
+        """Return the numbers of the shape at t for GLSL, (rows, 4) float64."""
+
+    @abstractmethod
+    def rates(self, t_ns: int) -> np.ndarray:
+        """Return the further numbers for dq/dt at t, (rows, 4) float64."""
+
+    @abstractmethod
+    def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
+        """Return the further numbers for q(p, there) - q(p, t), (rows, 4) float64."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,11 +43,11 @@ from blinkgl.io.frame_camera import (
     EXPOSURES,
     STAMPS,
     ExposureLine,
-    encode_codes,
     exposures_csv,
     picture_file,
     stamps_txt,
 )
+from blinkgl.io.images import encode_image
 from blinkgl.io.records import (
     SEAL,
     entries_below,
@@ -232,7 +232,7 @@ class SequenceWriter:
         """Write the next image of the frame camera: codes of "images" and what is written beside it
         (:mod:`blinkgl.io.frame_camera`); the arrays must not be changed afterwards."""
         for picture, codes in pictures.items():
-            self._write(picture_file(picture, len(self._exposures)), partial(encode_codes, codes))
+            self._write(picture_file(picture, len(self._exposures)), partial(encode_image, codes))
         self._exposures.append(exposure)
 
     def text(self, name: str, content: str) -> None:

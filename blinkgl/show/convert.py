@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from blinkgl.io.formats import WITH_CAUSES, convert, output_format
+from blinkgl.io.formats import FORMATS, convert, output_format
 from blinkgl.io.reading import EventReading
 from blinkgl.machine.terminal import plain_console, say
 
@@ -15,7 +15,7 @@ def run(source: str, target: str, *, reading: EventReading, **options: Any) -> i
     size = f"{file.width}x{file.height}" if file.height else "no size in it (--size WIDTHxHEIGHT)"
     say(plain_console(), f"{target}: {count:,} events, {size}, from {file.format}")
     written = output_format(target)
-    if file.causes and written not in WITH_CAUSES:
+    if file.causes and not FORMATS[written].causes:
         say(plain_console(), "the causes of the events are left out: the format cannot hold them")
     for line in file.notes:
         say(plain_console(stderr=True), f"{source}: {line}")

@@ -59,8 +59,9 @@ def _save(console: Console, folders: list[Path], out: Path, port: int | None, ov
     if out.suffix.lower() not in (".html", ".htm"):
         raise OutputError("not the name of a page", where="--save", value=str(out), accepted="NAME.html")
     if len(folders) != 1:
-        one = f"one, such as {folders[0]}"
-        raise ConfigError("a file shows one sequence", where="--save", value=len(folders), accepted=one)
+        raise ConfigError(
+            "a file shows one sequence", where="--save", value=len(folders), accepted=f"one, such as {folders[0]}"
+        )
     if out.exists() and not overwrite:  # before the work, not after it
         raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
     from blinkgl.viewer.page import save
@@ -74,8 +75,11 @@ def _save(console: Console, folders: list[Path], out: Path, port: int | None, ov
 def check_extra(option: str) -> None:
     """Raise ConfigError where the extra [view] is missing."""
     if importlib.util.find_spec("viser") is None:
-        remedy = f"run {install(*EXTRAS['view'][0])}"
-        raise ConfigError("viser, which shows sequences, is not installed", where=option, accepted=remedy)
+        raise ConfigError(
+            "viser, which shows sequences, is not installed",
+            where=option,
+            accepted=f"run {install(*EXTRAS['view'][0])}",
+        )
 
 
 class Watched:

@@ -116,7 +116,7 @@ class DeviceV2e(_OnDevice, V2e):
         # The CPU's limit is divided among blocks of pixels, see Emulator._run.
         share = max(BLOCK, self.config.max_events_per_step // -(-self.height * self.width // BLOCK))
         if len(events) > share:
-            pixels = events.y.astype(np.int64) * self.width + events.x
+            pixels = events.pixel(self.width)
             if np.bincount(pixels // BLOCK).max() > share:
                 raise EventDataError(
                     "more events in a step than the CPU would keep",

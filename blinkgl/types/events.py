@@ -93,6 +93,10 @@ class Events:
         """Return the events of a slice (views), an index array or a mask (copies); the order of time must stay."""
         return Events(**{k: getattr(self, k)[which] for k in self.columns})
 
+    def pixel(self, width: int) -> np.ndarray:
+        """Return the number of each event's pixel, row by row in a sensor of this width, (N,) int64."""
+        return self.y.astype(np.int64) * width + self.x
+
     def copy(self) -> Events:
         """Return a copy with its own memory."""
         return Events(**{k: getattr(self, k).copy() for k in self.columns})

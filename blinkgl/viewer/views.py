@@ -17,7 +17,8 @@ from blinkgl.camera.pinhole import rectified
 from blinkgl.errors import AssetError
 from blinkgl.io.colour import count_events, event_colour
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
+from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
+from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU, read_imu
 from blinkgl.io.overlays import TrackLines, with_boxes, with_tracks
 from blinkgl.io.pictures import id_colours, picture
@@ -132,7 +133,7 @@ class CameraView:
         k = max(int(np.searchsorted(ends, t_us, side="right")) - 1, 0)
         found = []
         for name in about["pictures"]:
-            codes = read_codes(self.source.folder / picture_file(name, k))
+            codes = read_image(self.source.folder / picture_file(name, k))
             shown = (codes.astype(np.uint32) >> (about["bits"] - 8)).astype(np.uint8)
             shown = np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
             heading = "frame camera" if name == "images" else f"frame camera, {name}"

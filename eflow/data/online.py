@@ -10,13 +10,14 @@ from pathlib import Path
 
 from blinkgl.config.base import placed
 from blinkgl.config.run import load_run
+from blinkgl.machine.closing import Closing
 from blinkgl.online.job import MIX, StreamJob, stream_seed
 from blinkgl.online.stream import SampleStream
 from eflow.config import SourceConfig
 from eflow.data.window import RawSample, raw_sample
 
 
-class OnlineSource:
+class OnlineSource(Closing):
     """An endless :class:`~eflow.data.sources.Source`. ``source[n]`` returns sample n once, in a loader process, too;
     :meth:`first` does not consume it.
 
@@ -43,12 +44,6 @@ class OnlineSource:
 
     def close(self) -> None:
         self.stream.close()
-
-    def __enter__(self) -> OnlineSource:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int = 0, batch: int = 1) -> OnlineSource:

@@ -1,5 +1,5 @@
 // Texture lookups of a pass, for the shader debugger: included only by the variant SHOW_LOOKUP, which only
-// blinkgl/shader_debugger uses. Every later lookup in the pass's source is recorded with the coordinates and the level
+// tools/shader_debugger uses. Every later lookup in the pass's source is recorded with the coordinates and the level
 // that it really uses.
 
 layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level (before clamping), light

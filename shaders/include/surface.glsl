@@ -1,4 +1,4 @@
-// Radiance of a surface that is more than matt (docs/materials.md; the float64 reference: blinkgl/render/reference.py,
+// Radiance of a surface that is more than matt (docs/materials.md; the float64 reference: tools/shader_debugger/reference.py,
 // radiated()). Included after light.glsl.
 //
 //   BUMPED      a normal map

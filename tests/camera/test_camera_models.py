@@ -14,12 +14,13 @@ from blinkgl.camera.distorted import DistortedModel
 from blinkgl.camera.pinhole import rectified, rectify_map
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.errors import ConfigError
-from blinkgl.render import casting, reference
+from blinkgl.render import casting
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject
 from blinkgl.scene.worlds.random_world import random_world
+from blinkgl.tools.shader_debugger import reference
 
 SIZE = {
     "width": 120,

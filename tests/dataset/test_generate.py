@@ -22,7 +22,8 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.flow import read_flow
-from blinkgl.io.frame_camera import read_codes, read_exposures
+from blinkgl.io.frame_camera import read_exposures
+from blinkgl.io.images import read_image
 from blinkgl.render.passes import Luminance
 
 SMALL = {
@@ -327,7 +328,7 @@ def test_images_are_written_beside_everything_else_and_verified(made_of_frame_ca
     assert not (report.path / "images").exists(), "in the place of the instantaneous ones"
     for name in ("images", "clean", "sharp"):
         assert len(list((report.path / "frame_camera" / name).glob("*.png"))) == 10
-        codes = read_codes(report.path / f"frame_camera/{name}/000009.png")
+        codes = read_image(report.path / f"frame_camera/{name}/000009.png")
         assert codes.shape == (30, 40, 3) and codes.dtype == np.uint16 and 300 < codes.max() < 4096
     manifest = json.loads((report.path / "manifest.json").read_text())
     assert manifest["frame_camera"]["images"] == 10 and manifest["frame_camera"]["bits"] == 12

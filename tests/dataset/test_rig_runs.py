@@ -18,11 +18,11 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.records import SEAL
-from blinkgl.render.reference import render as by_reference
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
 from blinkgl.sequence_files.sequence_dir import read_manifest
+from blinkgl.tools.shader_debugger.reference import render as by_reference
 
 WAY = [
     {"time": t, "position": [-2.5, y, 0.3], "look_at": [0, 0.3 * y, 0]} for t, y in ((-0.2, -0.4), (0, 0), (0.4, 0.8))

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import ks_2samp
 from shared_data import shared
 
-from blinkgl.config.events import V2eConfig
+from blinkgl.config.events import EmulatorConfig, V2eConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
 from blinkgl.errors import ConfigError
@@ -138,6 +138,31 @@ def still(sensor: SensorConfig, emulator: str, us: int, *, pixels: bool = True, 
     camera = EventCamera(sensor.emulator(emulator), readout, sensor.height, sensor.width, 0)
     frame = np.full((sensor.height, sensor.width), luminance, np.float32)
     return Events.concatenate([camera.step(EventFrame(int(t), frame)) for t in np.linspace(0, 1000 * us, 5)])
+
+
+def half_seconds(config: EmulatorConfig, luminance: float) -> np.ndarray:
+    """Rate of a still picture in each half of its first second, Hz a pixel."""
+    height, width = 150, 200
+    emulator, frame = make_emulator(config, height, width, 3), np.full((height, width), luminance, np.float32)
+    counts = [len(emulator.step(frame, k * 5_000_000)) for k in range(201)]
+    return np.add.reduceat(counts, [0, 101]) / (height * width * 0.5)
+
+
+@pytest.mark.parametrize("name", sensor_names())
+@pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
+def test_a_still_scene_is_nearly_silent(name, emulator):
+    """From the first half second, in dim and in bright light: not the noise of another camera in another light."""
+    for luminance in (0.03, 0.4):
+        assert half_seconds(load_sensor(name).emulator(emulator), luminance).max() < 0.02
+
+
+def test_every_emulator_has_a_sensors_noise():
+    """Leak of its ON events in any light, shot noise in the dark, in V2E and in the Voltmeter."""
+    sensor = SensorConfig(name="noisy", width=8, height=8, leak_rate_hz=2.0, shot_noise_rate_hz=0.0)
+    for emulator, luminance in itertools.product(("v2e", "voltmeter"), (0.03, 0.4)):
+        assert half_seconds(sensor.emulator(emulator), luminance) == pytest.approx(2.0, rel=0.05)
+    dark = sensor.model_copy(update={"leak_rate_hz": 0.0, "shot_noise_rate_hz": 3.0})
+    assert half_seconds(dark.emulator("voltmeter"), 0.0) == pytest.approx(3.0, rel=0.05)
 
 
 @pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])

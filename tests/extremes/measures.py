@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import reference
 from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
+from blinkgl.tools.shader_debugger import reference
 from tests.render.render_scenes import LEVEL, SECOND, drift, rig
 
 FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera

@@ -14,9 +14,9 @@ from blinkgl.errors import EventDataError
 from blinkgl.events import Esim, make_emulator
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Texture
+from blinkgl.tools.shader_debugger import reference
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, SECOND, drift, quad, rig, scene, still, thing
 

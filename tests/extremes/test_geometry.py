@@ -12,9 +12,10 @@ from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import casting, reference
+from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
+from blinkgl.tools.shader_debugger import reference
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
 from tests.render.render_scenes import (
     LEVEL,

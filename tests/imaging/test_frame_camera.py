@@ -15,10 +15,10 @@ from blinkgl.imaging import FrameCamera
 from blinkgl.imaging.exposure import Exposure, Setting, accumulate, decibels, factor, instants, next_setting
 from blinkgl.imaging.lens import blur_px, samples
 from blinkgl.imaging.sensor import PATTERNS, decode, encode, mosaic, readings
-from blinkgl.render.appearance import sample_bilinear
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material
+from blinkgl.tools.shader_debugger.appearance import sample_bilinear
 from tests.render.render_scenes import LEVEL, SECOND, cube, drift, quad, scene, smooth_texture, still, thing
 
 MS = 1_000_000

@@ -101,17 +101,15 @@ def test_what_opencv_would_pass_over(data, said):
         (b"Pg\n2 1\n-1\n", 2, "wrong header"),
     ],
 )
-def test_headers_of_pfm(head, count, said):
-    data = head + np.arange(count, dtype="<f4" if b"-" in head else ">f4").tobytes()
+def test_headers_of_pfm(tmp_path, head, count, said):
+    path = tmp_path / "a.pfm"
+    path.write_bytes(head + np.arange(count, dtype="<f4" if b"-" in head else ">f4").tobytes())
     if said is None:
-        image = images.decode_pfm(data, "a")
+        image = images.read_pfm(path)
         assert image.ravel().tolist() == list(range(count)) and image.dtype == np.float32 and image.shape[:2] == (1, 2)
     else:
         with pytest.raises(AssetError, match=said):
-            images.decode_pfm(data, "a")
-    for shape in ((2,), (2, 2, 2), (2, 2, 4), (1, 2, 2, 3)):
-        with pytest.raises(ValueError, match="PFM holds"):
-            images.encode_pfm(np.zeros(shape))
+            images.read_pfm(path)
 
 
 # --- Flow, images, masks, ids, arrays: round trips and independent readers.
@@ -147,7 +145,7 @@ def test_kitti_ground_truth():
 
 def test_flo_round_trip_and_unknown(tmp_path):
     flow, valid = flow_field()
-    flow_files.write_flo(tmp_path / "f.flo", flow, valid)
+    assert flow_files.write_flow(tmp_path / "f.flo", flow, valid) == 0
     again, again_valid = flow_files.read_flo(tmp_path / "f.flo")
     assert np.array_equal(again_valid, valid) and np.array_equal(again[valid], flow[valid])
     assert np.array_equal(cv2.readOpticalFlow(str(tmp_path / "f.flo"))[valid], flow[valid])
@@ -174,7 +172,7 @@ def test_pfm_real_file_and_orientation(tmp_path):
         (flow_files.read_flo, "a.flo", flow_files.encode_flo(np.zeros((4, 4, 2)))[:-1], "truncated"),
         (flow_files.read_flo, "a.flo", b"PIEH" + b"\xff" * 8, "impossible"),
         (images.read_pfm, "a.pfm", b"P6\n1 1\n255\n", "wrong header"),
-        (images.read_pfm, "a.pfm", images.encode_pfm(np.zeros((3, 3)))[:-1], "truncated"),
+        (images.read_pfm, "a.pfm", b"Pf\n3 3\n-1.0\n" + bytes(35), "truncated"),
         (flow_files.read_flow_png, "a.png", b"\x89PNG..", "corrupt"),
         (flow_files.read_flow_png, "a.png", images.encode_mask(np.ones((3, 3))), "16-bit RGB"),
         (flow_files.read_flow_png, "a.png", b"", "corrupt"),

@@ -10,7 +10,6 @@ import pytest
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.frames import Declared, open_frames, read_any_image
-from blinkgl.io.images import write_pfm
 from blinkgl.io.stamps import read_timestamps
 from blinkgl.io.video import VideoWriter
 from tests.videos import put_exr
@@ -80,7 +79,7 @@ def test_float_and_deep_images(tmp_path):
     assert np.array_equal(read_any_image(tmp_path / "a.exr"), colour)
     cv2.imwrite(str(tmp_path / "a.hdr"), colour[..., ::-1])
     assert np.allclose(read_any_image(tmp_path / "a.hdr"), colour, rtol=0.02, atol=0.02)
-    write_pfm(tmp_path / "a.pfm", colour)
+    cv2.imwrite(str(tmp_path / "a.pfm"), colour[..., ::-1])
     assert np.array_equal(read_any_image(tmp_path / "a.pfm"), colour)
     deep = rng.integers(0, 65536, (10, 14, 3)).astype(np.uint16)
     for ending in ("png", "tiff"):

@@ -23,7 +23,6 @@ from blinkgl.config.images import ImagesConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.imaging import FrameCamera
 from blinkgl.imaging.sensor import decode
-from blinkgl.render import reference
 from blinkgl.scene.geometry.primitives import cuboid, grid, sphere
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
@@ -32,8 +31,9 @@ from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import load_panorama
 from blinkgl.scene.types import Fog, Gloss, Lamp, Light, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.sky import panorama_light
-from blinkgl.shader_debugger.lamps import near_an_edge
-from blinkgl.shader_debugger.session import DebugRenderer
+from blinkgl.tools.shader_debugger import reference
+from blinkgl.tools.shader_debugger.lamps import near_an_edge
+from blinkgl.tools.shader_debugger.session import DebugRenderer
 
 EXPOSURE_US = 20_000
 ROUGHNESSES = (0.1, 0.25, 0.45, 0.7, 1.0)

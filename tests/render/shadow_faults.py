@@ -17,8 +17,6 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels.frames import LabelRequest
-from blinkgl.render import reference
-from blinkgl.render.appearance import seen_share
 from blinkgl.render.passes import shadow_maps
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.shadows import scale_of
@@ -28,7 +26,9 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Lamp, Light, Material, Part, Scene, SceneObject
-from blinkgl.shader_debugger.lamps import lit_points
+from blinkgl.tools.shader_debugger import reference
+from blinkgl.tools.shader_debugger.appearance import seen_share
+from blinkgl.tools.shader_debugger.lamps import lit_points
 
 SKY = 0.2
 

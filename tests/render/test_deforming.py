@@ -13,7 +13,6 @@ from skinned import arm
 from blinkgl.config.deform import BendConfig, BreatheConfig, FlagConfig, TwistConfig, WaveConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.living import figure as figure_of
 from blinkgl.scene.geometry.meshes import transform_mesh
@@ -21,6 +20,7 @@ from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.types import Material
+from blinkgl.tools.shader_debugger import reference
 from render_scenes import LEVEL, drift, quad, rig, scene, smooth_texture, sphere, still, thing
 
 MS = 1_000_000

@@ -18,7 +18,7 @@ from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
-from blinkgl.shader_debugger.twins import _Line, filtered as filtered_slowly
+from blinkgl.tools.shader_debugger.filters import _Line, filtered as filtered_slowly
 from render_scenes import (
     LEVEL,
     SECOND,

@@ -9,10 +9,11 @@ import blinkgl
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
-from blinkgl.render import appearance, casting
+from blinkgl.render import casting
 from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Fog, Material
+from blinkgl.tools.shader_debugger import appearance
 from tests.render.render_scenes import LEVEL, SECOND, cube, curve, drift, rig, scene, smooth_texture, sphere, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")

@@ -21,10 +21,11 @@ from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl.shader import ShaderLoader, shader_folder
 from blinkgl.labels import LabelRequest
-from blinkgl.render import appearance, casting, reference
+from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material
+from blinkgl.tools.shader_debugger import appearance, reference
 from render_scenes import (
     LEVEL,
     SECOND,

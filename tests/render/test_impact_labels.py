@@ -7,9 +7,9 @@ import pytest
 
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
+from blinkgl.tools.shader_debugger import reference
 
 MS = 1_000_000
 LABELS = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward")

@@ -13,9 +13,10 @@ from blinkgl.camera.pinhole import rectified
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render import casting, reference
+from blinkgl.render import casting
 from blinkgl.render.lens import places_of
 from blinkgl.render.renderer import Renderer
+from blinkgl.tools.shader_debugger import reference
 from tests.render.test_materials import drift, hidden_ball
 
 LENSES = {

@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.deform import TwistConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import casting, draw_items, reference
+from blinkgl.render import casting, draw_items
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.types import Lamp, Light, Material
+from blinkgl.tools.shader_debugger import reference
 from render_scenes import (
     LEVEL,
     SECOND,

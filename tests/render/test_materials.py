@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import appearance, reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.tangents import split_mirrored, tangents
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.types import Gloss, Lamp, Light, Map, Mask, Material, Scene, Texture
+from blinkgl.tools.shader_debugger import appearance, reference
 from tests.render.render_scenes import drift, pose, quad, rig, scene, smooth_texture, sphere, still, thing
 
 T = 300_000_000

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
-from blinkgl.render import casting, reference
+from blinkgl.render import casting
 from blinkgl.render.occlusion import HIDDEN, NARROW, REACH, SEEN, UNDECIDED, judged_by_samples, near_thin
 from blinkgl.render.renderer import Renderer
+from blinkgl.tools.shader_debugger import reference
 from render_scenes import LEVEL, cube, drift, mesh, mixed_scene, quad, rig, scene, sphere, still, thing
 
 MS = 1_000_000

@@ -15,7 +15,7 @@ from blinkgl.errors import GLError
 from blinkgl.gl.shader import ShaderError
 from blinkgl.labels import LabelRequest
 from blinkgl.render import casting
-from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.frames import DEPTH_BUFFER
 from blinkgl.render.moment import View
 from blinkgl.render.passes import Geometry, Input, Output, ScenePass, ScreenPass
 from blinkgl.render.renderer import Renderer

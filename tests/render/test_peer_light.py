@@ -2,7 +2,7 @@
 
 ``golden/cycles_light.npz`` holds what Cycles of Blender 4.5.15 made of each case: (H, W, 3) float16 linear radiance,
 512 to 4,096 paths a pixel. It was made once, by commit bec9ca8f, which could run Cycles: one picture a case by
-``blinkgl.trade.cycles.colours(case.scene, [0], CyclesSettings(samples, occlusion=False, bounces=0, …))``.
+``blinkgl.tools.trade.cycles.colours(case.scene, [0], CyclesSettings(samples, occlusion=False, bounces=0, …))``.
 """
 
 from __future__ import annotations

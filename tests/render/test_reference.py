@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.render import appearance, casting, reference
-from blinkgl.render.probe import probe
+from blinkgl.render import casting
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Texture
 from blinkgl.srgb import linear_from_srgb
+from blinkgl.tools.shader_debugger import appearance, reference
+from blinkgl.tools.shader_debugger.reference_probe import probe
 from exhaustive import nearest_exhaustive
 from render_scenes import (
     LEVEL,

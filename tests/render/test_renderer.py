@@ -14,8 +14,9 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import resources
-from blinkgl.render.canvas import Rectangle, merged, screen_rectangle
+from blinkgl.render.canvas import screen_rectangle
 from blinkgl.render.draw_items import MAX_RADIUS, DrawItem, _draw_item, _Facets, _Greys, box_corners
+from blinkgl.render.frames import Rectangle, merged
 from blinkgl.render.moment import Moment, cam_from_obj, cam_from_obj_rate
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.resources import HALF_LEAST, HALF_MOST, half_floats

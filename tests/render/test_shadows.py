@@ -11,13 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import reference
 from blinkgl.render.passes import shadow_maps
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
+from blinkgl.tools.shader_debugger import reference
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
 from shadow_faults import coarse_frame, contact_frame, faults, frame as random_frame, leaks
 

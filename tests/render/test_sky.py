@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels.frames import LabelRequest
-from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.primitives import cuboid, grid
 from blinkgl.scene.lights import lit_by
@@ -20,6 +19,7 @@ from blinkgl.scene.rig import Rig, Sensor
 from blinkgl.scene.surfaces.environment import environment, pixel_directions
 from blinkgl.scene.types import Gloss, Light, Material, Mesh, Part, Scene, SceneObject
 from blinkgl.scene.worlds.sky import panorama_sky, panorama_textures
+from blinkgl.tools.shader_debugger import reference
 
 SECOND = 1_000_000_000
 SPOT = np.array([0.8, 0.1, 0.25]) / np.linalg.norm([0.8, 0.1, 0.25])

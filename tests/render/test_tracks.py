@@ -15,11 +15,12 @@ from blinkgl.config.over_time import TracksConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.front.runs import configured
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render import casting, reference
+from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import track_points
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.table import deformer_of
+from blinkgl.tools.shader_debugger import reference
 from render_scenes import LEVEL, cube, drift, quad, rig, scene, sphere, still, thing
 
 RNG = np.random.default_rng

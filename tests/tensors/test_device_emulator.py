@@ -116,7 +116,7 @@ def test_a_bad_frame_is_said_in_the_same_words(card):
 
 @pytest.mark.parametrize("events", [{}, {"emulator": "v2e", "preset": "noisy", "causes": True}], ids=["esim", "v2e"])
 def test_files_are_the_same_and_the_manifest_says_which(card, gl, tmp_path, monkeypatch, events):
-    from blinkgl.render.canvas import Frame
+    from blinkgl.render.frames import Frame
 
     tensors, tensor = [], Frame.tensor
     monkeypatch.setattr(Frame, "tensor", lambda frame, *given: tensors.append(frame) or tensor(frame, *given))

@@ -13,7 +13,7 @@ from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
 from blinkgl.timeline import bounded_times
-from blinkgl.trade.matching import match_events
+from blinkgl.tools.trade.matching import match_events
 
 MS = 1_000_000
 WIDTH, HEIGHT = 48, 36

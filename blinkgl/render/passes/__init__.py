@@ -1,7 +1,7 @@
 """The passes: each is a value that defines what is drawn, by which program, from which other passes, into what.
 
 In:    a :class:`~blinkgl.render.moment.Moment` and frames of other passes.
-Out:   a :class:`~blinkgl.render.canvas.Frame`, by ``Renderer.draw``.
+Out:   a :class:`~blinkgl.render.frames.Frame`, by ``Renderer.draw``.
 Start: base.py, then luminance.py.
 """
 

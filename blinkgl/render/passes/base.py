@@ -6,26 +6,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+from blinkgl.gl.shader import Uniforms
 from blinkgl.render.antialiasing import Samples
+from blinkgl.render.frames import Frame, Output, Rectangle
 
 if TYPE_CHECKING:
     from blinkgl.gl import Target
-    from blinkgl.render.canvas import Frame, Rectangle
     from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.moment import Moment
-    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.painter import Painter
     from blinkgl.scene.types import Scene
-
-
-class Output(NamedTuple):
-    """An attachment: ``layout(location = i)`` of the fragment stage for the i-th output of a pass.
-
-    format : key of :data:`blinkgl.gl.FORMATS`.
-    components : how many of its format's are returned, the first ones; 0: all."""
-
-    name: str
-    format: str
-    components: int = 0
 
 
 class Input(NamedTuple):
@@ -136,6 +126,23 @@ class Pass:
             uniforms[one.sampler].value = unit
 
 
+class Programs(dict["Kind", Uniforms]):
+    """The programs of one pass: uniforms per kind of material, compiled when first needed."""
+
+    def __init__(self, painter: Painter, pass_: ScenePass):
+        self._painter, self._pass = painter, pass_
+
+    def __missing__(self, kind: Kind) -> Uniforms:
+        # Defines of the pass, of the material, of the light and of the fog make the variant.
+        pass_, lighting = self._pass, self._painter.lighting
+        light = lighting.defines(kind, pass_.one_channel, getattr(pass_, "shadows", ())) if pass_.lit else {}
+        foggy = {"FOG": 1} if pass_.lit and self._painter.scene.fog is not None else {}
+        defines = pass_.defines(kind) | kind.defines(pass_.lit) | light | foggy
+        program = self._painter.gl.program(pass_.program, defines)
+        uniforms = self[kind] = self._painter.uniforms(program)
+        return uniforms
+
+
 class ScenePass(Pass):
     """A pass that draws the scene's items."""
 
@@ -150,9 +157,15 @@ class ScenePass(Pass):
         """Set textures and uniforms of the program besides those that every program of the scene has."""
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        programs = painter.programs(self)
+        programs = self.programs(painter)
         for item in self.items(shot.moment) if items is None else items:
             self.draw_item(painter, shot, item, programs[item.kind])
+
+    def programs(self, painter: Painter) -> dict[Kind, Uniforms]:
+        """Return the painter's programs for this pass, by kind of material."""
+        if self not in painter.programs:
+            painter.programs[self] = Programs(painter, self)
+        return painter.programs[self]
 
     def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
         """Draw one item with the program that ``uniforms`` belong to."""
@@ -163,9 +176,9 @@ class ScenePass(Pass):
         """Set all that a program needs of an item."""
         painter.place(uniforms, item, shot.moment)
         if item.deformer is not None:
-            painter.deform(uniforms, item, shot)
+            painter.deform(uniforms, item, shot.moment, shot.ends)
         if "fog" in uniforms:
-            painter.fog(uniforms, shot)
+            painter.fog(uniforms, shot.moment, shot.size)
         self.bind(uniforms, shot)
         self.set(painter, uniforms, item, shot)
 
@@ -179,7 +192,7 @@ class ScreenPass(Pass):
         """Set uniforms of the program besides its inputs."""
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        uniforms, array = painter.cover(self)
+        uniforms, array = painter.cover(self.program, self.defines(None))
         self.bind(uniforms, shot)
         self.set(uniforms, shot)
         painter.fill(array, shot.target)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from blinkgl.render.antialiasing import Samples
-from blinkgl.render.canvas import DEPTH_BUFFER, Rectangle, merged
+from blinkgl.render.frames import DEPTH_BUFFER, Rectangle, merged
 from blinkgl.render.passes.base import Input, Output, Pass, Shot
 from blinkgl.render.passes.luminance import Mean
 

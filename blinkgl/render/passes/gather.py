@@ -11,7 +11,7 @@ from moderngl import LINEAR
 from blinkgl.camera import CameraModel, Radtan
 from blinkgl.gl import FORMATS
 from blinkgl.labels import LABELS
-from blinkgl.render.canvas import Rectangle
+from blinkgl.render.frames import Rectangle
 from blinkgl.render.lens import steps_of
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
 from blinkgl.render.passes.edged import Edged
@@ -66,7 +66,7 @@ class Gather(ScreenPass):
         return defines
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        lens, (uniforms, array) = painter.lens, painter.cover(self)
+        lens, (uniforms, array) = painter.lens, painter.cover(self.program, self.defines(None))
         assert lens is not None
         self.bind(uniforms, shot)
         if self.smooth:

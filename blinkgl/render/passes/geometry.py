@@ -15,8 +15,9 @@ from blinkgl.render.moment import Moment, rows_xyw_bytes
 from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
+    from blinkgl.gl.shader import Uniforms
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.painter import Painter
 
 
 MADE.append(includes)
@@ -53,7 +54,7 @@ class Geometry(ScenePass):
         return {define_of(name): i for i, name in enumerate(self.names)} | through
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        programs, values = painter.programs(self), self._values(shot)
+        programs, values = self.programs(painter), self._values(shot)
         # Uniforms that only programs of changing shapes have.
         of_shapes = {name for label in self.names for name in LABELS[label].of_shapes}
         checked = set()
@@ -66,7 +67,7 @@ class Geometry(ScenePass):
                 self._check(uniforms, given, item)
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
-                painter.deform(uniforms, item, shot)
+                painter.deform(uniforms, item, shot.moment, shot.ends)
             if "image_size" in uniforms:
                 uniforms["image_size"].value = shot.size
             if "target_size" in uniforms:
@@ -74,7 +75,7 @@ class Geometry(ScenePass):
             # Uniforms of the lens: the ray through a fragment, and its model.
             if self.lens:
                 assert painter.lens is not None
-                painter.lens.set(uniforms, shot, LENS_UNIT)
+                painter.lens.set(uniforms, shot.moment, LENS_UNIT)
             # Values of the labels, of this item's object.
             for name, (_, rows) in values.items():
                 if item.deformer is None and name in of_shapes:
@@ -166,7 +167,7 @@ class Velocity(ScenePass):
         if self.lens:
             assert painter.lens is not None
             # With a lens, motion is in its own pixels at any size, so there is no scale.
-            painter.lens.set(uniforms, shot, 0)
+            painter.lens.set(uniforms, shot.moment, 0)
         elif self.every != 1:
             camera = shot.moment.view.camera
             uniforms["image_scale"].write(np.array([camera.width / width, camera.height / height], np.float32))

@@ -16,8 +16,9 @@ from blinkgl.render.passes.shadow import Shaded, ShadowMap
 from blinkgl.scene.types import Scene
 
 if TYPE_CHECKING:
+    from blinkgl.gl.shader import Uniforms
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.painter import Painter
 
 
 class _Luminance(Shaded):

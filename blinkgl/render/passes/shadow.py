@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from moderngl import LINEAR
 
-from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.frames import DEPTH_BUFFER
 from blinkgl.render.moment import Moment
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
 from blinkgl.render.shadows import Box, boxes, planes_of, scale_of, view_of
@@ -19,8 +19,9 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Scene
 
 if TYPE_CHECKING:
+    from blinkgl.gl.shader import Uniforms
     from blinkgl.render.draw_items import DrawItem, Kind
-    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.painter import Painter
 
 
 FINEST = 1 / 32

@@ -14,12 +14,11 @@ from blinkgl.scene.geometry.figure import body_of
 from blinkgl.scene.geometry.meshes import bounds, finer, weld
 from blinkgl.scene.geometry.primitives import Surface, join, lattice, primitive, square
 from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.gait import PARENTS, Proportions, clip_of
 from blinkgl.scene.shapes.skeleton import Skeleton
 from blinkgl.scene.shapes.skin import Skin
 from blinkgl.scene.shapes.table import deformer_of
-from blinkgl.scene.types import Part
+from blinkgl.scene.types import Deformer, Part
 
 
 @primitive

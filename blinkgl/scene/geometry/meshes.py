@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.shapes.deformer import Deformer, filled
-from blinkgl.scene.types import Mesh, Scene
+from blinkgl.scene.shapes.sweep import filled
+from blinkgl.scene.types import Deformer, Mesh, Scene
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point

@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.primitives import PRIMITIVES
+from blinkgl.config.primitives import PRIMITIVES, PrimitiveKind
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import closedness, make_mesh, weld
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.gait import CLIPS
-from blinkgl.scene.types import Mesh
+from blinkgl.scene.types import Deformer, Mesh
 
 PARAMETERS = {
     "size": "edge length, m",
@@ -91,7 +90,7 @@ def _checked(where: str, key: str, value: Any, default: Any) -> Any:
         accepted = f"a number from {within[0]:g} to {within[1]:g}"
     elif isinstance(default, int):
         # Each subdivision has four times the triangles: 7 are 327,680.
-        low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MOST.get(key, _MAX_SEGMENTS))
+        low, high = (0, 7) if where == "icosphere" else (_LEAST.get(key, 1), _MOST.get(key, _MAX_SEGMENTS))
         right = not np.shape(value) and low <= value <= high and float(value) == int(value)
         accepted = f"a whole number in {low}..{high}"
     else:
@@ -147,6 +146,15 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
     made.checked = checked  # type: ignore[attr-defined]
     BUILDERS[build.__name__] = made
     return made
+
+
+def register(build: Callable[..., Surface]) -> Callable[..., Mesh]:
+    """Add a primitive of one's own to the scenes that name it, and return its builder. Parameters are numbers. Raises
+    TypeError: there is one of this name."""
+    if build.__name__ in PRIMITIVES:
+        raise TypeError(f"primitive '{build.__name__}': there is one already")
+    PRIMITIVES[build.__name__] = PrimitiveKind("prop")
+    return primitive(build)
 
 
 def join(pieces: Sequence[Surface]) -> Surface:

@@ -15,10 +15,9 @@ from blinkgl.scene.geometry.meshes import faces_with_area
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.parts import RawMesh, transformed
 from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skeleton import Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin
-from blinkgl.scene.types import Mesh
+from blinkgl.scene.types import Deformer, Mesh
 
 Motion = Callable[[int], tuple[np.ndarray, np.ndarray]]
 

@@ -53,8 +53,12 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
     gltf_schema.check(tree, where)
     version, least = tree["asset"]["version"], tree["asset"].get("minVersion", "2.0")
     if not version.startswith("2") or least not in ("2", "2.0"):
-        value = version if not version.startswith("2") else f"minVersion {least}"
-        raise AssetError("the file is no glTF 2.0", where=where, value=value, accepted="version 2.0")
+        raise AssetError(
+            "the file is no glTF 2.0",
+            where=where,
+            value=version if not version.startswith("2") else f"minVersion {least}",
+            accepted="version 2.0",
+        )
     return tree, binary
 
 

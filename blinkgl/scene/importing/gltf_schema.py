@@ -48,15 +48,13 @@ class BufferView(_Part):
     byteStride: Annotated[int, Field(ge=0, le=65536)] = 0
 
 
-class SparseIndices(_Part):
-    bufferView: Index
-    byteOffset: Size = 0
-    componentType: Literal[5121, 5123, 5125]
-
-
 class SparseValues(_Part):
     bufferView: Index
     byteOffset: Size = 0
+
+
+class SparseIndices(SparseValues):
+    componentType: Literal[5121, 5123, 5125]
 
 
 class Sparse(_Part):

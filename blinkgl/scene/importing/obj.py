@@ -164,9 +164,11 @@ def _numbers(text: str, least: int, where: str, line: int) -> list[float]:
         text = _COMMENT.split(text)[0]
         row = [float(word) if re.fullmatch(_FLOAT, word) else math.nan for word in text.split()]
     if len(row) < least:
-        accepted = f"at least {least} number{'s' if least > 1 else ''}"
         raise AssetError(
-            "numbers are missing, or are none", where=f"{where}, line {line}", value=text[:40], accepted=accepted
+            "numbers are missing, or are none",
+            where=f"{where}, line {line}",
+            value=text[:40],
+            accepted=f"at least {least} number{'s' if least > 1 else ''}",
         )
     return row
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from blinkgl.scene.geometry.meshes import CREASE_DEGREES, make_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
-from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.types import Material, Part
+from blinkgl.scene.types import Deformer, Material, Part
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.

@@ -94,8 +94,9 @@ def _check(given: Polygons, max_faces: int, where: str) -> None:
     if total > max_faces:
         raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
     if (most := int(given.sizes.max(initial=0))) > MAX_CORNERS:
-        accepted = f"at most {MAX_CORNERS}, or triangles"
-        raise AssetError("a polygon has too many corners", where=where, value=most, accepted=accepted)
+        raise AssetError(
+            "a polygon has too many corners", where=where, value=most, accepted=f"at most {MAX_CORNERS}, or triangles"
+        )
     last = len(given.points) - 1
     beyond = (given.places < 0) | (given.places > last)
     large = ~(np.abs(given.points[given.places.clip(0, max(last, 0))]) < MAX_COORDINATE).all(axis=1)  # NaN, too

@@ -84,10 +84,7 @@ def _check_stl(data: bytes, max_faces: int, where: str) -> None:
         claimed = int(np.frombuffer(data[80:84], "<u4")[0])
         # Binary when the size fits; ASCII begins with 'solid' (some binary files do, too, so the size comes first).
         if data.lstrip()[:5].lower() != b"solid" or len(data) == 84 + 50 * claimed:
-            if claimed > max_faces:
-                raise AssetError(
-                    "the mesh has too many faces", where=where, value=claimed, accepted=f"at most {max_faces}"
-                )
+            _limit(claimed, max_faces, where)
             if len(data) < 84 + 50 * claimed:
                 raise AssetError(
                     f"the mesh is truncated: {claimed} faces need {84 + 50 * claimed} bytes",

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.physics import BodyConfig
 from blinkgl.machine.kernels import kernel
-from blinkgl.scene.shapes.deformer import filled
+from blinkgl.scene.shapes.sweep import filled
 from blinkgl.scene.types import SceneObject
 
 _MOST_PARTS = 24  # an object with more parts gets one common hull

@@ -19,7 +19,7 @@ slide on it, lift off and land; only sinking more than ``rest_margin`` of its ra
 Touching other bodies, or ground that is not convex, at t0 is a collision at t0.
 
 A deforming body is the convex hull of all its shapes in [t0, t1], enlarged by the possible motion between the sampled
-times (:class:`~blinkgl.scene.shapes.deformer.Sweep`): a body clear of that is clear of each shape. Its path is cut like
+times (:class:`~blinkgl.scene.shapes.sweep.Sweep`): a body clear of that is clear of each shape. Its path is cut like
 any other's; its shape continues to change.
 
 Surfaces collide, not solids: a body that starts completely inside another's hollow touches nothing there.
@@ -36,6 +36,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from blinkgl.scene.motion.paths import CutPath
 from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.scene.shapes.sweep import sweep
 from blinkgl.scene.types import SceneObject
 
 CAMERA = "camera"
@@ -133,8 +134,10 @@ class _Body:
     @staticmethod
     def of_object(obj: SceneObject, t0: int, t1: int) -> _Body:
         meshes = [part.mesh for part in obj.parts if len(part.mesh.faces)]
-        swept = [None if mesh.deformer is None else mesh.deformer.sweep(mesh, t0, t1) for mesh in meshes]
-        solids = [(mesh.vertices, mesh.faces) if sweep is None else sweep.hull for mesh, sweep in zip(meshes, swept)]
+        regions = [None if mesh.deformer is None else sweep(mesh, t0, t1) for mesh in meshes]
+        solids = [
+            (mesh.vertices, mesh.faces) if region is None else region.hull for mesh, region in zip(meshes, regions)
+        ]
         # Vertex numbers are continued from part to part.
         first = np.cumsum([0] + [len(vertices) for vertices, _ in solids])
         return _Body(
@@ -144,7 +147,7 @@ class _Body:
             obj.path,
             np.concatenate([vertices for vertices, _ in solids]),
             np.concatenate([faces + k for (_, faces), k in zip(solids, first)]),
-            pad=max((sweep.margin for sweep in swept if sweep is not None), default=0.0),
+            pad=max((region.margin for region in regions if region is not None), default=0.0),
         )
 
     @staticmethod

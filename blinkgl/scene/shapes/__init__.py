@@ -2,6 +2,5 @@
 
 In:    parameters, skeletons and clips, morph targets; a mesh at rest and a time.
 Out:   positions, velocities and normals in float64, and the numbers for the vertex stage.
-Start: deformer.py defines :class:`~blinkgl.scene.shapes.deformer.Deformer`; table.py lists all; closed_forms.py has the
-simple ones.
+Start: table.py lists all deformers (:class:`~blinkgl.scene.types.Deformer`); closed_forms.py has the simple ones.
 """

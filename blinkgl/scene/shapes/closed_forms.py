@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.deform import BendConfig, BreatheConfig, FlagConfig, TwistConfig, WaveConfig
-from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.types import Mesh
+from blinkgl.scene.types import Deformer, Mesh
 
 _AXES = {"x": np.array([1.0, 0, 0]), "y": np.array([0, 1.0, 0]), "z": np.array([0, 0, 1.0])}
 

@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike
 
 from blinkgl.errors import AssetError
 from blinkgl.machine.kernels import kernel
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
-from blinkgl.scene.types import Mesh
+from blinkgl.scene.types import Deformer, Mesh
 
 MAX_ROWS = 1024
 """Largest number of rows per time: OpenGL's blocks of 64 kB hold four times as many."""

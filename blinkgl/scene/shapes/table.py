@@ -18,8 +18,8 @@ import numpy as np
 from blinkgl.config.base import tag_of
 from blinkgl.config.deform import DeformConfig
 from blinkgl.scene.shapes.closed_forms import Bend, Breathe, Flag, Twist, Wave
-from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.skin import Skin
+from blinkgl.scene.types import Deformer
 
 DEFORMERS: dict[str, type[Deformer]] = {}
 """Deformers by class name."""

@@ -34,7 +34,7 @@ from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.shapes.deformer import gait
+from blinkgl.scene.shapes.sweep import gait
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture

@@ -37,7 +37,7 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.shapes.deformer import filled, gait
+from blinkgl.scene.shapes.sweep import filled, gait
 from blinkgl.scene.surfaces.images import SKY_SIDES
 from blinkgl.scene.types import Lamp, Light, Material, Mesh, Part, Scene, SceneObject
 from blinkgl.scene.worlds.pool import Pool, object_pool, texture_pool

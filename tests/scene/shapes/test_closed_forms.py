@@ -20,9 +20,10 @@ from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.living import fish, flag
 from blinkgl.scene.geometry.primitives import icosphere
 from blinkgl.scene.geometry.random_primitives import random_primitive
-from blinkgl.scene.shapes.deformer import Deformer, Sweep, filled
 from blinkgl.scene.shapes.skin import Morphs, Skin
+from blinkgl.scene.shapes.sweep import Sweep, filled, sweep
 from blinkgl.scene.shapes.table import DEFORMERS, deformer_of, register
+from blinkgl.scene.types import Deformer
 
 MS = 1_000_000
 KINDS = {
@@ -76,13 +77,14 @@ def test_a_shape_elsewhere_in_its_file_changes_in_the_same_way(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_bounds_hold_every_shape(kind):
     mesh = body(kind)
-    low, high = mesh.deformer.bounds(mesh, 0, 900 * MS)
+    swept = sweep(mesh, 0, 900 * MS)
+    low, high = swept.low, swept.high
     for t in np.linspace(0, 900 * MS, 401).astype(np.int64):
         at = mesh.deformer.positions(mesh, int(t))
         assert (at >= low).all() and (at <= high).all()
     rest = np.ptp(mesh.vertices, axis=0).max()
     assert (high - low).max() < 2.2 * rest  # and hold little else
-    vertices, faces = mesh.deformer.sweep(mesh, 0, 900 * MS).hull
+    vertices, faces = sweep(mesh, 0, 900 * MS).hull
     corners = vertices[faces] - vertices.mean(axis=0)
     assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(
         axis=1
@@ -141,7 +143,7 @@ def test_a_shape_that_is_shrunk_to_a_point_has_a_hull():
     mesh = icosphere(subdivisions=1)
     gone = Morphs(-mesh.vertices[None], None, lambda t_ns: (np.ones(1), np.zeros(1)), False, MS, MS)
     mesh = replace(mesh, deformer=Skin.morphing(gone))
-    corners, _ = mesh.deformer.sweep(mesh, 0, MS).hull
+    corners, _ = sweep(mesh, 0, MS).hull
     assert len(corners) > 3 and np.abs(corners).max() < 1e-5
 
 
@@ -150,7 +152,7 @@ def test_no_shape_leaves_what_it_is_said_to_sweep(name):
     """Box and hull with its margin, at 97 times that are not those that were looked at; the margin is no excuse,
     either."""
     mesh = SHAPES[name]()
-    swept = mesh.deformer.sweep(mesh, 0, mesh.deformer.span_ns)
+    swept = sweep(mesh, 0, mesh.deformer.span_ns)
     planes = ConvexHull(swept.hull[0]).equations
     outside, beyond = -np.inf, -np.inf
     for t in np.linspace(0, mesh.deformer.span_ns, 99).astype(np.int64)[1:-1]:

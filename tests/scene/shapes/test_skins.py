@@ -16,6 +16,7 @@ from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.shapes.clips import Clip, Playing, Track
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin, joined
+from blinkgl.scene.shapes.sweep import sweep
 
 MS = 1_000_000
 RNG = np.random.default_rng(5)
@@ -86,7 +87,8 @@ def test_a_skin_moves_as_its_rate_says():
     for t in (0, 137 * MS, 812_345_678):
         before, after = (mesh.deformer.positions(mesh, t + dt) for dt in (-1000, 1000))
         np.testing.assert_allclose(mesh.deformer.velocity(mesh, t), (after - before) / 2e-6, atol=1e-7)
-    low, high = mesh.deformer.bounds(mesh, 0, 10**9)
+    swept = sweep(mesh, 0, 10**9)
+    low, high = swept.low, swept.high
     for t in np.linspace(0, 10**9, 200).astype(np.int64):
         at = mesh.deformer.positions(mesh, int(t))
         assert (at >= low).all() and (at <= high).all()

@@ -18,6 +18,7 @@ from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import clip_of, load_asset
 from blinkgl.scene.importing.parts import Z_UP
+from blinkgl.scene.shapes.sweep import sweep
 from tests.scene.gltf_files import arm_file
 
 SECOND = 10**9
@@ -179,7 +180,7 @@ def test_figures_enter_random_worlds_playing(tmp_path):
     assert any("plays 'wave'" in line for line in scene.log)
     assert len({o.parts[0].mesh.deformer.period_ns for o in arms}) == len(arms)  # each at a speed of its own
     for arm in arms:  # and all of what it sweeps is in the sphere that was kept free
-        points, margin = arm.parts[0].mesh.deformer.sweep(arm.parts[0].mesh, 0, SECOND).hull, 1e-3
+        points, margin = sweep(arm.parts[0].mesh, 0, SECOND).hull, 1e-3
         assert np.linalg.norm(points[0], axis=1).max() <= 2.2 / 2 + margin
     again = scene_of(tmp_path, RandomSceneConfig, kind="random", **world)
     assert [o.parts[0].mesh.deformer.period_ns for o in again.objects if o.deforms] == [
@@ -211,10 +212,7 @@ def test_a_share_of_a_random_world_deforms():
     for o in ours:
         if o.deforms:
             mesh = o.parts[0].mesh
-            assert (
-                np.linalg.norm(mesh.deformer.sweep(mesh, 0, SECOND).hull[0], axis=1).max()
-                <= rigid[o.name].radius * 1.001
-            )
+            assert np.linalg.norm(sweep(mesh, 0, SECOND).hull[0], axis=1).max() <= rigid[o.name].radius * 1.001
         elif o.name in rigid:
             np.testing.assert_array_equal(o.parts[0].mesh.vertices, rigid[o.name].parts[0].mesh.vertices)
     with pytest.raises(ConfigError, match="no such kind of deformation .got 'melt'"):

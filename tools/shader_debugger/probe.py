@@ -1,0 +1,290 @@
+"""One pixel: each buffer beside the float64 reference, the point's position in every frame of reference, and the reason
+if it is invalid or occluded."""
+
+from __future__ import annotations
+
+import numpy as np
+from trimesh.triangles import points_to_barycentric
+
+from blinkgl.render import casting
+from blinkgl.render.renderer import Renderer
+from blinkgl.tools.shader_debugger.compare import Comparison
+from blinkgl.tools.shader_debugger.filters import TWINNED
+from blinkgl.tools.shader_debugger.lamps import place_in
+from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of
+from blinkgl.tools.shader_debugger.quantities import QUANTITIES
+from blinkgl.tools.shader_debugger.reference_probe import probe as reference_probe
+
+
+def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
+    """Return the largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not
+    finite."""
+    g, r = np.atleast_1d(np.asarray(gpu, np.float64)), np.atleast_1d(np.asarray(ref, np.float64))
+    with np.errstate(all="ignore"):
+        # The distance of two neighbouring float32 at the reference's value.
+        apart = np.abs(g - r) / np.spacing(np.abs(r).astype(np.float32)).astype(np.float64)
+    # Equal values, infinities included, have no difference; other infinities give nan.
+    return float(np.where(g == r, 0.0, np.nan_to_num(apart, nan=np.inf, posinf=np.inf)).max())
+
+
+def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comparison | None = None) -> dict:
+    """Plain data (JSON) about pixel (x, y):
+
+    buffers  : rows of name, unit, gpu, reference, error, error_unit, ulps, ok (None: not graded here), note.
+    surface  : what the reference hit: object, category, instance, part, triangle, front, bary, corners …, and what the
+    GPU drew. positions: rows of name, gpu, reference (4 or 3 numbers each): local, camera, world, clip, window at t and
+    t', and of each shadow map where in it (texels), how deep, and what it holds there.
+    why : per direction, the reference's reason and the GPU's own for invalid or occluded ("": seen at both times).
+    """
+    comparison = comparison or Comparison(gpu, ref)
+    scene, when = ref.seen, gpu.when
+    parts = casting.scene_parts(scene)
+    seen = {way: reference_probe(scene, when.t_ns, x, y, getattr(when, f"{way}_ns")) for way in ("forward", "backward")}
+    drawn, true = int(gpu["part"][y, x]), int(ref["part"][y, x])
+    # Behind a lens: the pixel of the flat picture that it reads; later results are of the lens's own ray.
+    hit = reference_probe(ref.scene, when.t_ns, *ref.frame.xy[y, x])
+    return {
+        "pixel": [x, y],
+        "t_s": when.t_ns * 1e-9,
+        "times_s": {"forward": when.forward_ns * 1e-9, "backward": when.backward_ns * 1e-9},
+        "band": bool(comparison.band[y, x]),
+        "buffers": [
+            _row(name, gpu, ref, comparison, x, y)
+            for name in buffers_of(scene, gpu.renderer.twinned)
+            if name not in ("triangle", "local", *MAPS)
+        ],  # told below
+        "surface": {
+            "gpu": _surface(
+                parts, drawn, int(gpu["triangle"][y, x]) - 1, _barycentric(parts, drawn, gpu, x, y, when.t_ns)
+            ),
+            "reference": _surface(parts, true, hit.triangle, hit.bary)
+            | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
+        },
+        "positions": _positions(gpu, ref, x, y, hit, seen) if true >= 0 or drawn >= 0 else [],
+        "why": {
+            way: {"reference": seen[way].why, "gpu": _gpu_reason(gpu, way, x, y)} for way in ("forward", "backward")
+        },
+    }
+
+
+def _plain(values):
+    return None if values is None else np.asarray(values).tolist()
+
+
+def _row(name, gpu, ref, comparison, x, y) -> dict:
+    g, r = (side[y, x] for side in (comparison.pair(name) if name in TWINNED else (gpu[name], ref[name])))
+    row = {
+        "name": name,
+        "title": PASSES[name].title,
+        "unit": PASSES[name].unit,
+        "gpu": g.tolist(),
+        "reference": r.tolist(),
+        "error": None,
+        "error_unit": "",
+        "ulps": None,
+        "ok": None,
+        "note": "",
+    }
+    if PASSES[name].kind in ("mask", "ids"):
+        row |= {"error": float(g != r), "error_unit": "mismatch"}
+    else:
+        row["ulps"] = ulps(g, r)
+        row |= {
+            "error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
+            "error_unit": PASSES[name].unit,
+        }
+    if name in comparison.names() and name in QUANTITIES:
+        quantity = QUANTITIES[name]
+        error = float(comparison.errors(name)[y, x])
+        limit = quantity.tolerance if quantity.statistic == "max" else 0.5
+        row["ok"] = bool(error <= limit) if comparison.graded(name)[y, x] else None
+        if name in ("luminance", "colour"):
+            row["note"] = (
+                "of the GPU's own albedo and light: "
+                f"{np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off"
+            )
+    if name == "colour_albedo" and ref["level"][y, x] > 0:
+        row["note"] = f"full resolution (level 0): {np.array2string(ref['albedo_level0'][y, x], precision=5)}"
+    return row
+
+
+def _surface(parts, p, triangle, bary) -> dict:
+    if p < 0:
+        return {"object": None}
+    thing, part = parts[p]
+    return {
+        "object": thing.name,
+        "category": thing.category,
+        "instance": thing.instance_id,
+        "part": [i for i, own in enumerate(thing.parts) if own is part][0],
+        "mesh": part.mesh.name,
+        "texture": part.material.texture.name if part.material.texture else None,
+        "triangle": triangle,
+        "bary": _plain(bary),
+        "both_sides": not part.culled,
+        "unlit": part.material.unlit,
+    }
+
+
+def _barycentric(parts, p, gpu, x, y, t_ns):
+    """Of the GPU's interpolated local position in the triangle it drew; None: it has no area."""
+    triangle = int(gpu["triangle"][y, x]) - 1
+    if p < 0 or not 0 <= triangle < len(parts[p][1].mesh.faces):
+        return None
+    mesh = parts[p][1].mesh
+    corners = casting.vertices_at(mesh, t_ns)[mesh.faces[triangle]]
+    with np.errstate(all="ignore"):
+        shares = points_to_barycentric(corners[None], gpu["local"][y, x].astype(np.float64)[None], method="cross")[0]
+    return shares if np.isfinite(shares).all() else None
+
+
+def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
+    """Return the positions. The GPU's clip position is the one it used: gl_FragCoord at t; at t' the position and depth
+    that its flow implies."""
+    scene, when = ref.scene, gpu.when
+    P = scene.camera.clip_from_cam()
+    size = np.array([scene.camera.width, scene.camera.height], float)
+    rows: list[dict] = []
+
+    def add(name, g, r):
+        rows.append({"name": name, "gpu": _plain(g), "reference": _plain(r)})
+
+    p = int(gpu["part"][y, x])
+    local = gpu["local"][y, x].astype(np.float64) if p >= 0 else None
+    thing = casting.scene_parts(scene)[p][0] if p >= 0 else None
+
+    def world(t_ns):
+        if thing is None:
+            return None
+        pose = thing.path.pose(t_ns)
+        return pose[:3, :3] @ local + pose[:3, 3]
+
+    add("local", local, point.local)
+    add("world, t", world(when.t_ns), point.world)
+    add("camera, t", None, point.camera)
+    window = gpu["window"][y, x].astype(np.float64)
+    # gl_FragCoord contains all of the GPU's clip position: w is 1 / Z there.
+    ndc = window[:2] / size * 2 - 1
+    clip = np.array([*ndc, window[2], 1.0]) / window[3] if window[3] else None
+    add("clip, t", clip, P @ [*point.camera, 1.0] if point.hit else None)
+    for way, label in (("forward", "t' forward"), ("backward", "t' backward")):
+        later = seen[way]
+        t_ns = getattr(when, f"{way}_ns")
+        add(f"world, {label}", world(t_ns), later.world_to)
+        add(f"camera, {label}", None, later.camera_to)
+        w = float(gpu[f"next_depth_{way}"][y, x])
+        there = ndc + gpu[f"flow_{way}"][y, x] * 2 / size
+        add(
+            f"clip, {label}",
+            [there[0] * w, there[1] * w, scene.camera.near, w] if p >= 0 and scene is ref.seen else None,
+            P @ [*later.camera_to, 1.0] if later.camera_to is not None else None,
+        )
+        add(
+            f"pixel, {label}",
+            [x, y] + gpu[f"flow_{way}"][y, x].astype(np.float64) if gpu[f"valid_{way}"][y, x] else None,
+            later.xy_to,
+        )
+    for k, one in enumerate(ref.maps):
+        here = {}
+        for side, moment, at in (("gpu", gpu, world(when.t_ns)), ("reference", ref, point.world)):
+            there = None if at is None else place_in(one, when.t_ns, at)
+            if there is not None:
+                x_map, y_map = (int(np.clip(v, 0, one.texels - 1)) for v in there[:2])
+                there = np.array([*there, moment[MAPS[k]][y_map, x_map]])
+            here[side] = there
+        add(f"{MAPS[k]}: x, y, depth; map", here["gpu"], here["reference"])
+    return rows
+
+
+def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
+    """Return why the GPU's masks are invalid or occluded here, from the buffers that render/occlusion.py used."""
+    if gpu["part"][y, x] < 0 and gpu["id"][y, x] == 0:
+        return "nothing hit"
+    w = float(gpu[f"next_depth_{way}"][y, x])
+    flow = gpu[f"flow_{way}"][y, x]
+    if not gpu[f"valid_{way}"][y, x]:
+        return f"behind the camera at t' (Z' = {w:.6g})" if not w > 0 else "the flow is not finite"
+    if not gpu[f"occluded_{way}"][y, x]:
+        return ""
+    renderer: Renderer = gpu.renderer
+    xt, yt = x + float(flow[0]), y + float(flow[1])
+    # A point that leaves the picture is occluded in any case.
+    if not (-0.5 <= xt < renderer.width - 0.5 and -0.5 <= yt < renderer.height - 0.5):
+        return f"outside the image at t' (x' = {xt:.3f}, y' = {yt:.3f})"
+    if w < renderer.scene.camera.near:
+        return f"in front of the near plane at t' (Z' = {w:.6g} < {renderer.scene.camera.near:g})"
+    there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "depth", "ids")
+    # The pixel that contains the point then.
+    xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
+    other = int(there["ids"][yn, xn])
+    names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
+    return (
+        f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth "
+        f"{there['depth'][yn, xn]:.6g}, the point is at Z' = {w:.6g}"
+    )
+
+
+# ------------------------------------------------------------------------------------------------- text
+
+
+def as_text(found: dict) -> str:
+    """Return the probe as fixed-width text."""
+    x, y = found["pixel"]
+    lines = [
+        (
+            f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
+            f"{found['times_s']['backward']:.9g} s (backward)"
+        )
+    ]
+    if found["band"]:
+        lines.append(
+            "in the silhouette band: the pixel's centre may fall on either side of an edge, so nothing is graded here"
+        )
+    lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]
+    for row in found["buffers"]:
+        mark = {True: "", False: "!!", None: ""}[row["ok"]]
+        error = "" if row["error"] is None else f"{row['error']:.3g}"
+        count = "" if row["ulps"] is None else f"{row['ulps']:.3g}"
+        lines.append(
+            f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} "
+            f"{count:>9}  {row['error_unit']}"
+        )
+        if row["note"]:
+            lines.append(f"{'':24}{row['note']}")
+    lines.append("")
+    for side in ("gpu", "reference"):
+        lines.append(f"{'GPU drew' if side == 'gpu' else 'reference hit':<14} {_surface_text(found['surface'][side])}")
+    if found["positions"]:
+        lines += ["", f"{'position':<20} {'GPU':<52} reference (float64)"]
+        lines += [
+            f"{row['name']:<20} {_numbers(row['gpu']):<52} {_numbers(row['reference'])}" for row in found["positions"]
+        ]
+    lines.append("")
+    for way, why in found["why"].items():
+        for side in ("gpu", "reference"):
+            lines.append(f"{way:<9} {'GPU' if side == 'gpu' else 'reference':<10} {why[side] or 'seen at both times'}")
+    return "\n".join(lines)
+
+
+def _numbers(values) -> str:
+    if values is None:
+        return "-"
+    if isinstance(values, bool):
+        return "yes" if values else "no"
+    if isinstance(values, int):
+        return str(values)
+    if isinstance(values, float):
+        return f"{values:.8g}"
+    return "  ".join(f"{v:.7g}" for v in values)
+
+
+def _surface_text(s: dict) -> str:
+    if s["object"] is None:
+        return "nothing"
+    bary = f", barycentrics {_numbers(s['bary'])}" if s["bary"] is not None else ""
+    side = "" if "front" not in s else (", from the front" if s["front"] else ", from behind")
+    texture = f", texture {s['texture']}" if s["texture"] else ""
+    return (
+        f"{s['object']} (id {s['instance']}, {s['category']}), part {s['part']} {s['mesh']}{texture}, triangle "
+        f"{s['triangle']}{bary}{side}"
+    )

@@ -1,0 +1,125 @@
+"""The float64 reference renderer: computes every buffer of every pass by casting rays on the CPU.
+
+It shares with the rasteriser only :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no
+projection matrix. It supports any camera model whose rays point forward (Z > 0). Tests and the shader debugger compare
+the GPU with it. Rays, hits and flow are in :mod:`blinkgl.render.casting`, light and textures in
+:mod:`blinkgl.tools.shader_debugger.appearance`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from blinkgl.render.casting import Flow, Hits, cast, flow_to, moved_in_space, velocity
+from blinkgl.scene.types import Scene
+from blinkgl.tools.shader_debugger.appearance import surface
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceFrame:
+    """All buffers of one image; (H, W, ...) float64 unless said otherwise. See :class:`Hits`, :class:`Flow` and
+    :class:`~blinkgl.tools.shader_debugger.appearance.Surface` for the fields. velocity : (H, W, 2) px/s at t, nan where
+    nothing is hit.
+    forward, backward : flow to the requested times, else None."""
+
+    t_ns: int
+    hit: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    part: np.ndarray
+    triangle: np.ndarray
+    bary: np.ndarray
+    local: np.ndarray
+    normal: np.ndarray
+    uv: np.ndarray
+    albedo: np.ndarray
+    colour: np.ndarray
+    luminance: np.ndarray
+    velocity: np.ndarray
+    forward: Flow | None
+    backward: Flow | None
+    front: np.ndarray
+    xy: np.ndarray
+
+    def hits(self) -> Hits:
+        """Return the hits at the pixel centres, row by row."""
+        flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in _HIT_IMAGES}
+        return Hits(t_ns=self.t_ns, **flat)
+
+    def scene_flow(self, scene: Scene) -> np.ndarray:
+        """Return (H, W, 3) world units, as :func:`moved_in_space` to the forward flow's time; 0 where nothing is
+        hit."""
+        assert self.forward is not None
+        moved = moved_in_space(scene, self.hits(), self.forward.t_ns).reshape(*self.hit.shape, 3)
+        return np.where(self.hit[..., None], moved, 0.0)
+
+
+def render(
+    scene: Scene,
+    t_ns: int,
+    *,
+    forward_ns: int | None = None,
+    backward_ns: int | None = None,
+    xy: np.ndarray | None = None,
+) -> ReferenceFrame:
+    """Return every buffer at t_ns, with the flow to forward_ns and to backward_ns where given.
+
+    xy : (H, W, 2) image points, px, of a picture of any size; None: all pixel centres."""
+    shape = (scene.camera.height, scene.camera.width) if xy is None else xy.shape[:2]
+    hits = cast(scene, t_ns, None if xy is None else xy.reshape(-1, 2))
+    looks = surface(scene, hits)
+
+    def image(values):
+        return values.reshape(*shape, *values.shape[1:])
+
+    def flow(to_ns):
+        if to_ns is None:
+            return None
+        result = flow_to(scene, hits, to_ns)
+        return Flow(result.t_ns, *(image(getattr(result, name)) for name in _FLOW_IMAGES))
+
+    from_hits = {name: image(getattr(hits, name)) for name in _HIT_IMAGES}
+    from_looks = {name: image(getattr(looks, name)) for name in ("normal", "uv", "albedo", "colour", "luminance")}
+    return ReferenceFrame(
+        t_ns=int(t_ns),
+        **from_hits,
+        **from_looks,
+        velocity=image(velocity(scene, hits)),
+        forward=flow(forward_ns),
+        backward=flow(backward_ns),
+    )
+
+
+_HIT_IMAGES = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
+_FLOW_IMAGES = ("flow", "valid", "occluded", "outside", "depth", "hidden_by")
+
+
+def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: float = 0.02) -> np.ndarray:
+    """Return (H, W) bool: pixels within ``width`` px (8-neighbourhood) of an id change or a jump in depth.
+
+    ids : (H, W) integers.   depth : (H, W), inf or nan where nothing is hit.   A jump is a second difference of 1 / Z
+    along x or y above ``jump`` of its largest value there: 1 / Z of a plane is affine in the image, however steep the
+    plane, so slanted ground is not taken for an edge.
+    """
+    # Second differences of 1/Z vanish on a plane; along x and along y in turn.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.nan_to_num(1.0 / np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    band = np.zeros(ids.shape, bool)
+    for axis in (0, 1):
+        i, z, b = np.swapaxes(ids, 0, axis), np.swapaxes(inverse, 0, axis), np.swapaxes(band, 0, axis)
+        change = i[1:] != i[:-1]
+        b[1:] |= change
+        b[:-1] |= change
+        bend = np.abs(z[2:] - 2.0 * z[1:-1] + z[:-2]) > jump * np.maximum(np.maximum(z[2:], z[1:-1]), z[:-2])
+        b[1:-1] |= bend
+    # Diagonal neighbours.
+    diagonal = ids[1:, 1:] != ids[:-1, :-1]
+    other = ids[1:, :-1] != ids[:-1, 1:]
+    band[1:, 1:] |= diagonal
+    band[:-1, :-1] |= diagonal
+    band[1:, :-1] |= other
+    band[:-1, 1:] |= other
+    return ndimage.binary_dilation(band, np.ones((3, 3)), iterations=width - 1) if width > 1 else band

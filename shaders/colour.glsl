@@ -1,6 +1,6 @@
 #version 430 core
 // Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED,
-// LIGHTS, HUED, TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
+// LIGHTS, RGB, TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
 // SHOW_LOOKUP, for the shader debugger: also writes the texture lookups, see lookup.glsl.
 
 #include "needs.glsl"
@@ -94,7 +94,7 @@ void main()
 #ifndef LIT
     const float shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
 #endif
-#ifdef HUED
+#ifdef RGB
     vec3 weighed = radiance * vec3(0.2126, 0.7152, 0.0722); // Rec. 709
 #define OF_LUMINANCE(light) (dot(weighed, light) / max(weighed.r + weighed.g + weighed.b, 1e-30))
 #else

@@ -10,7 +10,7 @@
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
 //                       pixels
 //            FOG        seen through fog, see fog.glsl
-//           LIGHTS     other lights, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
+//           LIGHTS     other lights, see lights.glsl; RGB: the albedo is r, g, b, each times its share of the
 //                       luminance, because coloured light scales each channel separately
 //            TINTED     times the vertices' colours
 //           EMISSIVE   emitted light, EMISSION_MAP: from a texture of its luminance
@@ -35,15 +35,6 @@
 #endif
 #endif
 #endif
-#ifdef HUED
-#define ALBEDO vec3
-#define CHANNELS rgb
-#define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // weights of the luminance, Rec. 709
-#else
-#define ALBEDO float
-#define CHANNELS r
-#define WEIGHTS 1.0
-#endif
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
@@ -53,6 +44,7 @@
 #ifdef SHOW_LOOKUP
 #include "lookup.glsl"
 #endif
+#include "albedo.glsl"
 #ifdef RATE
 layout(location = 0) out vec2 result;
 #else
@@ -66,24 +58,6 @@ uniform mat4x3 rate;
 #endif
 #ifdef FOG
 #include "fog.glsl"
-#endif
-#ifdef EVERY
-const float every = float(EVERY);
-#else
-const float every = 1.0;
-#endif
-#ifdef TEXTURED
-uniform sampler2D albedo;
-#else
-uniform ALBEDO albedo;
-#endif
-#ifdef TINTED
-#ifdef HUED
-#define TINT(colour) colour
-#else
-uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface
-#define TINT(colour) dot(colour, tint_shares)
-#endif
 #endif
 #ifdef EMISSIVE
 uniform float emission; // luminance
@@ -105,45 +79,8 @@ void main()
 #ifdef NEEDS_UV
     vec2 uv = within_reach(uv); // hides the varying
 #endif
-// Albedo: the texture's, filtered in one of four ways, or the uniform.
 #ifdef TEXTURED
-#ifdef TAPS4
-#ifdef STRETCHED
-    // The longer and the shorter side of the pixel on the surface: four taps in a square where they are similar, in a
-    // row along the longer one at a grazing angle; each with the level that fits.
-    vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv), texels = vec2(textureSize(albedo, 0));
-    float across = dot(right * texels, right * texels), along = dot(down * texels, down * texels);
-    if (across > along) {
-        vec2 other = right;
-        right = down;
-        down = other;
-        other.x = across;
-        across = along;
-        along = other.x;
-    }
-    float row = clamp(along / max(4.0 * across, 1e-3 * along + 1e-20) - 0.5, 0.0, 1.0);
-    right = mix(right, 0.5 * down, row);
-    // Squares of the spacing of the taps on the surface, two texels and one texel: half of log2 is the level.
-    float level = 0.5 * log2(max(mix(4.0 * along, max(along, 16.0 * across), row), 1e-30));
-    ALBEDO luminance = 0.25 * (textureLod(albedo, uv - right - down, level).CHANNELS
-                             + textureLod(albedo, uv + right - down, level).CHANNELS
-                             + textureLod(albedo, uv - right + down, level).CHANNELS
-                             + textureLod(albedo, uv + right + down, level).CHANNELS);
-#else
-    // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
-    // texture.
-    vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
-    ALBEDO luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).CHANNELS
-                             + texture(albedo, uv + right - down, -1.0).CHANNELS
-                             + texture(albedo, uv - right + down, -1.0).CHANNELS
-                             + texture(albedo, uv + right + down, -1.0).CHANNELS);
-#endif
-#elif defined(EVERY)
-    // Neighbours in the target are n px of the image apart; the level is chosen as for one.
-    ALBEDO luminance = texture(albedo, uv, -log2(every)).CHANNELS;
-#else
-    ALBEDO luminance = texture(albedo, uv).CHANNELS;
-#endif
+    ALBEDO luminance = albedo_at(uv);
 #else
     ALBEDO luminance = albedo;
 #endif
@@ -238,7 +175,7 @@ void main()
     luminance *= light;
 #endif
 #endif
-#ifdef HUED
+#ifdef RGB
     // The albedo includes the luminance's weights.
     float seen = luminance.r + luminance.g + luminance.b;
 #ifdef RATE
@@ -269,7 +206,7 @@ void main()
 #elif !defined(LIT)
     const float light = 1.0, shown_direct = 0.0, shown_arrives = 0.0, shown_around = 0.0;
 #endif
-#ifdef HUED
+#ifdef RGB
     float known = unlit.r + unlit.g + unlit.b;
 #define OF_LUMINANCE(light) (dot(unlit, vec3(light)) / max(known, 1e-30))
 #else

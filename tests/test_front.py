@@ -80,6 +80,8 @@ def test_table_list_and_type_checker_agree():
 
 @pytest.mark.parametrize("name", sorted(blinkgl._HOME))
 def test_every_name_exists_and_says_what_it_is(name):
+    if name.startswith("Tensor"):
+        pytest.importorskip("torch")
     text = inspect.getdoc(getattr(blinkgl, name))
     assert text and len(text) > 20
 

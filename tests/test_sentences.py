@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from pinned import only_with_pinned
 from sentences import sentences
 
 from blinkgl import cli
@@ -234,6 +235,7 @@ def _said(run, capsys, words: str, folder: Path) -> str:
 
 
 def test_commands_say_what_is_wrong(tmp_path, monkeypatch, capsys):
+    only_with_pinned("typer", "click", "rich")
     import cv2
 
     monkeypatch.chdir(tmp_path)

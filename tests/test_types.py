@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from pinned import only_with_pinned
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -101,6 +102,7 @@ def test_a_users_program_is_checked(tmp_path):
     """Errors at the lines that are wrong and nowhere else: a class that a checker takes for
     Any would be an error nowhere."""
     pytest.importorskip("pyrefly", reason="the extra [dev] is not installed")
+    only_with_pinned("numpy", "pyrefly")
     (tmp_path / "program.py").write_text(PROGRAM, encoding="utf-8")
     program = next(file.locate() for file in metadata.files("pyrefly") or () if file.name == "pyrefly")
     command = [

@@ -49,7 +49,7 @@ HERE = Path(__file__).resolve().parents[1] / "tests" / "fingerprint"
 PINNED = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
 COLOUR = re.compile(r"(^|/)(images|clean|sharp|ev_inf|frame_camera|mvsec/train)$")
 """Folders of colour pictures, whose sums are kept for each processor vendor."""
-Sums = dict[str, str | dict[str, str]]
+GroupSums = dict[str, str | dict[str, str]]
 NOT_DATA = re.compile(r"(^|/)(manifest\.json|config\.yaml|rig\.yaml|README\.md|\.run/.*)$")
 
 
@@ -153,7 +153,7 @@ def fingerprint(name: str) -> dict[str, str]:
         return sums(OTHERS[name](scratch) if name in OTHERS else generated(name, scratch))
 
 
-def kept(platform: str) -> dict[str, Sums]:
+def kept(platform: str) -> dict[str, GroupSums]:
     """Return the sums that the repository keeps of a platform, by case; empty where it keeps none."""
     try:
         return json.loads((HERE / "sums" / f"{platform}.json").read_text(encoding="utf-8"))
@@ -161,7 +161,7 @@ def kept(platform: str) -> dict[str, Sums]:
         return {}
 
 
-def differences(before: Sums, after: dict[str, str], vendor: str) -> list[str]:
+def differences(before: GroupSums, after: dict[str, str], vendor: str) -> list[str]:
     """Return the folders of one case whose sums differ; colour pictures count where this vendor's sum is kept."""
 
     def known(path: str) -> str | None:
@@ -171,7 +171,7 @@ def differences(before: Sums, after: dict[str, str], vendor: str) -> list[str]:
     return [path for path in sorted(before.keys() | after) if known(path) != after.get(path)]
 
 
-def renewed(before: Sums, after: dict[str, str], vendor: str) -> Sums:
+def renewed(before: GroupSums, after: dict[str, str], vendor: str) -> GroupSums:
     """Return the sums of one case as they are kept: another vendor's stay only beside an unchanged one of this."""
 
     def entry(path: str, made: str) -> str | dict[str, str]:

@@ -21,10 +21,10 @@ from blinkgl.scene.types import SceneObject
 from blinkgl.scene.worlds.from_file import from_document
 
 AT_FRAMES, BETWEEN = 1e-4, 8e-4
-"""Largest distances at frames and between frames, of a thing's size."""
+"""Largest distances at frames and between frames, of a obj's size."""
 MOST_PER_FRAME = 8
 """Largest number of key frames per frame of the whole scene; what needs more is baked alone."""
-_NOTHING = 1e-6  # of its size: a thing that small is hidden
+_NOTHING = 1e-6  # of its size: a obj that small is hidden
 
 At = Callable[[int], np.ndarray]
 """Returns (V, 3) points in the world at one of the times."""
@@ -51,10 +51,10 @@ def compare(glb: Path, seen: Path | None, per: int = 1) -> tuple[dict[str, Diffe
     if seen is None:
         return {}, 1, scene.omissions
     theirs: dict[str, list[np.ndarray]] = {}
-    things = json.loads(str(table["things"]))
-    for k, (name, _) in enumerate(things):
+    objs = json.loads(str(table["objs"]))
+    for k, (name, _) in enumerate(objs):
         theirs.setdefault(name, []).append(table[f"arr_{k}"])
-    ours, changing = _played(document, scene.objects, t_ns), {name for name, changes in things if changes}
+    ours, changing = _played(document, scene.objects, t_ns), {name for name, changes in objs if changes}
     morphs = ["targets" in mesh["primitives"][0] for mesh in document.tree["meshes"]]
     deforming = {node.name for node in shown if node.skin is not None or morphs[node.mesh or 0]}
     differs: dict[str, Difference] = {}

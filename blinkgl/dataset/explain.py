@@ -262,7 +262,7 @@ def _shining(light: Light) -> str:
     names = [f"{count[kind]} {word}{'s' * (count[kind] > 1)}" for kind, word in words.items() if count[kind]]
     if light.sky:
         names.append("sky")
-    if light.around is not None:
+    if light.quadric is not None:
         names.append("panorama")
     if light.shadows != "off":
         names.append(f"{light.shadows} shadows")

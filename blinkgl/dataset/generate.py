@@ -182,7 +182,7 @@ def _settings(sequence: SensorSimulation) -> dict[str, Any]:
         "t_offset_us": sequence.t0_ns // 1000,
         "labels": sequence.config.labels,
         "events": sequence.camera is not None,
-        "truth": sequence.tells,
+        "truth": sequence.records_truth,
         "codec": sequence.config.output.compression,
     }
 

@@ -202,7 +202,7 @@ class EventCamera:
             self._readout = Readout(readout)
 
     @property
-    def tells(self) -> bool:
+    def records_truth(self) -> bool:
         """Return whether the surface of each event is recorded, so that frames must have ``surfaces``."""
         return self._truth is not None
 

@@ -183,8 +183,9 @@ def calibrate(
     **reading: Unpack[ReadingOptions],
 ) -> Calibration:
     """Fit an emulator to a camera's own recording. Of the result, ``config`` is the fitted emulator, ``values`` and
-    ``uncertainty`` belong to its fitted keys, ``untold`` gives the reasons why others were not fitted, ``judged`` is
-    the difference from the recording in the fitted half and in the other, ``sensor()`` is the table of a sensor file.
+    ``uncertainty`` belong to its fitted keys, ``undetermined`` gives the reasons why others were not fitted,
+    ``judged`` is the difference from the recording in the fitted half and in the other, ``sensor()`` is the table of a
+    sensor file.
 
     recording : event file.   frames : what the camera saw, of its size (default: the recording's own).   emulator : a
     name, or a mapping of initial values.   fixed : keys that keep their initial values.   still : a static scene in

@@ -32,22 +32,22 @@ def categories_of(labels: LabelsConfig) -> Categories:
     return tuple(asked.items()) if isinstance(asked, dict) and asked else BY_NAME
 
 
-def class_of(thing: SceneObject) -> str:
+def class_of(obj: SceneObject) -> str:
     """Return an object's kind, from its name: "cuboid" of "cuboid-3#12", "Chair" of "Chair.001"; "ground", "wall" and
     "sky" by their category."""
-    if thing.category != "object":
-        return thing.category
-    return re.sub(r"([#.\-_ ]\d+)+$", "", thing.name) or thing.name
+    if obj.category != "object":
+        return obj.category
+    return re.sub(r"([#.\-_ ]\d+)+$", "", obj.name) or obj.name
 
 
-def names_of(thing: SceneObject) -> list[str]:
+def names_of(obj: SceneObject) -> list[str]:
     """Return the names that patterns are compared with."""
-    return [thing.name, class_of(thing), *(part.mesh.name for part in thing.parts)]
+    return [obj.name, class_of(obj), *(part.mesh.name for part in obj.parts)]
 
 
-def category_of(thing: SceneObject, categories: Categories) -> int:
+def category_of(obj: SceneObject, categories: Categories) -> int:
     """Return the number of an object's category; 0: no pattern matches."""
-    names = names_of(thing)
+    names = names_of(obj)
     return next((number for pattern, number in categories if any(fnmatchcase(n, pattern) for n in names)), 0)
 
 
@@ -65,23 +65,20 @@ class Semantics(Label):
     def check(self, scene: Scene, labels: LabelsConfig) -> None:
         categories = categories_of(labels)
         if scene.objects and not any(
-            fnmatchcase(name, pattern)
-            for thing in scene.objects
-            for name in names_of(thing)
-            for pattern, _ in categories
+            fnmatchcase(name, pattern) for obj in scene.objects for name in names_of(obj) for pattern, _ in categories
         ):
             raise ConfigError(
                 "no object's name matches a pattern",
                 where="labels.semantics",
                 value=[pattern for pattern, _ in categories],
                 accepted="patterns of "
-                + ", ".join(dict.fromkeys(class_of(thing) for thing in scene.objects))
+                + ", ".join(dict.fromkeys(class_of(obj) for obj in scene.objects))
                 + "; '*': 0 accepts scenes without any",
             )
 
     def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
         categories = categories_of(labels)
-        of_objects = {thing.name: category_of(thing, categories) for thing in scene.objects}
+        of_objects = {obj.name: category_of(obj, categories) for obj in scene.objects}
         return {"categories": {"patterns": dict(categories), "objects": of_objects}}
 
     def finish(self, drawn: Drawn) -> np.ndarray:
@@ -102,7 +99,7 @@ class Semantics(Label):
 
 
 def _of(scene: Scene, categories: Categories, ids: np.ndarray) -> np.ndarray:
-    numbers = np.zeros(1 + max((thing.instance_id for thing in scene.objects), default=0), np.uint16)
-    for thing in scene.objects:
-        numbers[thing.instance_id] = category_of(thing, categories)
+    numbers = np.zeros(1 + max((obj.instance_id for obj in scene.objects), default=0), np.uint16)
+    for obj in scene.objects:
+        numbers[obj.instance_id] = category_of(obj, categories)
     return numbers[ids]

@@ -65,7 +65,7 @@ class Ids(Label):
     buffer, dtype = "R32UI", np.uint32
 
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
-        return {"instance_id": np.array([thing.instance_id for thing in shot.scene.objects], np.uint32)}
+        return {"instance_id": np.array([obj.instance_id for obj in shot.scene.objects], np.uint32)}
 
     @property
     def forms(self) -> tuple[Form, ...]:
@@ -136,7 +136,7 @@ class SceneFlow(Label):
         # Differences of poses, so that static objects have exactly 0.
         change = to_camera @ (then.T_world_obj - now.T_world_obj)[:, :3]
         # A sky at infinity is static: its box only follows the camera.
-        change[[thing.at_infinity for thing in shot.scene.objects]] = 0.0
+        change[[obj.at_infinity for obj in shot.scene.objects]] = 0.0
         of_clip = to_camera @ then.T_world_cam[:3, :3] @ np.linalg.inv(then.view.projection[[0, 1, 3], :3])
         return {"change_in_space": change, "space_from_clip": np.tile(of_clip, (len(change), 1, 1))}
 

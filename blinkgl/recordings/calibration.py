@@ -33,7 +33,7 @@ from blinkgl.recordings.clip import (
 from blinkgl.recordings.judge import judge
 from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
-from blinkgl.recordings.statistics import Sums, correlation, interval_distance, sums
+from blinkgl.recordings.statistics import GroupSums, correlation, interval_distance, sums
 from blinkgl.types.events import Events
 
 LEAST_EVENTS = 2000
@@ -71,7 +71,7 @@ class Calibration:
     """Result of :func:`calibrate`.
 
     config : the fitted emulator; before : before the fit.   values, uncertainty : of the fitted keys (a standard
-    deviation, in the key's unit).   untold : reason for each key that was not fitted.   halves : intervals of the
+    deviation, in the key's unit).   undetermined : reason for each key that was not fitted.   halves : intervals of the
     fitted half, and of the other.
     judged_before, judged : one of each half.   simulated_before, simulated : events of the whole clip.   gamma : of the
     frames' codes; None: there were none.   warnings : weaknesses of the recording, though a fit was possible."""
@@ -82,7 +82,7 @@ class Calibration:
     config: EmulatorConfig
     values: dict[str, float]
     uncertainty: dict[str, float]
-    untold: dict[str, str]
+    undetermined: dict[str, str]
     cost: float
     evaluations: int
     halves: tuple[tuple[int, int], tuple[int, int]]
@@ -110,7 +110,7 @@ class Calibration:
                 f"emulators.{name}": f"blinkgl calibrate, fitted to the first {seconds[0]:.3g} s of {file}; in the "
                 f"other {seconds[1]:.3g} s {self.judged[1].rate_ratio:.2f} of its events, intervals KS "
                 f"{self.judged[1].interval_distance:.3f}",
-                **{f"emulators.{name}.{key}": why for key, why in self.untold.items() if key in told},
+                **{f"emulators.{name}.{key}": why for key, why in self.undetermined.items() if key in told},
             },
             "uncertainty": {f"emulators.{name}.{key}": _short(v, 2) for key, v in self.uncertainty.items()},
         }
@@ -200,7 +200,7 @@ def calibrate_events(
     halves = ((0, half), (half, clip.intervals))
     found = Search([(clip, half)], base, seed, lambda done: say("fitting", done))
     if before is not None:
-        found.untold.update(before.untold)
+        found.undetermined.update(before.undetermined)
         keys, start = before.keys, before.place
     else:
         keys = found.responding(keys)
@@ -216,7 +216,7 @@ def calibrate_events(
         found.config(),
         found.values(),
         found.uncertainty(),
-        found.untold,
+        found.undetermined,
         found.cost,
         found.evaluations,
         halves,
@@ -284,7 +284,7 @@ def _without_lag(
     return again
 
 
-def judge_half(recorded: Sums, simulated: Sums, told: float = float("nan")) -> Judged:
+def judge_half(recorded: GroupSums, simulated: GroupSums, told: float = float("nan")) -> Judged:
     """Return the comparison of ``simulated`` with ``recorded``; its products must be with ``recorded``."""
     own, other = recorded.without(None), simulated.without(None)
     total = lambda parts: parts[0].sum(axis=0) + parts[4]  # OFF, ON of those that moved and of those that did not

@@ -25,7 +25,7 @@ from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET, spanned
 from blinkgl.recordings.decoding import UNKNOWN, Codes, OwnFrames, meaning
-from blinkgl.recordings.frame_noise import Steadied
+from blinkgl.recordings.frame_noise import DenoisedLight
 from blinkgl.timeline.interpolate import Displacement, motion
 from blinkgl.types.events import Events
 
@@ -212,7 +212,7 @@ def _greys(
             decode, white = found.decode, found.white
             if frame.dtype.kind == "u":
                 # It takes luminance, of which no more than the distance of two codes is to be known.
-                steadied = Steadied(lambda light: light, decode.code_distance(frame.dtype))
+                steadied = DenoisedLight(lambda light: light, decode.code_distance(frame.dtype))
         if frame.dtype.kind == "u":
             top = frame >= (white or np.iinfo(frame.dtype).max)
             full |= top.any(axis=2) if top.ndim == 3 else top

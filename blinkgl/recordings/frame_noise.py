@@ -207,7 +207,7 @@ def _push(at, light, constant, slope, band, leap, out):
                 out[row, column] = min(max(value, new - width), new + width)
 
 
-class Steadied:
+class DenoisedLight:
     """Light of frames without their noise, as they come.
 
     A pixel follows the frames' light only as far as noise does not explain the difference: a band of ``BAND`` standard

@@ -42,8 +42,8 @@ _TEN = float(np.log(10.0))
 class PixelFit:
     """Result of :func:`fit_pixels`.
 
-    config : as fitted.   uncertainty : standard deviations of what was fitted, by key.   untold : why the rest was not.
-    recorded, simulated : events of the half that was not fitted.
+    config : as fitted.   uncertainty : standard deviations of what was fitted, by key.   undetermined : why the rest
+    was not.   recorded, simulated : events of the half that was not fitted.
     counts_distance, intervals_distance : Kolmogorov and Smirnov's, of the number of events of the pixels that fired,
     and of the intervals between a pixel's events.   counts, intervals : these, recorded and simulated; µs.
     seconds : of both halves."""
@@ -52,7 +52,7 @@ class PixelFit:
     size: tuple[int, int]
     config: PixelsConfig
     uncertainty: dict[str, float]
-    untold: dict[str, str]
+    undetermined: dict[str, str]
     recorded: int
     simulated: int
     counts: tuple[np.ndarray, np.ndarray]
@@ -89,7 +89,7 @@ class PixelFit:
                 "readout.pixels": f"blinkgl calibrate --still --emulator pixels, fitted to the first "
                 f"{self.seconds[0]:.3g} s of {file}; in the other {self.seconds[1]:.3g} s {self.rate_ratio:.2f} of its "
                 f"events, events of a pixel KS {self.counts_distance:.3f}, intervals KS {self.intervals_distance:.3f}",
-                **{f"readout.pixels.{key}": why for key, why in self.untold.items()},
+                **{f"readout.pixels.{key}": why for key, why in self.undetermined.items()},
             },
             "uncertainty": {f"readout.pixels.{key}": float(f"{v:.2g}") for key, v in self.uncertainty.items()},
         }
@@ -136,7 +136,7 @@ def fit_pixels_of(
     seconds = ((middle - t0) / 1e6, (t1 - middle) / 1e6)
     pixel = halves[0].pixel(width)
     counts = np.bincount(pixel, minlength=height * width)
-    untold: dict[str, str] = {}
+    undetermined: dict[str, str] = {}
     say("counts of pixels", 0.1)
     dead = _dead_time(halves[0], pixel, counts, seconds[0])
     law = _Counts(counts[looked], seconds[0], dead)
@@ -155,11 +155,11 @@ def fit_pixels_of(
         answered = alone if alone.likelihood - plain.likelihood >= WORTH else plain
     values, uncertainty = answered.values, answered.uncertainty
     if not answered.hot:
-        untold["hot_fraction"] = "one law of rates says as much as two"
+        undetermined["hot_fraction"] = "one law of rates says as much as two"
     if dead:
         values["refractory_us"] = 1e6 * dead
     else:
-        untold["refractory_us"] = "no pixel fires so often that it would show"
+        undetermined["refractory_us"] = "no pixel fires so often that it would show"
     is_hot = law.hot_chance(answered, counts) > 0.5
     if answered.hot:
         found, spread = _preferences(halves[0], pixel, counts, is_hot)
@@ -176,7 +176,7 @@ def fit_pixels_of(
         values |= {"answered": q, "answer_ms": 1e3 * delay, "answer_spread_decades": wide}
         uncertainty["answered"] = spread * q / share
     else:
-        untold["answered"] = "events of a pixel are as many as if none answered another"
+        undetermined["answered"] = "events of a pixel are as many as if none answered another"
     values["on_share"] = float(np.clip(first_on, 0.0, 1.0))
     config = PixelsConfig(**{key: _within(key, value) for key, value in values.items()})
     say("judging", 0.9)
@@ -191,7 +191,7 @@ def fit_pixels_of(
         size,
         config,
         {key: value for key, value in uncertainty.items() if value > 0},
-        untold,
+        undetermined,
         len(halves[1]),
         len(made),
         (theirs[theirs > 0], ours[ours > 0]),

@@ -18,13 +18,13 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import EventDataError
 from blinkgl.recordings.clip import Clip
 from blinkgl.recordings.simulation import emulator_config
-from blinkgl.recordings.statistics import Sums, Targets, sums, target
+from blinkgl.recordings.statistics import GroupSums, Targets, sums, target
 
 TRIED = 64
 """Number of random settings over the whole range of the parameters; the best are the starts."""
 STEP = 0.05
 """Step of a parameter's logarithm, for derivatives: far above the jumps by single events."""
-UNTOLD = 0.5
+UNDETERMINED = 0.5
 """Standard deviation of a parameter's logarithm above which the data do not determine it."""
 VAGUE = 0.25
 """Standard deviation above which other values are tried, too."""
@@ -66,7 +66,7 @@ class Search:
                 value=sum(int(clip.used.sum()) for clip, _ in parts),
             )
         self.evaluations = 0
-        self.untold: dict[str, str] = {}
+        self.undetermined: dict[str, str] = {}
         self.cost = float("nan")
         self._set: dict[str, Any] = {}
         self.keys: list[str] = []
@@ -86,7 +86,7 @@ class Search:
             if any(np.abs(self._off(keys, at) - here).max() > 0 for at in places):
                 found.append(keys[i])
             else:
-                self.untold[keys[i]] = "makes no difference to this scene, left as it was"
+                self.undetermined[keys[i]] = "makes no difference to this scene, left as it was"
                 self._set[keys[i]] = self._default(keys[i])
         return found
 
@@ -125,7 +125,7 @@ class Search:
             self._jacobian = self._derivatives(keys, best[1], self._residual)
             spread = self._spread()
             worst = int(np.argmax(spread))
-            if spread[worst] <= UNTOLD:
+            if spread[worst] <= UNDETERMINED:
                 return
             key = keys[worst]
             keys = [k for k in keys if k != key]
@@ -138,12 +138,12 @@ class Search:
             if again[0] > best[0] + TOLERANCE:
                 again = self._descend(keys, others)
             if again[0] <= best[0] + TOLERANCE:
-                self.untold[key] = f"not told by the recording, left at its default ({within})"
+                self.undetermined[key] = f"not told by the recording, left at its default ({within})"
                 best = again
             else:
                 self._set[key] = there
                 side = "less" if there < default else "more"
-                self.untold[key] = f"told only to be {side} than its default ({within})"
+                self.undetermined[key] = f"told only to be {side} than its default ({within})"
                 best = self._descend(keys, others)
             if not keys:
                 self.cost, self.place = best
@@ -221,7 +221,7 @@ class Search:
     def _ends(self, keys: list[str]) -> np.ndarray:
         return np.log([self._base.fitted[key].ends for key in keys]).reshape(-1, 2)
 
-    def _sums(self, keys: list[str], at: np.ndarray) -> list[Sums]:
+    def _sums(self, keys: list[str], at: np.ndarray) -> list[GroupSums]:
         self.evaluations += 1
         self._progress(min(self.evaluations / self._planned, 0.99))
         config = self.config(keys, at)

@@ -30,7 +30,7 @@ from blinkgl.io.frames import NOTHING, Declared, open_frames
 from blinkgl.recordings.decoding import UNKNOWN, Codes, Decoder, OwnFrames, checked_gamma, meaning
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.frame_checks import FrameChecks
-from blinkgl.recordings.frame_noise import FrameNoise, Steadied
+from blinkgl.recordings.frame_noise import DenoisedLight, FrameNoise
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
@@ -307,7 +307,7 @@ class _Given:
             report.noise = steadied.noise
             report.caveats.extend([steadied.doubt] if steadied.doubt else [])
 
-    def _begin(self, first: np.ndarray) -> tuple[float | None, Steadied | None, bool]:
+    def _begin(self, first: np.ndarray) -> tuple[float | None, DenoisedLight | None, bool]:
         """Decide by the first frame's type what codes mean. Return the code of white, what removes noise, and whether
         frames may stay codes."""
         found = meaning(first, self._use.codes)
@@ -320,7 +320,7 @@ class _Given:
         if self._use.keep_noise or first.dtype.kind != "u":
             return found.white, None, by_codes
         light = lambda frame: self._luminance(frame, "")
-        return found.white, Steadied(light, self.decode.code_distance(first.dtype)), by_codes
+        return found.white, DenoisedLight(light, self.decode.code_distance(first.dtype)), by_codes
 
     def _luminance(self, frame: np.ndarray, name: str) -> np.ndarray:
         luminance = self.decode(frame, name)

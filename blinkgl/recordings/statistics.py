@@ -35,7 +35,7 @@ LEAST_STILL = 400
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class GroupSums:
     """Of the intervals [first, stop) of a clip; the first axis is the group. What lies in a burst that the camera's
     frames set off is left out on both sides.
 
@@ -75,7 +75,7 @@ class Sums:
         return [part[keep].sum(axis=0) for part in parts]
 
 
-def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None = None) -> Sums:
+def sums(events: Events, clip: Clip, first: int, stop: int, against: GroupSums | None = None) -> GroupSums:
     """Return the sums of a stream of events of the clip's scene in its intervals [first, stop).
 
     against : the recording's; None: it is the recording itself."""
@@ -105,7 +105,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
     # Quantisation and sub-pixel shifts are not compared, as in `compare`.
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
     other = polarity if against is None else against.polarity
-    # Sums of products, not correlations, since only sums can be added over groups, and without one of them.
+    # GroupSums of products, not correlations, since only sums can be added over groups, and without one of them.
     products = np.stack(
         [
             _by(on_group, np.einsum("kn,kn->n", x, y))
@@ -125,7 +125,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
         1,
     )
     looks, full = _looks(part, clip.size, span_us, None if against is None else against.full)
-    return Sums(
+    return GroupSums(
         rates, lights, isi, counts, quiet, still_counts, products, pixels, polarity, mine, alike, looks, full, seconds
     )
 
@@ -133,7 +133,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: Sums | None
 def _looks(
     events: Events, size: tuple[int, int], span_us: tuple[int, int], full: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``Sums.looks`` and (T, Y, X) bool, the patches that count (full: where that is known)."""
+    """Return ``GroupSums.looks`` and (T, Y, X) bool, the patches that count (full: where that is known)."""
     count, told = patches(events, size, span_us)
     full = count >= LEAST_IN_PATCH if full is None else full
     side = TILE_PX // 2
@@ -196,7 +196,7 @@ class Target:
     spread : (F,), of the features of the recording's patches.
     together : rates of ON and OFF events of moving pixels in one number."""
 
-    sums: Sums
+    sums: GroupSums
     probes: np.ndarray
     values: np.ndarray
     chance: np.ndarray
@@ -211,14 +211,14 @@ class Target:
     def error(self) -> np.ndarray:
         return np.hypot(self.chance, self.floor)
 
-    def residual(self, simulated: Sums) -> np.ndarray:
+    def residual(self, simulated: GroupSums) -> np.ndarray:
         """Return the residuals, (N,), in errors, times the weights."""
         return self.weight * (self._numbers(simulated) - self.values) / self.error
 
-    def _numbers(self, of: Sums, without: int | None = None) -> np.ndarray:
+    def _numbers(self, of: GroupSums, without: int | None = None) -> np.ndarray:
         return numbers(of, self.probes, self.spread, without, self.together)[0]
 
-    def beside(self, simulated: Sums, *, floor: str) -> Target:
+    def beside(self, simulated: GroupSums, *, floor: str) -> Target:
         """Return the target with errors from a simulation near the recording. Chance: the jackknife of the differences,
         in which the common scene cancels.
 
@@ -245,15 +245,15 @@ class Targets:
     def __init__(self, each: list[Target]):
         self._each = each
 
-    def beside(self, simulated: list[Sums], *, floor: str) -> None:
+    def beside(self, simulated: list[GroupSums], *, floor: str) -> None:
         """Use errors as in :meth:`Target.beside` from now on."""
         self._each = [one.beside(of, floor=floor) for one, of in zip(self._each, simulated)]
 
-    def residual(self, simulated: list[Sums]) -> np.ndarray:
+    def residual(self, simulated: list[GroupSums]) -> np.ndarray:
         return np.concatenate([one.residual(of) for one, of in zip(self._each, simulated)])
 
     @property
-    def sums(self) -> list[Sums]:
+    def sums(self) -> list[GroupSums]:
         return [one.sums for one in self._each]
 
     def _joined(self, name: str) -> np.ndarray:
@@ -276,7 +276,7 @@ LOWEST = 0.1
 """Factor on a floor, where the model turns out to be better."""
 
 
-def target(recorded: Sums, together: bool = False) -> Target:
+def target(recorded: GroupSums, together: bool = False) -> Target:
     """Return the target of the recording's sums, with floors as errors until a simulation is compared. together: see
     Target."""
     probes = _probes(recorded.isi.sum(axis=(0, 1)))
@@ -291,14 +291,14 @@ def target(recorded: Sums, together: bool = False) -> Target:
 
 
 def _spread(looks: np.ndarray) -> np.ndarray:
-    """Return standard deviations of the patches' features, from ``Sums.looks``."""
+    """Return standard deviations of the patches' features, from ``GroupSums.looks``."""
     count, features = max(looks[0], 1), len(NAMES)
     mean, square = looks[1 : 1 + features] / count, looks[1 + features :] / count
     return np.sqrt(np.maximum(square - mean**2, 1e-6))
 
 
 def correlation(alike: np.ndarray) -> float:
-    """Return Pearson's correlation of the events of single pixels, from ``Sums.alike``; 0 where one of them is
+    """Return Pearson's correlation of the events of single pixels, from ``GroupSums.alike``; 0 where one of them is
     constant."""
     n, a, b, product, square_a, square_b = alike
     norm = np.sqrt(max(n * square_a - a * a, 0.0) * max(n * square_b - b * b, 0.0))
@@ -317,7 +317,7 @@ def _probes(isi: np.ndarray) -> np.ndarray:
 
 
 def numbers(
-    s: Sums, probes: np.ndarray, spread: np.ndarray, without: int | None = None, together: bool = False
+    s: GroupSums, probes: np.ndarray, spread: np.ndarray, without: int | None = None, together: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (N,) numbers of a stream, and the block name of each. spread, together: see Target."""
     rates, lights, isi, counts, still, still_counts, products, pixels, alike, looks = s.without(without)
@@ -354,6 +354,6 @@ def numbers(
     return np.concatenate(values) if values else np.empty(0), np.array(block)
 
 
-def interval_distance(a: Sums, b: Sums) -> float:
+def interval_distance(a: GroupSums, b: GroupSums) -> float:
     """Return the Kolmogorov-Smirnov distance of the intervals between events of a pixel."""
     return histogram_distance(*(s.isi.sum(axis=(0, 1)) for s in (a, b)))

@@ -21,16 +21,16 @@ from blinkgl.types.boxes import Boxes, no_boxes
 def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -> Boxes:
     """Return the boxes of the objects in front of the camera at t_ns. ids : (H, W) uint32 visible instances."""
     camera, T_world_cam = scene.camera, scene.camera_path.pose(t_ns)
-    shown = extents(ids, 1 + max((thing.instance_id for thing in scene.objects), default=0))
+    shown = extents(ids, 1 + max((obj.instance_id for obj in scene.objects), default=0))
     whole = np.array([-0.5, -0.5, camera.width - 0.5, camera.height - 0.5])
     rows = []
-    for thing in scene.objects:
-        T_world_obj = thing.path.pose(t_ns)
+    for obj in scene.objects:
+        T_world_obj = obj.path.pose(t_ns)
         T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
-        x0, y0, x1, y1, seen = (int(n) for n in shown[thing.instance_id])
-        if not seen and not thing.deforms and _aside(camera, thing, T_cam_obj):
+        x0, y0, x1, y1, seen = (int(n) for n in shown[obj.instance_id])
+        if not seen and not obj.deforms and _aside(camera, obj, T_cam_obj):
             continue
-        vertices, faces = _solid(thing, t_ns)
+        vertices, faces = _solid(obj, t_ns)
         if not len(faces):
             continue
         px, drawn = _projected(camera, vertices @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3], faces)
@@ -56,9 +56,9 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         area = np.prod(amodal[2:] - amodal[:2])
         rows.append(
             {
-                "instance": thing.instance_id,
-                "category": category_of(thing, categories),
-                "kind": class_of(thing),
+                "instance": obj.instance_id,
+                "category": category_of(obj, categories),
+                "kind": class_of(obj),
                 "visible_box": np.array([x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]) if seen else np.zeros(4),
                 "visible_pixels": seen,
                 "amodal_box": amodal,
@@ -80,15 +80,15 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
     return Boxes(**made, resolution=np.array([camera.width, camera.height], np.int64))
 
 
-def _aside(camera: CameraModel, thing: SceneObject, T_cam_obj: np.ndarray) -> bool:
+def _aside(camera: CameraModel, obj: SceneObject, T_cam_obj: np.ndarray) -> bool:
     """Return whether the ball around an object is outside the picture."""
-    return bool((camera.frustum_planes() @ T_cam_obj[:3, 3] < -thing.radius).any())
+    return bool((camera.frustum_planes() @ T_cam_obj[:3, 3] < -obj.radius).any())
 
 
-def _solid(thing: SceneObject, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+def _solid(obj: SceneObject, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices of all parts at t_ns, (V, 3) float64, object axes, and the faces, (F, 3)."""
     vertices, faces, begin = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    for part in thing.parts:
+    for part in obj.parts:
         vertices.append(vertices_at(part.mesh, t_ns))
         faces.append(part.mesh.faces.astype(np.int64) + begin)
         begin += len(vertices[-1])

@@ -88,7 +88,7 @@ class Flow:
 
 def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
     """Return every part with its object, in the order of part indices."""
-    return [(thing, part) for thing in scene.objects for part in thing.parts]
+    return [(obj, part) for obj in scene.objects for part in obj.parts]
 
 
 def pixel_grid(camera: CameraModel) -> np.ndarray:
@@ -106,7 +106,7 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None) -> Hits:
     parts = scene_parts(scene)
     # A part's number -1 (nothing hit) indexes the added 0 at the end.
     found = hit[:, 0] >= 0
-    ids = np.array([thing.instance_id for thing, _ in parts] + [0], np.int32)
+    ids = np.array([obj.instance_id for obj, _ in parts] + [0], np.int32)
     local = np.full((len(xy), 3), np.nan)
     for p, rows in by_part(hit[:, 0]):
         mesh = parts[p][1].mesh
@@ -138,7 +138,7 @@ def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
 def _forest(scene: Scene, t_ns: int) -> Forest:
     kept = _forests.setdefault(scene, {})
     # One forest for all times, unless a shape deforms.
-    key = t_ns if any(thing.deforms for thing in scene.objects) else None
+    key = t_ns if any(obj.deforms for obj in scene.objects) else None
     if key not in kept:
         parts = scene_parts(scene)
         trees = []
@@ -181,7 +181,7 @@ def nearest(
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
-    relative = [_relative_pose(camera_pose, thing.path.pose(t_ns)) for thing, _ in scene_parts(scene)]
+    relative = [_relative_pose(camera_pose, obj.path.pose(t_ns)) for obj, _ in scene_parts(scene)]
     axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
     origins = np.array([-m[:3, :3].T @ m[:3, 3] for m in relative]).reshape(-1, 3)
     n = len(rays)
@@ -217,10 +217,10 @@ def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
     return m
 
 
-def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
+def _relative_change(scene: Scene, obj: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
     """Return (3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
     c0, c1 = scene.camera_path.pose(t0_ns), scene.camera_path.pose(t1_ns)
-    b0, b1 = thing.path.pose(t0_ns), thing.path.pose(t1_ns)
+    b0, b1 = obj.path.pose(t0_ns), obj.path.pose(t1_ns)
     # M1 - M0 = C1^T (B1 - B0) + (C1 - C0)^T B0, and likewise for the translation: differences only.
     turn = (c1[:3, :3] - c0[:3, :3]).T
     shift = (b1[:3, 3] - b0[:3, 3]) - (c1[:3, 3] - c0[:3, 3])
@@ -230,10 +230,10 @@ def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -
     return change
 
 
-def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
+def _relative_rate(scene: Scene, obj: SceneObject, t_ns: int) -> np.ndarray:
     """Return (3, 4) dM/dt in 1/s: the analytic twist of the body relative to the moving camera."""
     c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
-    b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
+    b, db = obj.path.pose(t_ns), obj.path.derivative(t_ns)
     rate = np.empty((3, 4))
     # The product rule on C^T B and on C^T (b - c).
     rate[:, :3] = dc[:3, :3].T @ b[:3, :3] + c[:3, :3].T @ db[:3, :3]
@@ -254,11 +254,11 @@ def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors
     """Add the motion of deforming shapes to ``out`` (N, 3): vectors_of(mesh) (V, 3) at the hit point, from the object's
     axes to the camera's at t_ns."""
     for p, rows in by_part(hits.part):
-        thing, part = scene_parts(scene)[p]
+        obj, part = scene_parts(scene)[p]
         if part.mesh.deformer is not None:
             corners = vectors_of(part.mesh)[part.mesh.faces[hits.triangle[rows]]]
             moved = np.einsum("nc,nck->nk", hits.bary[rows], corners)
-            out[rows] += moved @ relative_pose_at(scene, thing, t_ns)[:3, :3].T
+            out[rows] += moved @ relative_pose_at(scene, obj, t_ns)[:3, :3].T
 
 
 def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
@@ -277,7 +277,7 @@ def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
 def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     """Return the displacement of every hit point from ``hits.t_ns`` to t_ns, and its visibility there."""
     camera = scene.camera
-    change = applied(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
+    change = applied(scene, hits, lambda obj: _relative_change(scene, obj, hits.t_ns, t_ns))
     _add_of_shapes(scene, hits, change, t_ns, lambda mesh: vertices_at(mesh, t_ns) - vertices_at(mesh, hits.t_ns))
     depth = hits.depth + change[:, 2]
     valid = hits.hit & (depth > 0.0)
@@ -291,7 +291,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
 
     # the ray aims at the moved point itself: through xy + flow it would have that sum's rounding
     there_hits = replace(hits, local=local_at(scene, hits, t_ns))
-    moved = applied(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))
+    moved = applied(scene, there_hits, lambda obj: relative_pose_at(scene, obj, t_ns))
     seen, hidden_by = is_seen(scene, hits, t_ns, moved, inside & (depth >= camera.near))
     occluded = valid & ~seen
     return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
@@ -302,16 +302,16 @@ def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
     ``hits.t_ns``; nan where nothing is hit."""
     # The motion of the shape plus that of the pose.
     own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
-    carried = applied(scene, hits, lambda thing: _pose_change(thing, hits.t_ns, t_ns))
-    changed = applied(scene, own, lambda thing: np.c_[thing.path.pose(t_ns)[:3, :3], np.zeros(3)])
+    carried = applied(scene, hits, lambda obj: _pose_change(obj, hits.t_ns, t_ns))
+    changed = applied(scene, own, lambda obj: np.c_[obj.path.pose(t_ns)[:3, :3], np.zeros(3)])
     return (carried + changed) @ scene.camera_path.pose(hits.t_ns)[:3, :3]
 
 
-def _pose_change(thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
+def _pose_change(obj: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
     """Return the difference of two poses, (3, 4); zero for a sky at infinity, whose box only follows the camera."""
-    if thing.at_infinity:
+    if obj.at_infinity:
         return np.zeros((3, 4))
-    return (thing.path.pose(t1_ns) - thing.path.pose(t0_ns))[:3]
+    return (obj.path.pose(t1_ns) - obj.path.pose(t0_ns))[:3]
 
 
 def is_seen(
@@ -344,26 +344,26 @@ def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack:
 
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     """Return the image velocity of every hit point at ``hits.t_ns``, (N, 2) px/s, from the analytic twists."""
-    rate = applied(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
+    rate = applied(scene, hits, lambda obj: _relative_rate(scene, obj, hits.t_ns))
     _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
         points = rays_of(scene.camera, hits.xy) * hits.depth[:, None]
         return np.einsum("nij,nj->ni", scene.camera.jacobian(points), rate)
 
 
-def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
+def relative_pose_at(scene: Scene, obj: SceneObject, t_ns: int) -> np.ndarray:
     """Return T_cam_obj at t_ns, (4, 4)."""
-    return _relative_pose(scene.camera_path.pose(t_ns), thing.path.pose(t_ns))
+    return _relative_pose(scene.camera_path.pose(t_ns), obj.path.pose(t_ns))
 
 
 def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:
     """Return (N,) bool: the triangle of each hit is drawn from the camera's position at t_ns (False only for culled
     ones)."""
     shown = np.ones(len(rows), bool)
-    for p, (thing, part) in enumerate(scene_parts(scene)):
+    for p, (obj, part) in enumerate(scene_parts(scene)):
         on = np.flatnonzero(rows & (hits.part == p))
         if len(on) and (side := part.side(t_ns)):
-            m = relative_pose_at(scene, thing, t_ns)
+            m = relative_pose_at(scene, obj, t_ns)
             eye = -m[:3, :3].T @ m[:3, 3]
             a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
             # The eye is on the drawn side of the triangle's plane.

@@ -17,7 +17,7 @@ from blinkgl.scene.types import Deformer, Light, Material, Mesh, Part, Scene, Sc
 
 
 class Kind(NamedTuple):
-    """Properties of a material, and of a deforming shape, that select a program. shape : macros of the latter.   hued :
+    """Properties of a material, and of a deforming shape, that select a program. shape : macros of the latter.   rgb :
     whether its luminance needs three channels: where its colour and that of the light, or two of its colours, vary
     independently.
     masked : it has holes.   more : of MORE, for lit passes.   faceted : the corners of each face have one normal; set
@@ -27,7 +27,7 @@ class Kind(NamedTuple):
     lit: bool
     two_sided: bool
     shape: tuple[tuple[str, int], ...] = ()
-    hued: bool = False
+    rgb: bool = False
     masked: bool = False
     more: tuple[str, ...] = ()
     faceted: bool = False
@@ -41,7 +41,7 @@ class Kind(NamedTuple):
     def whole(self) -> bool:
         """Return whether light is not just a factor on the albedo that the normal determines: it then uses the general
         light's programs."""
-        return self.lit and (self.hued or "GLOSSY" in self.more or "BUMPED" in self.more)
+        return self.lit and (self.rgb or "GLOSSY" in self.more or "BUMPED" in self.more)
 
 
 MORE = ("TINTED", "EMISSIVE", "EMISSION_MAP", "GLOSSY", "GLOSS_MAP", "BUMPED")
@@ -97,7 +97,7 @@ class DrawItem:
     corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : the normal is turned towards the camera; faces are drawn from both sides unless the shape ``mirrors``:
-    then from one, which its deformer knows (:meth:`side`).   hued, faceted : as in :class:`Kind`.
+    then from one, which its deformer knows (:meth:`side`).   rgb, faceted : as in :class:`Kind`.
     casts : whether it casts shadows: objects and walls do, unless they are unlit (screens, skies of files).
     facet_slope : tangent of the angle between its facets and the normals that smooth them.
     extended : whether its material has more than a base colour: maps and numbers to pass to programs.
@@ -116,7 +116,7 @@ class DrawItem:
     moves: bool
     part: int = -1
     number: int = -1
-    hued: bool = False
+    rgb: bool = False
     casts: bool = False
     faceted: bool = False
     facet_slope: float = 0.0
@@ -127,7 +127,7 @@ class DrawItem:
         self.deformer = self.mesh.deformer
         shape, more = shape_of(self.deformer), more_of(self.material, self.mesh)
         masked = self.material.mask is not None
-        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.hued, masked, more, self.faceted)
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.rgb, masked, more, self.faceted)
         self.extended = masked or bool(more)
         self.corners = box_corners(self.low, self.high)
 
@@ -156,7 +156,7 @@ class _Greys:
             self._known[id(values)] = all(np.array_equal(values[..., 0], values[..., k]) for k in (1, 2))
         return self._known[id(values)]
 
-    def hued(self, material: Material, mesh: Mesh) -> bool:
+    def rgb(self, material: Material, mesh: Mesh) -> bool:
         gloss = None if material.unlit else material.gloss
         metal = gloss is not None and gloss.metallic > 0
         # One channel is enough unless light, metal or vertex colours may change the hue.
@@ -207,8 +207,8 @@ class _Facets:
         return self._known[id(mesh)]
 
 
-def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _Greys, facets: _Facets) -> DrawItem:
-    mesh, material, category = part.mesh, part.material, thing.category
+def _draw_item(index: int, obj: SceneObject, part: Part, scene: Scene, grey: _Greys, facets: _Facets) -> DrawItem:
+    mesh, material, category = part.mesh, part.material, obj.category
     if mesh.deformer is None:
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         centre = (low + high) / 2
@@ -238,8 +238,8 @@ def _draw_item(index: int, thing: SceneObject, part: Part, scene: Scene, grey: _
         _LAYER[category],
         not part.culled or mirrors,
         not material.unlit,
-        not thing.is_static,
-        hued=grey.hued(material, mesh),
+        not obj.is_static,
+        rgb=grey.rgb(material, mesh),
         casts=category in ("object", "wall") and not material.unlit,
         faceted=not material.unlit and facets.flat(mesh),
         facet_slope=0.0 if material.unlit else facets.slope(mesh),

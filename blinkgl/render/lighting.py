@@ -32,8 +32,8 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
         "SHADOWS": 2, "SHADOW_SUNS": 1, "SHADOW_SPOTS": 1, "SOFT": 1,
     },
 )  # fmt: skip
-"""Variants in which the program of a lit pass must compile, besides the plain light's; each also with HUED."""
-# By uniform, whether it has a value per channel: HUED's three, or one that represents them; for arrays, how many.
+"""Variants in which the program of a lit pass must compile, besides the plain light's; each also with RGB."""
+# By uniform, whether it has a value per channel: RGB's three, or one that represents them; for arrays, how many.
 _FIXED = {"sun_strength": True, "lamp_strength": True, "lamp_fading": False, "spot_cone": False}
 _PLACED = {
     **dict.fromkeys(("sun_towards", "lamp_place", "spot_axis"), 0),
@@ -69,11 +69,11 @@ class Lighting:
         self._last: tuple[Moment | None, bool, dict[str, np.ndarray]] = None, False, {}
 
     def defines(self, kind: Kind, one_channel: bool, maps: Sequence[Any]) -> dict[str, Any]:
-        """Return the defines of a lit pass's variant. HUED: light of three channels, where one is not enough: for
+        """Return the defines of a lit pass's variant. RGB: light of three channels, where one is not enough: for
         colour pictures, and for the luminance of surfaces with several colours. maps : shadow maps of the pass."""
-        hued = {"HUED": 1} if kind.hued and one_channel else {}
+        rgb = {"RGB": 1} if kind.rgb and one_channel else {}
         if not kind.lit:
-            return hued
+            return rgb
         shadows, lamps = self._shadows(maps), len(self.lamps) > self._suns
         if self.plain and not kind.whole:
             return shadows
@@ -85,7 +85,7 @@ class Lighting:
             | ({"AMBIENT": ambient} if self._quadric.any() else {})
             | shadows
             | ({"FACETED": 1} if kind.faceted and not (shadows or lamps) else {})
-            | (hued or ({"HUED": 1} if not one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
+            | (rgb or ({"RGB": 1} if not one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
 
     def _shadows(self, maps: Sequence[Any]) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from blinkgl.gl.shader import Uniforms
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.lens import Lens
 from blinkgl.render.lighting import Lighting
+from blinkgl.render.line_drawer import LineDrawer
 from blinkgl.render.moment import Moment, linear_xyw_bytes
-from blinkgl.render.strokes import Strokes
 from blinkgl.scene.types import Map, Scene
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Painter:
     """Draws for the passes of one renderer. A subclass may observe: each method is called only by passes.
 
     gl : GLContext.   resources : SceneResources.   stats : counters.   lens : of a camera with distortion.
-    strokes : lines to draw."""
+    line_drawer : of the filtered edges."""
 
     def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
@@ -57,7 +57,7 @@ class Painter:
         self.programs: dict[Hashable, dict[Kind, Uniforms]] = {}
         self._covers: dict[Hashable, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._side = 0
-        self.strokes = Strokes(gl, self.uniforms)
+        self.line_drawer = LineDrawer(gl, self.uniforms)
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
         """Set ``target`` for drawing and clear it: the first attachment to ``background`` (0 for missing components),
@@ -218,5 +218,5 @@ class Painter:
         for _, array in self._covers.values():
             array.release()
         self.programs, self._covers = {}, {}
-        self.strokes.release()
+        self.line_drawer.release()
         self.resources.forget_vertex_arrays()

@@ -76,8 +76,8 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     visible."""
     camera = scene.camera
     there = replace(hits, local=_local(scene, hits, t_ns))
-    moved = casting.applied(scene, there, lambda thing: casting.relative_pose_at(scene, thing, t_ns))
-    world = casting.applied(scene, there, lambda thing: thing.path.pose(t_ns))
+    moved = casting.applied(scene, there, lambda obj: casting.relative_pose_at(scene, obj, t_ns))
+    world = casting.applied(scene, there, lambda obj: obj.path.pose(t_ns))
     depth = moved[:, 2].copy()
     ahead = depth > 0
     xy = np.zeros((len(depth), 2))
@@ -118,8 +118,8 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
     """Return points drawn uniformly on the objects (without objects, on all but the sky) at the first time; only those
     that are visible at some time, queried when they first are."""
     parts = casting.scene_parts(scene)
-    own = [p for p, (thing, _) in enumerate(parts) if thing.category == "object"]
-    own = own or [p for p, (thing, _) in enumerate(parts) if thing.category != "sky"]
+    own = [p for p, (obj, _) in enumerate(parts) if obj.category == "object"]
+    own = own or [p for p, (obj, _) in enumerate(parts) if obj.category != "sky"]
     which, area = [np.zeros((0, 2), np.int32)], [np.zeros(0)]
     for p in own:
         mesh = parts[p][1].mesh
@@ -138,7 +138,7 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
         u, v = rng.random((2, draws))
         # The far half of the parallelogram is folded back: uniform over the triangle.
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        ids = np.array([thing.instance_id for thing, _ in parts], np.int32)[chosen[:, 0]]
+        ids = np.array([obj.instance_id for obj, _ in parts], np.int32)[chosen[:, 0]]
         nothing = np.zeros(draws)
         hits = Hits(
             np.zeros((draws, 2)),

@@ -70,7 +70,7 @@ def parameters(result: Calibration) -> list[tuple[str, str, str, str]]:
         if key in result.values:
             found.append((key, before, f"{after:.4g} ± {result.uncertainty[key]:.2g}", ""))
         else:
-            said = result.untold.get(key, "kept fixed by request")
+            said = result.undetermined.get(key, "kept fixed by request")
             found.append((key, before, "" if after is None else f"{after:.4g}", said))
     return found
 

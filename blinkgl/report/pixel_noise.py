@@ -37,8 +37,8 @@ def parameters(result: PixelFit) -> list[tuple[str, str, str]]:
     found = []
     for key, field in type(result.config).model_fields.items():
         value = getattr(result.config, key)
-        if key in result.untold:
-            found.append((f"readout.pixels.{key}", "", result.untold[key]))
+        if key in result.undetermined:
+            found.append((f"readout.pixels.{key}", "", result.undetermined[key]))
         elif value != field.default:
             spread = result.uncertainty.get(key)
             text = f"{value:.4g}" + (f" ± {spread:.2g}" if spread is not None else "")

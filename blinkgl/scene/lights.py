@@ -86,7 +86,7 @@ def quadric_of(light: Light) -> np.ndarray:
     one[3, 3] = 0.5
     one[2, 3] = one[3, 2] = 0.25  # 0.5 + 0.5 n_z
     sky = light.sky * np.asarray(light.sky_color, np.float64)[:, None, None] * one
-    return sky if light.around is None else sky + np.asarray(light.around, np.float64)
+    return sky if light.quadric is None else sky + np.asarray(light.quadric, np.float64)
 
 
 def is_coloured(light: Light) -> bool:
@@ -98,7 +98,7 @@ def is_coloured(light: Light) -> bool:
 def quartic_of(light: Light) -> np.ndarray | None:
     """Return the order-4 light of the surroundings, (3, 9, 9), for :func:`ambient`; world axes. None: only
     :func:`quadric_of`."""
-    return None if light.finer is None else np.asarray(light.finer, np.float64)
+    return None if light.quartic is None else np.asarray(light.quartic, np.float64)
 
 
 def ambient(quadric: np.ndarray, normal: np.ndarray, quartic: np.ndarray | None = None) -> np.ndarray:
@@ -121,9 +121,9 @@ def seen_around(light: Light) -> np.ndarray:
     picture = np.zeros((height, width, 3), np.float32)
     if light.surroundings is not None:
         picture += light.surroundings.pixels
-    elif light.around is not None:
+    elif light.quadric is not None:
         directions, _ = pixel_directions(height, width)
-        picture += ambient(np.asarray(light.around, np.float64), directions, quartic_of(light))
+        picture += ambient(np.asarray(light.quadric, np.float64), directions, quartic_of(light))
     picture[: height // 2] += np.float32(light.sky) * np.asarray(light.sky_color, np.float32)
     return picture
 
@@ -131,7 +131,7 @@ def seen_around(light: Light) -> np.ndarray:
 def surroundings_of(light: Light) -> np.ndarray:
     """Return (levels, h, w, 3) float32: :func:`seen_around` mirrored by surfaces of several roughnesses
     (:func:`~blinkgl.scene.surfaces.gloss.blurred`)."""
-    if light.around is None and light.surroundings is None:  # one column suffices
+    if light.quadric is None and light.surroundings is None:  # one column suffices
         return _half_a_sky() * (np.float32(light.sky) * np.asarray(light.sky_color, np.float32))
     return blurred(seen_around(light))
 
@@ -206,7 +206,7 @@ def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
         for form in (panorama.quadric, panorama.quartic)
     )
     lamps, picture = (*suns, *light.lamps), Panorama(panorama.picture * np.float32(factor))
-    return replace(light, sun=0.0, sky=0.0, lamps=lamps, around=around, finer=finer, surroundings=picture)
+    return replace(light, sun=0.0, sky=0.0, lamps=lamps, quadric=around, quartic=finer, surroundings=picture)
 
 
 LUMENS_PER_WATT = 683.0

@@ -78,7 +78,8 @@ class Deformer(ABC):
 
     examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
 
-    goes : orientation of a moving body: "anyhow"; "upright" on the ground, "level" above it, both along its x axis.
+    locomotion : how a moving body is oriented: "free"; "upright" on the ground, "level" above it, both along its x
+    axis.
     speed : units/s that fit the motion, such as steps; 0: it may stay in place.
 
     mirrors : whether the shape is a mirror image at some time (:meth:`side`).
@@ -95,7 +96,7 @@ class Deformer(ABC):
     sizes: Mapping[str, int] = {}
     period_ns: int | None = None
     span_ns: int = 0
-    goes: str = "anyhow"
+    locomotion: str = "free"
     speed: float = 0.0
     mirrors: bool = False
     examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
@@ -342,9 +343,9 @@ class Light:
     sun_direction : unit vector in the world, from the surface towards the sun (s).
     sun_color, sky_color : (3,) linear factors.   sun_size : rad, as of a lamp.
     lamps : further lights.
-    around : quadric of the other light of the surroundings (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers;
+    quadric : form of the other light of the surroundings (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers;
         None: none.
-    finer : quartic of the same, 3 x 9 x 9 numbers, where ``around`` alone is not accurate enough.
+    quartic : form of the same, 3 x 9 x 9 numbers, where ``quadric`` alone is not accurate enough.
     surroundings : the same as a picture without its suns, for reflections; lights that differ only in it are equal.
         None: the sky alone, ``sky`` above the horizon.
     shadows : of suns and spot lights; soft by their size.   shadow_size : px per side of each map.
@@ -359,8 +360,8 @@ class Light:
     sky_color: tuple[float, float, float] = WHITE
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
-    around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
-    finer: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    quadric: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    quartic: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     surroundings: Panorama | None = field(default=None, compare=False, repr=False)
     shadows: Literal["off", "hard", "soft"] = "off"
     shadow_size: int = LightConfig().shadow_size
@@ -368,7 +369,7 @@ class Light:
     @property
     def plain(self) -> bool:
         """Return whether the light is only a white sun and sky: the formula above."""
-        lone = not self.lamps and self.around is None and self.shadows == "off"
+        lone = not self.lamps and self.quadric is None and self.shadows == "off"
         return lone and self.sun_color == WHITE == self.sky_color
 
 
@@ -423,9 +424,9 @@ class Scene:
     fog: Fog | None = None
 
     def __post_init__(self) -> None:
-        if any(thing.at_infinity for thing in self.objects):
+        if any(obj.at_infinity for obj in self.objects):
             sky = self.rig.path_of_sky()
-            placed = tuple(replace(thing, path=sky) if thing.at_infinity else thing for thing in self.objects)
+            placed = tuple(replace(obj, path=sky) if obj.at_infinity else obj for obj in self.objects)
             object.__setattr__(self, "objects", placed)
 
     @property

@@ -105,7 +105,7 @@ class RenderedSequence(SensorSimulation):
 
     def _frames(self) -> Iterator[EventFrame]:
         """Yield the frames of the event pass."""
-        return drawn(self.renderer, self.timeline, self.camera.tells, self.camera.tensor_device)
+        return drawn(self.renderer, self.timeline, self.camera.records_truth, self.camera.tensor_device)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()

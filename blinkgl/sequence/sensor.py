@@ -159,9 +159,9 @@ class SensorSimulation(ABC):
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
 
     @property
-    def tells(self) -> bool:
+    def records_truth(self) -> bool:
         """Return whether its events record their surfaces (``labels.events``)."""
-        return self.camera is not None and self.camera.tells
+        return self.camera is not None and self.camera.records_truth
 
     @property
     def causes(self) -> dict[str, int]:

@@ -1,13 +1,13 @@
 // Lights other than a white sun and sky; blinkgl/scene/lights.py defines the light of each lamp.
 //
 //   SUNS     number of suns           LAMPS    number of point and spot lights, SPOTS: the last of them are spot lights
-//   AMBIENT  light of the surroundings    HUED     of three channels; else one, weighted for this material's luminance
+//   AMBIENT  light of the surroundings    RGB     of three channels; else one, weighted for this material's luminance
 //   SHADOWS  see shadows.glsl
 //   SURFACED with RATE: everything ``later`` by this many seconds, to first order, for surface.glsl
 //
 // Everything is in the object's own frame, computed from float64 poses, so that neither normals nor positions need a
 // matrix. A lamp gives a Beam at a point of the surface, for Lambert and for other reflections.
-#ifdef HUED
+#ifdef RGB
 #define ILLUMINANT vec3
 #else
 #define ILLUMINANT float
@@ -98,7 +98,7 @@ Beam lamp_beam(int i, vec3 at)
 #endif
 
 #ifdef AMBIENT
-#ifdef HUED
+#ifdef RGB
 #define BANDS 3
 #else
 #define BANDS 1
@@ -140,7 +140,7 @@ float around_band(int band, vec3 n)
 
 ILLUMINANT ambient(vec3 n)
 {
-#ifdef HUED
+#ifdef RGB
     return vec3(around_band(0, n), around_band(1, n), around_band(2, n));
 #else
     return around_band(0, n);
@@ -248,7 +248,7 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
     vec3 turn = (normal_rate - n * dot(n, normal_rate)) * scale; // dn/dt, see light.glsl
     ILLUMINANT sum = ILLUMINANT(0.0);
 #ifdef AMBIENT
-#ifdef HUED
+#ifdef RGB
     sum += vec3(around_band_rate(0, n, turn), around_band_rate(1, n, turn), around_band_rate(2, n, turn));
 #else
     sum += around_band_rate(0, n, turn);

@@ -48,7 +48,7 @@ uniform sampler2D energy; // reflection of uniform light, over (cosine, roughnes
 uniform sampler2D looks; // its direction, over the same: for two looks the fraction from the normal to the mirror
                                 // direction, and roughness; energy's a: how much is the first one's (gloss.py, both())
 // Radiance seen in a mirror, by longitude, latitude and roughness.
-#ifdef HUED
+#ifdef RGB
 uniform sampler3D surroundings;
 #define SURROUNDINGS surroundings
 #else
@@ -71,7 +71,7 @@ ILLUMINANT mirrored(vec3 d, float roughness)
     float levels = float(textureSize(SURROUNDINGS, 0).z);
     vec2 at = vec2(0.5 - atan(d.y, d.x) * 0.15915494309, 0.5 - asin(clamp(d.z, -1.0, 1.0)) * 0.31830988618);
     vec4 radiance = map_at(SURROUNDINGS, vec3(at, (roughness * (levels - 1.0) + 0.5) / levels));
-#ifdef HUED
+#ifdef RGB
     return radiance.rgb;
 #else
     return radiance.r;

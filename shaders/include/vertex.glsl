@@ -36,7 +36,7 @@
 // LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind. LIGHT_SEEN: the visible
 // side's.
 #ifdef LIT_AT_CORNERS
-#ifdef HUED
+#ifdef RGB
 #define LIGHT_HERE vec3
 #else
 #define LIGHT_HERE float

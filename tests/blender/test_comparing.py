@@ -31,7 +31,7 @@ def test_baked_nodes_play_as_blender_saw_them():
 )
 def test_a_difference_is_named_with_how_much_and_how_long(tmp_path, name, change, words):
     table = dict(np.load(GOLDEN / "unsaid.npz"))
-    which = [k for k, (thing, _) in enumerate(json.loads(str(table["things"]))) if thing == name]
+    which = [k for k, (obj, _) in enumerate(json.loads(str(table["objs"]))) if obj == name]
     table[f"arr_{which[0]}"] = change(table[f"arr_{which[0]}"], table["times"])
     np.savez(tmp_path / "seen.npz", **table)
     differs, _, _ = compare(GOLDEN / "unsaid.glb", tmp_path / "seen.npz")
@@ -40,7 +40,7 @@ def test_a_difference_is_named_with_how_much_and_how_long(tmp_path, name, change
 
 def test_changing_faces_and_what_is_too_many_are_named(tmp_path):
     table = dict(np.load(GOLDEN / "unsaid.npz"))
-    things = json.loads(str(table["things"]))
-    table["things"] = json.dumps([(("Other" if name == "Ring" else name), name == "Spots") for name, _ in things])
+    objs = json.loads(str(table["objs"]))
+    table["objs"] = json.dumps([(("Other" if name == "Ring" else name), name == "Spots") for name, _ in objs])
     np.savez(tmp_path / "seen.npz", **table)
     assert set(compare(GOLDEN / "unsaid.glb", tmp_path / "seen.npz")[0]) == {"Spots", "Other", "Ring"}

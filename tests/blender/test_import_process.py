@@ -151,7 +151,7 @@ def test_blender_is_told_what_differs(blend, tmp_path, fake):
 import numpy as np
 at = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1.0]])
 np.savez(folder / "seen.npz", at + [[[0, 0, 0]], [[0.1, 0, 0]]], times=[0, 0.5], whole=[True, True],
-         things=json.dumps([["A", False]]))
+         objs=json.dumps([["A", False]]))
 (folder / "scene.glb").write_bytes(glb); say(compare=1)
 answer = json.loads(sys.stdin.readline())
 say(report=REPORT | {"left_out": [json.dumps(answer)]})

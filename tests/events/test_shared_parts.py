@@ -212,15 +212,15 @@ def clip():
 )
 def test_same_events_and_state(config):
     frames, rows = clip()
-    told, untold = (make_emulator(config, H, W, seed=9) for _ in range(2))
+    told, undetermined = (make_emulator(config, H, W, seed=9) for _ in range(2))
     count = 0
     for k, (frame, changed) in enumerate(zip(frames, rows)):
-        a, b = told.step(frame, k * 1_000_000, changed), untold.step(frame, k * 1_000_000)
+        a, b = told.step(frame, k * 1_000_000, changed), undetermined.step(frame, k * 1_000_000)
         for name in "xytp":
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         count += len(a)
     assert count > 500
-    for name, value in untold.state_dict().items():
+    for name, value in undetermined.state_dict().items():
         np.testing.assert_array_equal(told.state_dict()[name], value)
 
 

@@ -52,8 +52,8 @@ def test_the_events_of_the_slow_twin(variant):
     events = run(DvsVoltmeter(37, 45, VoltmeterConfig(**VARIANTS[variant], causes=True), seed=9), codes, times)
     columns = np.stack([events.x, events.y, events.t, events.p, events.cause]).astype("<i8")
     assert [len(events), hashlib.sha256(columns.tobytes()).hexdigest()] == GOLDEN[variant]
-    untold = DvsVoltmeter(37, 45, VoltmeterConfig(**VARIANTS[variant]), seed=9)
-    assert_same(run(untold, codes / np.float32(255), times), replace(events, cause=None))
+    undetermined = DvsVoltmeter(37, 45, VoltmeterConfig(**VARIANTS[variant]), seed=9)
+    assert_same(run(undetermined, codes / np.float32(255), times), replace(events, cause=None))
 
 
 @numba.njit

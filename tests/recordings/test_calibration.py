@@ -173,8 +173,10 @@ def still_recording(folder, seconds: float = 2.0, size=(48, 60), seed: int = 3, 
 def test_what_makes_no_difference_is_named(tmp_path):
     """ESIM has no noise: a scene that stands still says nothing of any of its parameters."""
     result = calibrate(still_recording(tmp_path, shot_noise_rate_hz=3.0), still=True, starts=1)
-    assert not result.values and set(result.untold) == set(result.config.fitted) and result.config == result.before
-    assert set(result.untold.values()) == {"makes no difference to this scene, left as it was"}
+    assert (
+        not result.values and set(result.undetermined) == set(result.config.fitted) and result.config == result.before
+    )
+    assert set(result.undetermined.values()) == {"makes no difference to this scene, left as it was"}
 
 
 def test_noise_of_a_still_scene_comes_back(tmp_path):

@@ -11,7 +11,7 @@ from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events
 from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
-from blinkgl.recordings.frame_noise import BAND, MOST_CODES, Steadied, estimated, looked_at
+from blinkgl.recordings.frame_noise import BAND, MOST_CODES, DenoisedLight, estimated, looked_at
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
 from tests.shared_data import shared
 
@@ -138,7 +138,7 @@ def test_exact_frames_are_taken_as_they_are(frames):
 def test_a_pixel_moves_no_further_than_noise_leaves_it():
     """A band round where a pixel stands: inside nothing changes, a ramp is followed at the band's distance."""
     light = lambda codes: codes.astype(np.float32) / 255
-    steady = Steadied(light, lambda light: CODE)
+    steady = DenoisedLight(light, lambda light: CODE)
     still = noisy(scene(200), 4 * CODE**2, 0.0)
     for frame in still[:100]:
         shown = steady(frame)

@@ -43,14 +43,14 @@ def test_known_values_come_back(known):
     ):  # fmt: skip
         assert abs(getattr(found, key) / getattr(KNOWN, key) - 1) < room, (key, getattr(found, key))
     assert abs(known.rate_ratio - 1) < 0.1 and known.counts_distance < 0.03 and known.intervals_distance < 0.05
-    assert known.untold == {}
+    assert known.undetermined == {}
     for key in ("rate_hz", "hot_rate_hz", "hot_on_share", "hot_on_spread", "answered"):
         assert 0 < known.uncertainty[key] < 0.2 * getattr(KNOWN, key)
 
 
 def test_what_is_not_there_is_not_found():
     result = fit_pixels_of(recorded(PixelsConfig(rate_hz=0.5)), SIZE)
-    assert set(result.untold) == {"hot_fraction", "answered", "refractory_us"}
+    assert set(result.undetermined) == {"hot_fraction", "answered", "refractory_us"}
     assert result.config.answered == 0 and result.config.hot_fraction == 0 and result.config.spread_decades < 0.1
     assert abs(result.config.rate_hz / 0.5 - 1) < 0.03
 

@@ -120,7 +120,7 @@ def test_light_of_a_panorama_is_the_references(gl, finer):
     around, more = (
         tuple(tuple(map(tuple, one)) for one in form.tolist()) for form in (quadric, quartic + quartic.swapaxes(1, 2))
     )
-    light = Light(sun=0, sky=0, around=around, finer=more if finer else None)
+    light = Light(sun=0, sky=0, quadric=around, quartic=more if finer else None)
     world, t, h = replace(mixed_scene(textured=False), light=light), SECOND // 3, 1_000_000
     ref = reference.render(world, t)
     with Renderer(gl, world, RenderConfig(image_antialiasing="none"), whole=True) as renderer:
@@ -148,7 +148,7 @@ def test_flat_facets_are_lit_at_their_corners(gl, monkeypatch, finer):
     nested = [
         tuple(tuple(map(tuple, one)) for one in form.tolist()) for form in (around, fourth + fourth.swapaxes(1, 2))
     ]
-    light = Light(sun=0.4, sky=0, sun_color=(1.0, 0.8, 0.5), around=nested[0], finer=nested[1] if finer else None)
+    light = Light(sun=0.4, sky=0, sun_color=(1.0, 0.8, 0.5), quadric=nested[0], quartic=nested[1] if finer else None)
     texture, sheet = Material(texture=smooth_texture()), quad(0.6, 0.6)
     bodies = [
         thing("box", 1, cube(0.5), still((-0.8, 3, 0), Rotation.from_euler("zx", [30, 20], degrees=True)), texture),

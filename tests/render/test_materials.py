@@ -113,7 +113,7 @@ def test_rates(gl, name):
 def test_a_furnace(gl):
     """Constant radiance from all around: what reflects all of it cannot be seen, whatever its metal and roughness."""
     even = tuple(tuple(tuple(float(i == j == 3) for j in range(4)) for i in range(4)) for _ in range(3))
-    light = Light(sun=0.0, sky=0.0, around=even)
+    light = Light(sun=0.0, sky=0.0, quadric=even)
     for metallic in (0.0, 0.4, 1.0):
         for roughness in (0.0, 0.3, 1.0):
             made = scene(
@@ -182,7 +182,7 @@ def test_lamps_and_surroundings_are_one(metallic, roughness):
         plain = clear * (gloss.DIELECTRIC + (1 - gloss.DIELECTRIC) * edge)
         total[c] = (lobe * nl * ((1 - metallic) * plain + metallic * metal)).sum() * solid
     even = tuple(tuple(tuple(float(i == j == 3) for j in range(4)) for i in range(4)) for _ in range(3))
-    made = scene([], light=Light(sun=0.0, sky=0.0, around=even))
+    made = scene([], light=Light(sun=0.0, sky=0.0, quadric=even))
     light = appearance.received(made, 0, np.zeros((1, 3)), normal)
     _, mirrored = appearance.shone(
         made, 0, light, np.zeros((1, 3)), normal, eye, albedo, np.array([metallic]), np.array([roughness])

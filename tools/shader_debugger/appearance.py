@@ -183,7 +183,7 @@ def shone(
     if id(scene.light) not in _surroundings:
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
-    around = gloss.around(_surroundings[id(scene.light)][1], normal, away, nv, roughness)
+    around = gloss.mirrored_radiance(_surroundings[id(scene.light)][1], normal, away, nv, roughness)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     # Lamps: GGX lobe with Schlick's Fresnel term, half vector between lamp and eye.
     for k, lamp in enumerate(lamps_of(scene.light)):

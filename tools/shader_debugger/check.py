@@ -37,9 +37,9 @@ def kinds() -> list[Kind]:
         for sizes in deformer.examples
     }
     # Each material feature alone, and all of them on a shape that changes.
-    surfaces = [Kind(True, False, False, masked=True, more=("TINTED",), hued=True)]
-    for hued in (False, True):
-        surfaces += [Kind(True, True, False, hued=hued, more=more) for more in SURFACES]
+    surfaces = [Kind(True, False, False, masked=True, more=("TINTED",), rgb=True)]
+    for rgb in (False, True):
+        surfaces += [Kind(True, True, False, rgb=rgb, more=more) for more in SURFACES]
     bent = next(iter(shapes))
     surfaces.append(Kind(True, True, True, bent, True, more=MORE))
     return [*KINDS, *(Kind(True, True, True, shape) for shape in shapes), *surfaces]
@@ -61,13 +61,13 @@ def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
     if kind is None or not (kind.lit and pass_.lit):
         return [{}]
     if kind.more:
-        three = {"HUED": 1} if (kind.hued if pass_.one_channel else "GLOSSY" in kind.more) else {}
+        three = {"RGB": 1} if (kind.rgb if pass_.one_channel else "GLOSSY" in kind.more) else {}
         found = [light | three for light in (EXAMPLES[0], EXAMPLES[-1])]
         return found if kind.whole else [{}, *found]
     if kind.shape:
         return [{}, EXAMPLES[-1]]
-    hued = (kind.textured or not pass_.one_channel) and not kind.two_sided
-    coloured = [light | {"HUED": 1} for light in EXAMPLES if "LIGHTS" in light] if hued else []
+    rgb = (kind.textured or not pass_.one_channel) and not kind.two_sided
+    coloured = [light | {"RGB": 1} for light in EXAMPLES if "LIGHTS" in light] if rgb else []
     return [{}, *EXAMPLES, *coloured]
 
 

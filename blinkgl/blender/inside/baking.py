@@ -45,7 +45,7 @@ class Clock:
         self.fps = self.scene.render.fps / self.scene.render.fps_base
         self.map = self.scene.render.frame_map_old, self.scene.render.frame_map_new
         self.markers = [(marker, marker.frame) for marker in self.scene.timeline_markers]
-        kinds = {modifier.type for thing in self.scene.objects for modifier in thing.modifiers}
+        kinds = {modifier.type for obj in self.scene.objects for modifier in obj.modifiers}
         kinds |= {node.bl_idname for group in bpy.data.node_groups for node in group.nodes}
         self.simulated = self.scene.rigidbody_world is not None or not SIMULATED.isdisjoint(kinds)
         self.graph: Any = None
@@ -82,35 +82,35 @@ class Clock:
             self.go(frame)
             shapes: dict[str, tuple | None] = {}
             for one in self.graph.object_instances:
-                thing, owner = one.object, one.parent if one.is_instance else one.object
+                obj, owner = one.object, one.parent if one.is_instance else one.object
                 unwanted = owners is not None and owner.name not in owners
                 # The mesh of a curve, an instance of its own, is the curve.
-                itself = one.is_instance and owner.name == thing.name and owner.type != thing.type
-                hidden = not one.show_self or thing.hide_render or owner.hide_render
-                if unwanted or itself or hidden or thing.type not in SEEN:
+                itself = one.is_instance and owner.name == obj.name and owner.type != obj.type
+                hidden = not one.show_self or obj.hide_render or owner.hide_render
+                if unwanted or itself or hidden or obj.type not in SEEN:
                     continue
-                if thing.name not in shapes:
-                    shapes[thing.name] = surface(thing)
-                if shapes[thing.name] is not None:
+                if obj.name not in shapes:
+                    shapes[obj.name] = surface(obj)
+                if shapes[obj.name] is not None:
                     matrix = one.matrix_world
-                    if thing.type == "CAMERA":
+                    if obj.type == "CAMERA":
                         matrix = Matrix.LocRotScale(*matrix.decompose()[:2], None)
-                    key = owner.name, thing.name, tuple(one.persistent_id) if one.is_instance else None
-                    yield frame, key, thing, np.array(matrix), *shapes[thing.name]
+                    key = owner.name, obj.name, tuple(one.persistent_id) if one.is_instance else None
+                    yield frame, key, obj, np.array(matrix), *shapes[obj.name]
 
 
-def surface(thing: Any) -> tuple[np.ndarray, np.ndarray, int] | None:
+def surface(obj: Any) -> tuple[np.ndarray, np.ndarray, int] | None:
     """Return ((V, 3) vertices, vertex of each corner, a number of its faces) of an evaluated object; None without
     faces."""
-    if thing.type == "CAMERA":
+    if obj.type == "CAMERA":
         return np.eye(4, 3, -1), np.arange(4), 0
-    mesh = thing.to_mesh()
+    mesh = obj.to_mesh()
     if mesh is None or not len(mesh.polygons):
         return None
     points, corners = np.empty((len(mesh.vertices), 3), np.float32), np.empty(len(mesh.loops), np.int32)
     mesh.vertices.foreach_get("co", points.ravel())
     mesh.loops.foreach_get("vertex_index", corners)
-    thing.to_mesh_clear()
+    obj.to_mesh_clear()
     return points.astype(float), corners, zlib.crc32(corners)
 
 
@@ -121,7 +121,7 @@ def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
     """Write to ``path`` (npz) where points of every surface are at a few frames and between frames: ``times`` (T,) s,
-    ``whole`` (T,) bool, ``things`` JSON: (name, whether its faces change) of each, ``arr_0`` … (T, n, 3) its points,
+    ``whole`` (T,) bool, ``objs`` JSON: (name, whether its faces change) of each, ``arr_0`` … (T, n, 3) its points,
     NaN where it is not seen.
 
     Return (owners that are broken, owners of each object's name)."""
@@ -134,11 +134,11 @@ def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
     broken, owners = set(), {}
     clock.play()
     for frame in frames:
-        for _, key, thing, matrix, points, corners, form in clock.watch([frame]):
+        for _, key, obj, matrix, points, corners, form in clock.watch([frame]):
             if key not in seen:
                 picked = np.sort(np.random.default_rng(0).permutation(np.unique(corners))[:most])
                 seen[key] = [form, False, picked, {}]
-            owners.setdefault(thing.name, set()).add(key[0])
+            owners.setdefault(obj.name, set()).add(key[0])
             if form != seen[key][0]:
                 seen[key][1] = True
                 continue
@@ -149,9 +149,9 @@ def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
     points = [
         [at.get(frame, np.full((len(picked), 3), np.nan)) for frame in frames] for *_, picked, at in kept.values()
     ]
-    things = json.dumps([(name, changes) for (_, name, _), (_, changes, *_) in kept.items()])
+    objs = json.dumps([(name, changes) for (_, name, _), (_, changes, *_) in kept.items()])
     whole = [frame == int(frame) for frame in frames]
-    np.savez(path, *points, things=things, times=[clock.seconds(frame) for frame in frames], whole=whole)
+    np.savez(path, *points, objs=objs, times=[clock.seconds(frame) for frame in frames], whole=whole)
     return broken, owners
 
 
@@ -163,8 +163,8 @@ class Track:
     seen : frames at which it is there; other : at which it has other faces.   coarse : whether it has keys at whole
     frames alone; over : bytes at which it was given up.   object : that shows it."""
 
-    def __init__(self, owner: str, thing: Any, shape: np.ndarray, corners: int, form: int):
-        self.name, self.owner, self.camera, self.original = thing.name, owner, thing.type == "CAMERA", thing.original
+    def __init__(self, owner: str, obj: Any, shape: np.ndarray, corners: int, form: int):
+        self.name, self.owner, self.camera, self.original = obj.name, owner, obj.type == "CAMERA", obj.original
         self.shape, self.corners, self.form, self.deforms = shape, corners, form, False
         self.kept, self.waiting, self.seen, self.other, self.coarse, self.over = [], [], [], [], False, 0
         self.data = self.object = None
@@ -243,15 +243,15 @@ def bake(clock: Clock, owners: set[str], room: float) -> tuple[list[Track], dict
     frames = [clock.first + k / per_frame for k in range((clock.last - clock.first) * per_frame + 1)]
     data: dict[str, Any] = {}
     clock.play()
-    for frame, key, thing, matrix, points, corners, form in clock.watch(frames, owners):
+    for frame, key, obj, matrix, points, corners, form in clock.watch(frames, owners):
         if key not in tracks:
-            tracks[key] = Track(key[0], thing, points, len(corners), form)
-            if thing.name not in data and thing.type == "CAMERA":
-                data[thing.name] = thing.original.data
-            elif thing.name not in data:
+            tracks[key] = Track(key[0], obj, points, len(corners), form)
+            if obj.name not in data and obj.type == "CAMERA":
+                data[obj.name] = obj.original.data
+            elif obj.name not in data:
                 keep = {"preserve_all_data_layers": True, "depsgraph": clock.graph}
-                data[thing.name] = bpy.data.meshes.new_from_object(thing, **keep)
-            tracks[key].data = data[thing.name]
+                data[obj.name] = bpy.data.meshes.new_from_object(obj, **keep)
+            tracks[key].data = data[obj.name]
         track = tracks[key]
         room += track.size
         track.add(frame, matrix, points, form)

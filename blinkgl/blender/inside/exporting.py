@@ -41,9 +41,9 @@ class Refused(Exception):
         self.problem, self.accepted = problem, accepted
 
 
-def names(things: Iterable[Any], limit: int = 3) -> str:
+def names(objs: Iterable[Any], limit: int = 3) -> str:
     """Return 'a', 'b', 'c' and 4 more."""
-    listed = [f"'{getattr(thing, 'name', thing)}'" for thing in things]
+    listed = [f"'{getattr(obj, 'name', obj)}'" for obj in objs]
     return ", ".join(listed[:limit]) + (f" and {len(listed) - limit} more" if len(listed) > limit else "")
 
 
@@ -121,18 +121,18 @@ def rendered() -> tuple[list[Any], list[str]]:
     lines about others. Objects that the camera does not see are hidden."""
     found, unseen, hidden = [], [], []
     shown = set(collections(bpy.context.view_layer.layer_collection))
-    for thing in bpy.context.view_layer.objects:
-        if thing.type in SEEN and thing.type != "CAMERA" and (thing.is_holdout or not thing.visible_camera):
-            unseen.append(thing)
-        elif shown.isdisjoint(collection.name for collection in thing.users_collection):
-            hidden.append(thing)
-        elif not thing.hide_render or thing.animation_data is not None:  # which may show it later
-            thing.hide_viewport = False
-            thing.hide_set(False)
-            thing.show_instancer_for_viewport = thing.show_instancer_for_render
-            found.append(thing)
-    for thing in unseen + hidden:
-        thing.hide_render = True
+    for obj in bpy.context.view_layer.objects:
+        if obj.type in SEEN and obj.type != "CAMERA" and (obj.is_holdout or not obj.visible_camera):
+            unseen.append(obj)
+        elif shown.isdisjoint(collection.name for collection in obj.users_collection):
+            hidden.append(obj)
+        elif not obj.hide_render or obj.animation_data is not None:  # which may show it later
+            obj.hide_viewport = False
+            obj.hide_set(False)
+            obj.show_instancer_for_viewport = obj.show_instancer_for_render
+            found.append(obj)
+    for obj in unseen + hidden:
+        obj.hide_render = True
     lines = [f"invisible to the camera, or cut out of the picture: {names(unseen)}"] if unseen else []
     return found, lines + ([f"in collections that are not rendered: {names(hidden)}"] if hidden else [])
 
@@ -145,7 +145,7 @@ def collections(layer: Any) -> Iterator[str]:
             yield from collections(child)
 
 
-def realize(things: list[Any]) -> None:
+def realize(objs: list[Any]) -> None:
     """Convert instances of geometry nodes to faces of the object itself, because the exporter leaves them out."""
     group = bpy.data.node_groups.new("Realize", "GeometryNodeTree")
     for way in ("INPUT", "OUTPUT"):
@@ -154,15 +154,15 @@ def realize(things: list[Any]) -> None:
     start, real, end = (group.nodes.new(kind) for kind in kinds)
     group.links.new(start.outputs[0], real.inputs[0])
     group.links.new(real.outputs[0], end.inputs[0])
-    for thing in things:
-        if any(m.type == "NODES" and m.show_viewport for m in thing.modifiers):
-            thing.modifiers.new("Realize", "NODES").node_group = group
+    for obj in objs:
+        if any(m.type == "NODES" and m.show_viewport for m in obj.modifiers):
+            obj.modifiers.new("Realize", "NODES").node_group = group
 
 
 # --- what glTF cannot store -------------------------------------------------------------------------------------------
 
 
-def left_out(things: list[Any], clock: Clock) -> list[str]:
+def left_out(objs: list[Any], clock: Clock) -> list[str]:
     """Return lines about what glTF cannot represent."""
     scene, lines = clock.scene, []
 
@@ -171,12 +171,12 @@ def left_out(things: list[Any], clock: Clock) -> list[str]:
             lines.append(f"{problem}: {names(some, limit)}")
 
     for kind, words in UNKNOWN.items():
-        say(f"glTF has no {words}; left out", (thing for thing in things if thing.type == kind))
-    lamps = [thing for thing in things if thing.type == "LIGHT"]
-    say("glTF has no area lights; left out", (thing for thing in lamps if thing.data.type == "AREA"))
+        say(f"glTF has no {words}; left out", (obj for obj in objs if obj.type == kind))
+    lamps = [obj for obj in objs if obj.type == "LIGHT"]
+    say("glTF has no area lights; left out", (obj for obj in lamps if obj.data.type == "AREA"))
     say("lights with key frames shine as at their brightest", (lamp for lamp in lamps if lamp.data.animation_data))
-    cameras = [thing for thing in things if thing.type == "CAMERA"]
-    say("glTF has no panoramic cameras; left out", (thing for thing in cameras if thing.data.type == "PANO"))
+    cameras = [obj for obj in objs if obj.type == "CAMERA"]
+    say("glTF has no panoramic cameras; left out", (obj for obj in cameras if obj.data.type == "PANO"))
     say("cameras with a keyed lens keep that of the first frame", (one for one in cameras if one.data.animation_data))
     say("the shift of the lens is left out", (one for one in cameras if one.data.shift_x or one.data.shift_y))
     cuts = sorted((m.frame, m.camera.name) for m in scene.timeline_markers if m.camera is not None)
@@ -185,13 +185,13 @@ def left_out(things: list[Any], clock: Clock) -> list[str]:
         lines.append(f"the scene cuts between cameras ({shots}): import one shot, --frames FIRST LAST")
     strands = ("OBJECT", "COLLECTION")
     say("particles and hair are left out", (
-        thing for thing in things if any(p.settings.render_type not in strands for p in thing.particle_systems)
+        obj for obj in objs if any(p.settings.render_type not in strands for p in obj.particle_systems)
     ))  # fmt: skip
     say("drivers that need Python are not run", (
-        thing for thing in things if thing.animation_data is not None
-        and any(d.driver.type == "SCRIPTED" and not d.driver.is_simple_expression for d in thing.animation_data.drivers)
+        obj for obj in objs if obj.animation_data is not None
+        and any(d.driver.type == "SCRIPTED" and not d.driver.is_simple_expression for d in obj.animation_data.drivers)
     ))  # fmt: skip
-    used = {slot.material for thing in things for slot in thing.material_slots if slot.material is not None}
+    used = {slot.material for obj in objs for slot in obj.material_slots if slot.material is not None}
     odd = sorted((m for m in used if not has_plain_colour(m)), key=lambda m: m.name)
     say("materials without a plain colour or image look different (bake them in Blender)", odd, 8)
     nodes = [
@@ -315,18 +315,18 @@ def counts(tree: dict) -> dict[str, int]:
     }
 
 
-def steady(clock: Clock, things: list[Any]) -> None:
+def steady(clock: Clock, objs: list[Any]) -> None:
     """Give lights with key frames the greatest energy that they have at nine times."""
-    keyed = [thing for thing in things if thing.type == "LIGHT" and thing.data.animation_data is not None]
+    keyed = [obj for obj in objs if obj.type == "LIGHT" and obj.data.animation_data is not None]
     best = dict.fromkeys(keyed, (0.0, 1.0, 1.0, 1.0))
     for k in range(9 if keyed else 0):
         clock.go(clock.first + k * (clock.last - clock.first) / 8)
-        for thing in keyed:
-            data = thing.evaluated_get(clock.graph).data
-            best[thing] = max(best[thing], (data.energy, *data.color))
-    for thing, (energy, *colour) in best.items():
-        thing.data.animation_data_clear()
-        thing.data.energy, thing.data.color = energy, colour
+        for obj in keyed:
+            data = obj.evaluated_get(clock.graph).data
+            best[obj] = max(best[obj], (data.energy, *data.color))
+    for obj, (energy, *colour) in best.items():
+        obj.data.animation_data_clear()
+        obj.data.energy, obj.data.color = energy, colour
 
 
 def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
@@ -338,16 +338,16 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
             raise Refused(f"the file has no scene '{job['scene']}'", f"one of: {names(bpy.data.scenes, 20)}")
         bpy.context.window.scene = bpy.data.scenes[job["scene"]]
     scene = bpy.context.scene
-    things, lines = rendered()
-    realize(things)
+    objs, lines = rendered()
+    realize(objs)
     clock = clock_of(job["frames"], job["keys_per_frame"])
     say(doing="evaluating the scene")
     broken, owners = sample(clock, out.with_name("seen.npz"))
     keep_out(clock, broken)
     if broken:
         lines.append(f"left out, further away than {FURTHEST:g} or no number: {names(sorted(broken))}")
-    lines += left_out(things, clock)
-    steady(clock, things)
+    lines += left_out(objs, clock)
+    steady(clock, objs)
     for picture in [picture for picture in bpy.data.images if picture.source == "TILED"]:
         bpy.data.images.remove(picture)  # the exporter stops at it
     failed: dict[str, str] = {}
@@ -358,7 +358,7 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     for number in range(ROUNDS):
         say(doing="writing the GLB")
         found = export(clock, out, job["clips"], tracks)
-        if not found["meshes"] and not any(thing.type == "ARMATURE" for thing in things):  # a clip for another's figure
+        if not found["meshes"] and not any(obj.type == "ARMATURE" for obj in objs):  # a clip for another's figure
             raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
         if job["clips"] or not owners:
             break
@@ -376,14 +376,14 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
         if denser == 1 and tried == set(broken) | why.keys():
             break
     lines += [f"'{name}' cannot be exported, it is left out or plain ({why})" for name, why in sorted(failed.items())]
-    cameras = [thing for thing in things if thing.type == "CAMERA" and thing.data.type != "PANO"]
+    cameras = [obj for obj in objs if obj.type == "CAMERA" and obj.data.type != "PANO"]
     scene.frame_set(scene.frame_start)
     active = scene.camera if scene.camera in cameras else None
     return {
         "blender": bpy.app.version_string,
         "counts": found,
         "left_out": lines,
-        "cameras": [thing.name for thing in cameras],
+        "cameras": [obj.name for obj in cameras],
         "camera": active and active.name,
         "size": [scene.render.resolution_x, scene.render.resolution_y],
         "frames": [clock.first, clock.last],

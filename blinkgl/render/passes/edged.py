@@ -68,20 +68,20 @@ class Edged(Pass):
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         # Pixels without an edge keep their value.
         shot.inputs["picture"].target.copy_into(shot.target)
-        moment, strokes = shot.moment, painter.strokes
+        moment, drawer = shot.moment, painter.line_drawer
         drawn = [item for item in (moment.visible if items is None else items) if item.layer != SKY]
-        strokes.upload(moment, drawn, *shot.size)
-        uniforms, array = strokes.program(self.program, self.defines(None))
+        drawer.upload(moment, drawn, *shot.size)
+        uniforms, array = drawer.program(self.program, self.defines(None))
         # The picture has no edges.
         if array is None:
             return
         self.bind(uniforms, shot)
-        strokes.use(_CROSSINGS_UNIT)
+        drawer.use(_CROSSINGS_UNIT)
         uniforms["crossings"].value = _CROSSINGS_UNIT
         uniforms["image_size"].value = shot.size
         # Width of a pixel on the plane at distance 1: 2 / (width |P00|).
         uniforms["pixel"].value = 2 / (shot.size[0] * abs(moment.view.projection[0, 0]))
-        strokes.draw(array, shot.target)
+        drawer.draw(array, shot.target)
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:

@@ -32,8 +32,8 @@ class _Luminance(Shaded):
         super().set(painter, uniforms, item, shot)
         if item.textured:
             resources = painter.resources
-            (resources.shares_texture if item.kind.hued else resources.luminance_texture)(item.material).use(0)
-        elif item.kind.hued:
+            (resources.shares_texture if item.kind.rgb else resources.luminance_texture)(item.material).use(0)
+        elif item.kind.rgb:
             uniforms["albedo"].value = tuple(LUMA * np.asarray(item.material.base_color, np.float64))
         else:
             uniforms["albedo"].value = painter.resources.albedo_luminance(item.material)

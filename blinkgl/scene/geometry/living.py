@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.config.deform import DeformConfig, FlagConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.figure import body_of
-from blinkgl.scene.geometry.meshes import bounds, finer, weld
+from blinkgl.scene.geometry.meshes import bounds, subdivided, weld
 from blinkgl.scene.geometry.primitives import Surface, join, lattice, primitive, square
 from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
 from blinkgl.scene.shapes.gait import PARENTS, Proportions, clip_of
@@ -74,7 +74,7 @@ def flag(
     config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
     low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
     cloth = Flag.of(config, low, high)
-    cloth.goes = "level"
+    cloth.locomotion = "level"
     return join([front, back, *rim]), cloth
 
 
@@ -126,7 +126,7 @@ def fish(
         (0.085 * length, 0.0),
         (beat, beat),
     )
-    swim.goes, swim.speed = "level", 0.7 * 0.95 * length / (beat.period_ns * 1e-9)
+    swim.locomotion, swim.speed = "level", 0.7 * 0.95 * length / (beat.period_ns * 1e-9)
     return (flat, _smooth_normals(flat, faces, area), uvs, faces), swim
 
 
@@ -152,4 +152,4 @@ def deforming(parts: Sequence[Part], config: DeformConfig) -> tuple[Part, ...]:
     """Return the parts of one object, deformed together by ``deform:``; their triangles are as fine as that needs."""
     low, high = bounds([part.mesh for part in parts])
     deformer, edge = deformer_of(config, low, high), EDGE * float(np.max(high - low))
-    return tuple(replace(part, mesh=replace(finer(part.mesh, edge), deformer=deformer)) for part in parts)
+    return tuple(replace(part, mesh=replace(subdivided(part.mesh, edge), deformer=deformer)) for part in parts)

@@ -405,7 +405,7 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
     )
 
 
-def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
+def subdivided(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
     """Return the same surface with smaller triangles: each is split into four until no edge is longer than ``edge``, or
     there would be more than ``max_faces``."""
     while True:

@@ -97,7 +97,7 @@ class Waves(Deformer):
 
         first, second = (form(*wave) for wave in self.waves)
         out = type(self)(linear @ self.direction, form(*self.envelope), (first, second), self.amplitudes, self.beats)
-        out.goes, out.speed = self.goes, self.speed * float(np.linalg.norm(linear[:, 0]))
+        out.locomotion, out.speed = self.locomotion, self.speed * float(np.linalg.norm(linear[:, 0]))
         return out
 
     def _terms(self, mesh: Mesh, t_ns: int):

@@ -26,7 +26,7 @@ class Cycle:
     motion, 0: it stays in place.   N has to be more than twice ``HARMONICS``."""
 
     is_static = False
-    goes = "upright"
+    locomotion = "upright"
 
     def __init__(
         self,

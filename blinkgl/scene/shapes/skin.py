@@ -112,7 +112,7 @@ class Skin(Deformer):
         periods = {part.period_ns for part in moving}
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
-        self.goes = getattr(skeleton.motion, "goes", "anyhow")
+        self.locomotion = getattr(skeleton.motion, "locomotion", "free")
         self.speed = getattr(skeleton.motion, "speed", 0.0) * float(np.linalg.norm(self.after[:3, 0]))
         self.mirrors = getattr(skeleton.motion, "mirrors", False) or self.side(0) != 1
         self.sizes = {"SKIN_WEIGHTS": self.weights.shape[1]}

@@ -164,6 +164,6 @@ def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:
 def gait(meshes: Iterable[Mesh]) -> tuple[str, float]:
     """Return (orientation, units/s) of the motion of one object's meshes: of the first that has any."""
     for mesh in meshes:
-        if mesh.deformer is not None and mesh.deformer.goes != "anyhow":
-            return mesh.deformer.goes, mesh.deformer.speed
-    return "anyhow", 0.0
+        if mesh.deformer is not None and mesh.deformer.locomotion != "free":
+            return mesh.deformer.locomotion, mesh.deformer.speed
+    return "free", 0.0

@@ -162,7 +162,7 @@ def both(normal: np.ndarray, away: np.ndarray, cells: np.ndarray) -> tuple[Look,
     return look(first, r1, weight), look(second, r2, 1.0 - weight)
 
 
-def around(
+def mirrored_radiance(
     levels: np.ndarray, normal: np.ndarray, away: np.ndarray, cosine: np.ndarray, roughness: np.ndarray
 ) -> np.ndarray:
     """Return the radiance, (N, 3), of :func:`blurred` surroundings mirrored by surfaces of (N,) roughnesses, relative
@@ -177,14 +177,14 @@ def energy_at(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     return _bilinear(energy(), cosine * (_ANGLES - 1), roughness * (_ROUGHNESSES - 1))
 
 
-def _bilinear(table: np.ndarray, x: np.ndarray, y: np.ndarray, around: bool = False) -> np.ndarray:
+def _bilinear(table: np.ndarray, x: np.ndarray, y: np.ndarray, wraps: bool = False) -> np.ndarray:
     height, width = table.shape[:2]
     y = np.clip(y, 0, height - 1)
-    x = x if around else np.clip(x, 0, width - 1)
+    x = x if wraps else np.clip(x, 0, width - 1)
     x0, y0 = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), max(height - 2, 0))
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     y1 = np.minimum(y0 + 1, height - 1)
-    x0, x1 = (np.mod(x0, width), np.mod(x0 + 1, width)) if around else (x0, np.minimum(x0 + 1, width - 1))
+    x0, x1 = (np.mod(x0, width), np.mod(x0 + 1, width)) if wraps else (x0, np.minimum(x0 + 1, width - 1))
     return (table[y0, x0] * (1 - fx) + table[y0, x1] * fx) * (1 - fy) + (
         table[y1, x0] * (1 - fx) + table[y1, x1] * fx
     ) * fy
@@ -243,6 +243,6 @@ def mirrored(levels: np.ndarray, directions: np.ndarray, roughness: np.ndarray) 
     for k in np.unique(low):
         on = low == k
         part = (at[on] - k)[:, None]
-        ends = [_bilinear(levels[j].astype(np.float64), x[on], y[on], around=True) for j in (k, k + 1)]
+        ends = [_bilinear(levels[j].astype(np.float64), x[on], y[on], wraps=True) for j in (k, k + 1)]
         out[on] = ends[0] * (1 - part) + ends[1] * part
     return out

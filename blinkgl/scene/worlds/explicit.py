@@ -69,7 +69,7 @@ def explicit_scene(
     omissions: dict[str, None] = {}
     objects = _objects(config, t0_ns, t1_ns, base, memory, log, omissions)
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True, log=log)
-    bodies = {thing.name: item.physics for thing, item in zip(objects, config.objects) if item.physics is not None}
+    bodies = {obj.name: item.physics for obj, item in zip(objects, config.objects) if item.physics is not None}
     if config.collisions:
         # Nothing stops falling objects: the engine knows the others' final paths.
         falling = {name for name, body in bodies.items() if body.kind == "dynamic"}

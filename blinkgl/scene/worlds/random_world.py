@@ -76,7 +76,7 @@ def random_world(
     dice = rng, rng_texture, rng_shape
     placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
     # Objects with their own motion are not thrown.
-    lifeless = [one.name for one in placed if _gait(one.parts)[0] == "anyhow"]
+    lifeless = [one.name for one in placed if _gait(one.parts)[0] == "free"]
     bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
     room = _Room(config, floor, placed, T_cam, clearance)
     for k, one in enumerate(placed):
@@ -176,13 +176,13 @@ def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
 
 def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng, t0_ns: int, t1_ns: int) -> PosePath:
     """Return a random path or, for an object with its own motion, a way at the speed of its steps."""
-    goes, speed = _gait(one.parts)
-    if goes == "anyhow" or (goes == "level" and speed == 0):
-        turns = one.resting or goes == "level"
+    locomotion, speed = _gait(one.parts)
+    if locomotion == "free" or (locomotion == "level" and speed == 0):
+        turns = one.resting or locomotion == "level"
         return random_path(rng, t0_ns, t1_ns, config.object_motion, space, one.radius, one.pose, on_ground=turns)
     if speed == 0 or config.object_motion.kind == "static":
         return StaticPath(one.pose, t0_ns, t1_ns)
-    return random_path_along_curve(rng, t0_ns, t1_ns, space, one.radius, one.pose, speed, flat=goes == "upright")
+    return random_path_along_curve(rng, t0_ns, t1_ns, space, one.radius, one.pose, speed, flat=locomotion == "upright")
 
 
 def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clearance, t0_ns, t1_ns, log):
@@ -279,11 +279,11 @@ def _place(
         asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
         resting = config.ground is not None and rng.random() >= settings.flying
-        goes, _ = _gait(asset.parts)
-        if goes == "anyhow":
+        locomotion, _ = _gait(asset.parts)
+        if locomotion == "free":
             rotation = _rotation(rng, resting)
         else:
-            resting = goes == "upright" and config.ground is not None
+            resting = locomotion == "upright" and config.ground is not None
             rotation = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * math.pi)]).as_matrix()
         changed, word = _changing(asset, settings.deform, rng_shape)
         parts = _dress(config, changed, radius, textures, rng_texture, split, log)
@@ -346,7 +346,7 @@ def _lowest(mesh: Mesh, up: np.ndarray) -> float:
         return float((mesh.vertices @ up).min())
     points, margin = filled(mesh)
     # A figure's feet are on the ground: the margin for times between samples is not used.
-    return float((points @ up).min()) - (0.0 if mesh.deformer.goes == "upright" else margin)
+    return float((points @ up).min()) - (0.0 if mesh.deformer.locomotion == "upright" else margin)
 
 
 def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:

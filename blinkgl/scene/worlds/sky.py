@@ -98,7 +98,7 @@ def with_environment(
         image = np.roll(image, -round(config.heading / 360 * image.shape[1]), axis=1)
         textures = panorama_textures(image, file.stem, content_hash(contents(file, "image"), repr(config).encode()))
         parts = panorama_sky(textures, config.strength)
-        number = 1 + max((thing.instance_id for thing in objects), default=0)
+        number = 1 + max((obj.instance_id for obj in objects), default=0)
         objects = (*objects, SceneObject("sky", number, parts, StaticPath(), "sky", at_infinity=True))
     return light, objects
 

@@ -212,7 +212,7 @@ def test_two_looks_are_the_lobe(made, roughness, most):
         n, along = lobes.facing(rng, 16)
         true = lobes.integral(made[0], n, along, cosine, roughness)
         away = cosine * n - np.sqrt(1 - cosine**2) * along
-        seen = gloss.around(made[1], n, away, np.full(len(n), cosine), np.full(len(n), roughness))
+        seen = gloss.mirrored_radiance(made[1], n, away, np.full(len(n), cosine), np.full(len(n), roughness))
         errors.append(np.abs(seen - true) / (true + 0.01))
     assert np.median(errors) < most
 

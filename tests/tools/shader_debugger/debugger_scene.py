@@ -83,7 +83,7 @@ MISTAKES = {
     "depth off by near": ("include/labels/depth.glsl", "1.0 / INVERSE_DEPTH", "1.0 / INVERSE_DEPTH - 0.05"),
 }
 
-_UV = "ALBEDO luminance = texture(albedo, uv).CHANNELS;"
+_UV = "return texture(albedo, uv).CHANNELS;"
 
 LOOKUP_MISTAKES = {
     # name: ([(file, right, wrong), …], the first buffer that is wrong, words of the suspicion, the objects)
@@ -109,13 +109,13 @@ LOOKUP_MISTAKES = {
         {"floor", "ball"},
     ),
     "mip bias +1": (
-        [("luminance.glsl", _UV, _UV.replace("uv)", "uv, 1.0)"))],
+        [("include/albedo.glsl", _UV, _UV.replace("uv)", "uv, 1.0)"))],
         "luminance_level",
         "a mip bias of +1",
         {"floor", "ball"},
     ),
     "uv off by half a texel": (
-        [("luminance.glsl", _UV, _UV.replace("uv)", "uv + 0.5 / vec2(textureSize(albedo, 0)))"))],
+        [("include/albedo.glsl", _UV, _UV.replace("uv)", "uv + 0.5 / vec2(textureSize(albedo, 0)))"))],
         "luminance_uv",
         "shifted by half a texel (+0.5, +0.5)",
         {"floor", "ball"},

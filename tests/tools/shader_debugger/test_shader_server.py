@@ -337,10 +337,10 @@ def test_the_page_in_chromium(served, shader, config):
         for side in ("gpu", "reference"):
             value = html.unescape(re.search(rf'data-{side}="{name}"[^>]*>([^<]+)<', page)[1])
             assert f" {value} " in line, (name, side, value, line)
-    good = (folder / "luminance.glsl").read_text()
+    good = (folder / "include/albedo.glsl").read_text()
     version = as_json(server, "/state")["version"]
-    edit(folder / "luminance.glsl", "= texture(albedo, uv).CHANNELS;", "= texture(albedo, uv, 1.0).CHANNELS;")
+    edit(folder / "include/albedo.glsl", "return texture(albedo, uv).C", "return texture(albedo, uv, 1.0).C")
     next_version(server, version)
     page = page_of(server, "fault")
-    (folder / "luminance.glsl").write_text(good)
+    (folder / "include/albedo.glsl").write_text(good)
     assert "level of luminance" in page and "a mip bias of +1" in page

@@ -21,7 +21,7 @@ ROW = 512
 """Crossings per row of their texture, two texels each; the same as in edges.glsl."""
 
 
-class Strokes:
+class LineDrawer:
     """The lines of one renderer. lines : the contours that it draws.   uniforms : returns a program's table."""
 
     def __init__(self, gl: GLContext, uniforms: Callable[[moderngl.Program], Uniforms] = Uniforms):

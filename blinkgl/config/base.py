@@ -36,6 +36,8 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import core_schema
 
+from blinkgl.errors import ConfigError
+
 Path = tuple[str, ...]
 
 
@@ -46,6 +48,24 @@ class Refused(ValueError):
     def __init__(self, problem: str, *, where: str = "", value: Any = ..., accepted: str | None = None):
         super().__init__(problem)
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
+
+
+@contextmanager
+def placed(
+    where: str | Callable[[str], str],
+    kind: type[Any] = ConfigError,
+    *,
+    of: tuple[type[Any], ...] = (Refused, ConfigError),
+    said: str = "",
+) -> Iterator[None]:
+    """Raise the errors ``of`` the code inside as a ``kind`` of error at another place.
+
+    where : the place, or what makes it of the place there.   said : what comes before the problem."""
+    try:
+        yield
+    except of as error:
+        place = where if isinstance(where, str) else where(error.where or "")
+        raise kind(said + error.problem, where=place, value=error.value, accepted=error.accepted) from None
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ import numpy as np
 
 from blinkgl.camera import CAMERA_MODELS, CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
+from blinkgl.config.base import placed
 from blinkgl.config.poses import rigid_matrix
 from blinkgl.config.reader import parse_yaml, read_text, to_yaml
 from blinkgl.errors import ConfigError
@@ -292,13 +293,9 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
     elif isinstance(table.get(numbers), dict):
         table = {**table, numbers: given}
     given = [] if kind == "pinhole" else _numbers(table, numbers, _COUNTS[kind], where)
-    try:
-        made = CAMERA_MODELS[kind](
-            int(size[0]), int(size[1]), *intrinsics, **dict(zip(CAMERA_MODELS[kind].coefficients, given))
-        )
-    except ConfigError as error:
-        raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
-    return Calibrated(made)
+    with placed(where):
+        coefficients = dict(zip(CAMERA_MODELS[kind].coefficients, given))
+        return Calibrated(CAMERA_MODELS[kind](int(size[0]), int(size[1]), *intrinsics, **coefficients))
 
 
 def _numbers(table: dict[str, Any], key: str, counts: tuple[int, ...], where: str) -> list[float]:

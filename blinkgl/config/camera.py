@@ -19,7 +19,7 @@ from pydantic import Field
 
 from blinkgl.camera import CAMERA_MODELS, CameraModel, focal_length
 from blinkgl.camera.drawing import seen_through
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, placed, rule
 from blinkgl.config.draw import is_distribution
 from blinkgl.errors import ConfigError
 
@@ -100,10 +100,8 @@ class CameraConfig(Config):
     def _can_be_drawn(width: int, height: int, lens: str, distortion: tuple[float, ...], *rest: Any):
         if lens == "pinhole" or len(distortion) not in COUNTS[lens]:  # the rule of distortion reports this
             return
-        try:
+        with placed("distortion", Refused):
             seen_through(_model(width, height, lens, distortion, *rest))
-        except ConfigError as error:
-            raise Refused(error.problem, where="distortion", value=error.value, accepted=error.accepted) from None
 
     @property
     def model(self) -> CameraModel:

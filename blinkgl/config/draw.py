@@ -114,10 +114,6 @@ def _number(x: Any) -> float:
     return value
 
 
-def _is_choice(spec: Any) -> bool:
-    return isinstance(spec, list) and bool(spec)
-
-
 def _is_weighted(spec: Any) -> bool:
     weights = [_number(weight) for weight in spec.values()]
     return min(weights) >= 0 and sum(weights) > 0
@@ -139,16 +135,8 @@ def _is_range(spec: Any) -> bool:
     return low <= high and math.isfinite(high - low)
 
 
-def _is_log_range(spec: Any) -> bool:
-    return _is_range(spec) and _number(spec[0]) > 0
-
-
-def _is_integers(spec: Any) -> bool:
-    return _is_range(spec) and all(_number(x).is_integer() and abs(_number(x)) < 2**63 for x in spec)
-
-
 _RULES: dict[str, tuple[Callable[[Any], bool], str, str]] = {
-    "choice": (_is_choice, "a list of choices", "a non-empty list"),
+    "choice": (lambda spec: isinstance(spec, list) and bool(spec), "a list of choices", "a non-empty list"),
     "weighted": (_is_weighted, "a table of weights", "{value: weight, …} with weights >= 0 and a positive sum"),
     "shares": (_is_shares, "a list of shares", "[{share: 0.8, value: …}, …] with shares that sum to 1"),
     "normal": (
@@ -157,8 +145,16 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str, str]] = {
         "[mean, standard deviation > 0, lowest, highest], the mean between the last two",
     ),
     "uniform": (_is_range, "a range", "[low, high], two finite numbers, low <= high"),
-    "log_uniform": (_is_log_range, "a logarithmic range", "[low, high], 0 < low <= high"),
-    "integer": (_is_integers, "a range of whole numbers", "[low, high], two integers, low <= high"),
+    "log_uniform": (
+        lambda spec: _is_range(spec) and _number(spec[0]) > 0,
+        "a logarithmic range",
+        "[low, high], 0 < low <= high",
+    ),
+    "integer": (
+        lambda spec: _is_range(spec) and all(_number(x).is_integer() and abs(_number(x)) < 2**63 for x in spec),
+        "a range of whole numbers",
+        "[low, high], two integers, low <= high",
+    ),
 }
 """Kind -> whether its parameters are valid, what they are, and what is accepted."""
 

@@ -27,7 +27,6 @@ from blinkgl.config.reader import (
     merge,
     read_table,
     shipped,
-    shipped_names,
     with_groups,
     with_sections,
 )
@@ -47,10 +46,8 @@ class Recipe(Config):
 
 def load_recipe(name: str) -> Recipe:
     """Return a shipped recipe. Raises ConfigError listing the known ones."""
-    known = shipped_names("emulators")
-    if not isinstance(name, str) or name not in known:
-        raise ConfigError("unknown recipe", where="events.recipe", value=name, accepted=f"one of {', '.join(known)}")
-    return validate(Recipe, shipped("emulators", name), where=f"emulators/{name}.yaml")
+    keys = shipped("emulators", name, "recipe", "events.recipe")
+    return validate(Recipe, keys, where=f"emulators/{name}.yaml")
 
 
 def expanded(tree: Table, base: Path) -> Table:

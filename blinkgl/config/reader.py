@@ -317,8 +317,13 @@ def shipped_names(kind: str) -> tuple[str, ...]:
     return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
 
 
-def shipped(kind: str, name: str) -> dict[str, Any]:
-    """Return a copy of the table of this name (see :func:`shipped_names`)."""
+def shipped(kind: str, name: Any, what: str = "table", where: str = "") -> dict[str, Any]:
+    """Return a copy of the table of this name. Raises ConfigError listing the known ones (:func:`shipped_names`).
+
+    what, where : for the message."""
+    known = shipped_names(kind)
+    if not isinstance(name, str) or name not in known:
+        raise ConfigError(f"unknown {what}", where=where, value=name, accepted=f"one of {', '.join(known)}")
     return copy.deepcopy(_read(kind, name))
 
 

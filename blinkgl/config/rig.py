@@ -29,7 +29,7 @@ from blinkgl.config.images import ImagesConfig
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.over_time import ImuConfig, TracksConfig
 from blinkgl.config.poses import Matrix, check_rigid, rigid_matrix, some_rotation
-from blinkgl.config.reader import merge, shipped, shipped_names
+from blinkgl.config.reader import merge, shipped
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import Sensor
 from blinkgl.config.values import Position, Vector3
@@ -131,14 +131,6 @@ class RigSensorConfig(Config):
         return self.events is not None or self.images is not None or told
 
 
-def load_rig(name: Any) -> list[dict[str, Any]]:
-    """Return the sensors of a shipped rig as plain trees. Raises ConfigError for an unknown one."""
-    known = shipped_names("rigs")
-    if name not in known:
-        raise ConfigError("unknown rig", where="rig", value=name, accepted=f"one of {', '.join(known)}")
-    return shipped("rigs", name)["sensors"]
-
-
 def is_rig(tree: Any) -> bool:
     """Return whether a configuration has several sensors."""
     return isinstance(tree, dict) and (tree.get("rig") is not None or tree.get("sensors") is not None)
@@ -192,7 +184,8 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     for k, one in enumerate(own):
         if not isinstance(one, dict):
             raise ConfigError("not a table of keys", where=f"sensors.{k}", value=one, accepted="{name: left, …}")
-    return {**tree, "sensors": _laid(own, [] if tree.get("rig") is None else load_rig(tree["rig"]))}
+    base = [] if tree.get("rig") is None else shipped("rigs", tree["rig"], "rig", "rig")["sensors"]
+    return {**tree, "sensors": _laid(own, base)}
 
 
 def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -31,7 +31,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.base import Refused, remembering
+from blinkgl.config.base import Refused, placed, remembering
 from blinkgl.config.draw import Fill, corners, draw, is_distribution, sites
 from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
@@ -169,12 +169,8 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
             tree["seed"] = validate_field(SequenceConfig, "seed", own["seed"])
         if isinstance(tree.setdefault("output", {}), dict):
             tree["output"].setdefault("name", name)
-        try:
+        with placed(str, said=f"in group '{name}': "):
             made.append(_group(name, tree, template, enabled))
-        except ConfigError as error:
-            raise ConfigError(
-                f"in group '{name}': {error.problem}", where=error.where, value=error.value, accepted=error.accepted
-            ) from None
     folders: dict[tuple[str, str], str] = {}
     for group in made:
         output = group.template.tree["output"]

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, placed, rule
 from blinkgl.config.draw import corners, draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.problems import validate
@@ -44,11 +44,8 @@ def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, A
             raise Refused("unknown emulator", value=name, accepted="one of " + ", ".join(models))
         if "emulator" in keys:
             raise Refused("the name of the table is the emulator", where=name, value=keys["emulator"])
-        try:
+        with placed(lambda key, name=name: name if key in ("", "config") else f"{name}.{key}", Refused):
             validate(models[name], keys)
-        except ConfigError as error:
-            where = name if error.where in (None, "", "config") else f"{name}.{error.where}"
-            raise Refused(error.problem, where=where, value=error.value, accepted=error.accepted) from None
     return tables
 
 

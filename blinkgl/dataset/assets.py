@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from blinkgl.config.base import placed
 from blinkgl.config.run import Group, RunTemplate
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import SequenceConfig
@@ -30,17 +31,8 @@ def check_assets(plan: Plan) -> dict[str, str]:
     folders."""
     hashes: dict[str, str] = {}
     for group in plan.used:
-        try:
+        with placed(str, said=f"in group '{group.name}': " if group.name else ""):
             _check_group(group, plan.counts[group.name], hashes)
-        except ConfigError as error:
-            if group.name:
-                raise ConfigError(
-                    f"in group '{group.name}': {error.problem}",
-                    where=error.where,
-                    value=error.value,
-                    accepted=error.accepted,
-                ) from None
-            raise
     return hashes
 
 

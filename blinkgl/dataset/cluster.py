@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from blinkgl.dataset.messages import Message
-from blinkgl.dataset.work import Job, Maker, Work, environment_differences, thread_environment
+from blinkgl.dataset.work import Job, Maker, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 from blinkgl.machine.extras import install
@@ -61,7 +61,7 @@ class RayCluster:
         self._board = None
         self._folder: str | None = None  # of our own cluster
 
-    def open(self, job: Work) -> list[Message]:
+    def open(self, job: Job) -> list[Message]:
         ray = self._ray
         if not ray.is_initialized():
             self._connect()

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Protocol
 
 from blinkgl.dataset.messages import RUN_FOLDER, Message
-from blinkgl.dataset.work import Maker, Work, maker_of, thread_environment
+from blinkgl.dataset.work import Job, Maker, maker_of, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 from blinkgl.machine.posix import fcntl
@@ -50,7 +50,7 @@ class Executor(Protocol):
     listener: Callable[[Message], None]
     """Called with progress that ``poll`` does not return (:class:`Inline`)."""
 
-    def open(self, job: Work) -> list[Message]: ...
+    def open(self, job: Job) -> list[Message]: ...
     def free(self) -> int: ...
     def submit(self, task: int, attempt: int) -> None: ...
     def poll(self, timeout_s: float) -> list[Message]: ...
@@ -66,7 +66,7 @@ class Inline:
         self._maker: Maker | None = None
         self._next: tuple[int, int] | None = None
 
-    def open(self, job: Work) -> list[Message]:
+    def open(self, job: Job) -> list[Message]:
         self._maker = maker_of(job.maker, job.to_dict(), None)
         return [self._maker.open()]
 
@@ -117,7 +117,7 @@ class Local:
         self._selector = selectors.DefaultSelector()
         self._bad_starts = 0
 
-    def open(self, job: Work) -> list[Message]:
+    def open(self, job: Job) -> list[Message]:
         self._job = job
         if self._devices is None:
             self._devices = several_cards(job)
@@ -277,7 +277,7 @@ class _Process:
         os.close(self.channel)
 
 
-def several_cards(job: Work) -> list[int] | None:
+def several_cards(job: Job) -> list[int] | None:
     """Return the machine's graphics cards as EGL devices, when there are several and the configuration does not choose
     one."""
     wanted = [group.template.check().gl for group in job.plan().used]

@@ -15,15 +15,15 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import PreviewConfig, SequenceConfig
 from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
-from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
+from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.exposure import decibels
 from blinkgl.io.frame_camera import ExposureLine
+from blinkgl.io.poses import POSES
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.machine.plugins import plugin_versions
 from blinkgl.sequence import (
-    CameraImage,
     EventChunk,
     GroundTruth,
     Item,
@@ -39,6 +39,9 @@ from blinkgl.sequence_files.rig_dir import sensors_yaml, write_lens
 from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter, refuse_existing
 from blinkgl.version import __version__
 
+LOSSES = "events_cut_by_max_events_per_step", "events_lost_in_readout", "events_late_in_readout"
+"""The manifest's counts of events that were made but are not in the file; see docs/formats.md."""
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Passes a sequence's items to the preview.
 
@@ -50,9 +53,9 @@ class PreviewRecorder:
     sequences : of one camera, or of those of a rig, shown one below the other by their names."""
 
     def __init__(self, config: PreviewConfig, sequences: Sequence[SensorSimulation], writer: SequenceWriter):
-        self._shown = {id(one): k for k, one in enumerate(one for one in sequences if one.pictures_hz is not None)}
+        shown = [one for one in sequences if one.pictures_hz is not None]
+        self._numbers = {one.name: number for number, one in enumerate(shown)}
         self._video: PreviewWriter | None = None
-        shown = [one for one in sequences if id(one) in self._shown]
         if not shown:
             return
         self._clock = shown[0].clock
@@ -74,7 +77,7 @@ class PreviewRecorder:
 
     def take(self, sequence: SensorSimulation, item: Item) -> None:
         """Add the items of a sequence, in order."""
-        if self._video is None or (number := self._shown.get(id(sequence))) is None:
+        if self._video is None or (number := self._numbers.get(sequence.name)) is None:
             return
         if isinstance(item, EventChunk):
             with sequence.clock("preview"):
@@ -195,14 +198,22 @@ def write_item(writer: SequenceWriter, sequence: SensorSimulation, item: Item) -
         elif isinstance(item, GroundTruth):
             _write_labels(writer, item)
         else:
-            writer.image(item.pictures, exposure_line(item))
+            line = ExposureLine(
+                item.start_ns / 1000,
+                item.end_ns / 1000,
+                item.exposure_ns / 1000,
+                item.row_ns / 1000,
+                decibels(item.gain),
+                item.instants,
+            )
+            writer.image(item.pictures, line)
 
 
 def write_end(writer: SequenceWriter, sequence: SensorSimulation) -> None:
     """Write what is known only at the end."""
     with sequence.clock("write"):
         if poses := sequence.poses():
-            writer.poses(**poses)
+            writer.arrays(POSES, **poses)
         if (camera := sequence.lens) is not None:
             write_lens(writer, camera)
         if (inertial := sequence.imu()) is not None:
@@ -220,18 +231,6 @@ def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
         writer.label(name, truth.k, value, truth.t_ns // 1000, None if to_ns is None else to_ns // 1000)
 
 
-def exposure_line(image: CameraImage) -> ExposureLine:
-    """Return an image's line in the list of exposures."""
-    return ExposureLine(
-        image.start_ns / 1000,
-        image.end_ns / 1000,
-        image.exposure_ns / 1000,
-        image.row_ns / 1000,
-        decibels(image.gain),
-        image.instants,
-    )
-
-
 def manifest_info(sequence: SensorSimulation) -> dict:
     """Return the manifest's entries about a camera's source; no clock times (same seed, same manifest)."""
     camera, opencv = sequence.camera, {} if sequence.config.frames is None else {"opencv": cv2.__version__}
@@ -241,7 +240,7 @@ def manifest_info(sequence: SensorSimulation) -> dict:
     return {
         **_made_by(sequence, {**opencv, **sequence.libraries}),
         **emulator,
-        **losses(*sequence.losses),
+        **dict(zip(LOSSES, sequence.losses, strict=True)),
         **({"events_by_cause": sequence.causes} if sequence.causes else {}),
         **sequence.facts(),
     }

@@ -58,15 +58,6 @@ class SequenceReport:
         self.total_s, self.compile_s = sequence.clock.total, sequence.clock.compile_s
 
 
-def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
-    """Return the manifest's counts of events that were made but are not in the file; see docs/formats.md."""
-    return {
-        "events_cut_by_max_events_per_step": saturated,
-        "events_lost_in_readout": dropped,
-        "events_late_in_readout": late,
-    }
-
-
 @dataclass
 class Totals:
     """The total cost of many sequences, in constant memory. ``first`` is the first that was added."""

@@ -129,23 +129,13 @@ def files_of_sequence(config: SequenceConfig, events: bool = True) -> Iterator[s
         yield from IMU_FILES
     if config.tracks is not None:
         yield TRACKS
-    if distorts(config):
+    if config.frames is None and config.camera.lens != "pinhole":  # a lens with distortion
         yield from LENS_FILES
     if config.images is not None:
-        yield from files_of(config.images, len(exposures_of(config)))
+        starts = exposure_starts(config.images, config.time.t0_ns, config.time.t1_ns, config.camera.height)
+        yield from files_of(config.images, len(starts))
     if config.preview.enabled:
         yield "preview.mp4"
-
-
-def distorts(config: SequenceConfig) -> bool:
-    """Return whether a lens has distortion, so that its files exist."""
-    return config.frames is None and config.camera.lens != "pinhole"
-
-
-def exposures_of(config: SequenceConfig) -> list[int]:
-    """Return the starts of the frame camera's exposures, ns; for a configuration with ``images``."""
-    assert config.images is not None
-    return exposure_starts(config.images, config.time.t0_ns, config.time.t1_ns, config.camera.height)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from functools import lru_cache, partial
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.run import RunTemplate
@@ -49,7 +49,8 @@ _NEWS_EVERY_S = 0.25
 
 @dataclass(frozen=True)
 class Job:
-    """A run, in plain data. ``recipe``: YAML text (it keeps what JSON would not, such as integer keys)."""
+    """A run, in plain data, as executors take it. ``out``: the folder of logs.   ``recipe``: YAML text (it keeps what
+    JSON would not, such as integer keys)."""
 
     out: str
     base: str
@@ -63,17 +64,6 @@ class Job:
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
-
-
-class Work(Protocol):
-    """The interface of jobs for executors: folder of logs, sequences, maker, plain data."""
-
-    maker: ClassVar[str]
-
-    @property
-    def out(self) -> str: ...
-    def plan(self) -> Plan: ...
-    def to_dict(self) -> dict[str, Any]: ...
 
 
 def maker_of(name: str, job: Mapping[str, Any], device: int | None) -> Maker:
@@ -98,7 +88,7 @@ def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.e
 class Maker:
     """Makes the job's sequences in this process. Use as a context manager; ``open`` before ``make``."""
 
-    def __init__(self, job: Work, device: int | None = None):
+    def __init__(self, job: Job, device: int | None = None):
         self.job, self.device = job, device
         self.plan = job.plan()
         self.gl: GLContext | None = None

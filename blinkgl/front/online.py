@@ -88,6 +88,7 @@ class OnlineSequences:
             "",
             "",
             "",
+            None,
             kind,
             check.whole(per_sequence, "per_sequence", 1, 1000),
             _window_us(window_ms),

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.base import Config, Refused
+from blinkgl.config.base import Config, placed
 from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, check_rigid, rigid_matrix
 from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
@@ -32,14 +32,14 @@ class Piece:
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
         """Return ``tree`` unchanged if the model accepts it. renamed : arguments of the model's keys
         that have other names; "": the keys' own names."""
-        try:
-            validate(model, tree)
-        except ConfigError as error:
-            first, *rest = (error.where or "config").split(".")
+
+        def called(where: str) -> str:
+            first, *rest = where.split(".")
             at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
-            raise ConfigError(
-                error.problem, where=".".join([type(self).__name__, *at]), value=error.value, accepted=error.accepted
-            ) from None
+            return ".".join([type(self).__name__, *at])
+
+        with placed(called):
+            validate(model, tree)
         return tree
 
     def __repr__(self) -> str:
@@ -95,10 +95,8 @@ class Pose(Piece):
         """Return the pose of T_world_body or T_world_cam, (4, 4): from the body's axes to the world's, z up; a camera's
         are x right, y down, z forward. Raises ConfigError: not rigid."""
         matrix = check.array(T, where, (4, 4), "an array (4, 4)")
-        try:
+        with placed(where):
             check_rigid(check.plain(matrix), where)
-        except Refused as error:
-            raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
         from scipy.spatial.transform import Rotation
 
         x, y, z, w = Rotation.from_matrix(rigid_matrix(matrix)[:3, :3]).as_quat()

@@ -18,7 +18,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, placed
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.rig import PlaceConfig, RigSensorConfig, spelled_out
@@ -113,11 +113,8 @@ class Rig(Piece):
         self.sensors = sensors
         # both keys: a rig replaces the one of a configuration
         self.tree = {"rig": check.plain(preset), "sensors": [one.tree for one in sensors]}
-        try:
+        with placed(lambda where: "Rig.preset" if where == "rig" else f"Rig.{where}"):
             spelled_out(self.tree, ())
-        except ConfigError as error:
-            where = "Rig.preset" if error.where == "rig" else f"Rig.{error.where}"
-            raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
 
     def __repr__(self) -> str:
         return f"<Rig of {', '.join([*([self.tree['rig']] if self.tree['rig'] else []), *self.names])}>"
@@ -126,8 +123,3 @@ class Rig(Piece):
     def names(self) -> tuple[str, ...]:
         """Return the names of ``sensors``; a preset has further ones."""
         return tuple(one.tree["name"] for one in self.sensors)
-
-
-def rig_of(given: Rig | str) -> Rig:
-    """Return a rig, or that of a preset's name. Raises ConfigError."""
-    return Rig(preset=given) if isinstance(given, str) else check.one_of(given, "rig", Rig, "a Rig, or a preset's name")

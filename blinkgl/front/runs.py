@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
+from blinkgl.config.base import placed
 from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
 from blinkgl.config.problems import validate_field
@@ -15,7 +16,7 @@ from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
-from blinkgl.front.rigs import Rig, rig_of
+from blinkgl.front.rigs import Rig
 from blinkgl.front.scenes import Scene
 from blinkgl.front.sections import SECTIONS, Section, sections
 from blinkgl.scene.types import Scene as SceneData
@@ -39,11 +40,8 @@ class Timeline:
     @check.public()
     def __init__(self, kind: str = "displacement", **values: Any):
         self.tree = {"kind": check.plain(kind), **check.plain(values)}
-        try:
+        with placed(lambda where: where.replace("timeline", "Timeline", 1)):
             validate_field(SequenceConfig, "timeline", self.tree)
-        except ConfigError as error:
-            where = (error.where or "timeline").replace("timeline", "Timeline", 1)
-            raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
 
     def __repr__(self) -> str:
         return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
@@ -136,7 +134,8 @@ def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[
     template = source.template() if isinstance(source, Scene) else source
     own = sections(_READERS, settings)
     if rig is not None:
-        own |= rig_of(rig).tree
+        named = Rig(preset=rig) if isinstance(rig, str) else rig
+        own |= check.one_of(named, "rig", Rig, "a Rig, or a preset's name").tree
     own = expanded(own, Path.cwd())
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])

@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from blinkgl.config.base import placed
 from blinkgl.config.camera import CameraConfig, calibrated
 from blinkgl.config.deform import AnimationConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
@@ -288,10 +289,8 @@ def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> 
         )
     t = None if uvs is None else check.array(uvs, "Mesh.uvs", (len(v), 2), f"an array ({len(v)}, 2)").astype(np.float32)
     digest = content_hash(v.tobytes(), f.astype(np.int64).tobytes(), b"" if t is None else t.tobytes())
-    try:
+    with placed("Mesh.vertices", of=(AssetError,)):
         return make_mesh(v, f, uvs=t, name="mesh", source_hash=digest, where="Mesh")
-    except AssetError as error:
-        raise ConfigError(error.problem, where="Mesh.vertices", value=error.value, accepted=error.accepted) from None
 
 
 class Scene(Piece):

@@ -19,7 +19,7 @@ from blinkgl.errors import GLError
 if TYPE_CHECKING:
     from blinkgl.gl.context import GLContext
 
-_READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x2600
+_READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _DEPTH_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x0100, 0x2600
 _COLOR_ATTACHMENT0 = 0x8CE0
 _TEXTURE_2D, _RENDERBUFFER, _TEXTURE0 = 0x0DE1, 0x8D41, 0x84C0
 _DEPTH_COMPONENT, _DEPTH_COMPONENT32F, _FLOAT = 0x1902, 0x8CAC, 0x1406
@@ -172,14 +172,15 @@ class Target:
         if self.depth is not None:
             yield partial(self._clear_float, _DEPTH, 0, ctypes.byref(ctypes.c_float(depth)))
 
-    def copy_into(self, other: Target) -> None:
-        """Copy the first attachment into that of ``other``, a target of the same size and formats; honours the
-        scissor."""
+    def copy_into(self, other: Target, edges: tuple[int, int, int, int] | None = None, *, depth: bool = False) -> None:
+        """Copy the first attachment, if there is one, into that of ``other``, a target of the same size and formats;
+        honours the scissor.   edges : x0, y0, x1, y1 px of the part; None: all.   depth : the depth, too."""
         self._bind(_READ_FRAMEBUFFER, self.fbo.glo)
-        self._read_buffer(_COLOR_ATTACHMENT0)  # reading another attachment, such as the depth, has changed it
+        if self.formats:
+            self._read_buffer(_COLOR_ATTACHMENT0)  # reading another attachment, such as the depth, has changed it
         self._bind(_DRAW_FRAMEBUFFER, other.fbo.glo)
-        edges = (0, 0, self.width, self.height)
-        self._blit(*edges, *edges, _COLOR_BIT, _NEAREST)
+        edges = edges or (0, 0, self.width, self.height)
+        self._blit(*edges, *edges, _COLOR_BIT * bool(self.formats) | _DEPTH_BIT * depth, _NEAREST)
         other.fbo.use()
 
     def read(

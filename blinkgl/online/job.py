@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from blinkgl.config.reader import parse_yaml
 from blinkgl.config.run import Group, RunTemplate, derived_seed
 from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.work import Job
 from blinkgl.errors import ConfigError
 
 MIX = 8
@@ -17,7 +18,7 @@ MIX = 8
 
 
 @dataclass(frozen=True)
-class StreamJob:
+class StreamJob(Job):
     """What a stream renders.
 
     recipe : YAML text, its seed already the stream's (:func:`stream_seed`).   base : folder that its paths start from.
@@ -28,9 +29,6 @@ class StreamJob:
     its mean flow.   split : which groups.   seed : of windows and their order.   out : the spool folder.
     rank, world : this process has every ``world``-th block of the stream, from block ``rank`` on."""
 
-    out: str
-    base: str
-    recipe: str
     kind: str = "windows"
     samples: int = 8
     window_us: tuple[int, int] | None = None
@@ -56,9 +54,6 @@ class StreamJob:
         """Return the number in the whole stream of a slot of this process."""
         block, place = divmod(slot, MIX)
         return self.block_of_all(block) * MIX + place
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @lru_cache(maxsize=8)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -65,10 +64,6 @@ class Canvas(Memory):
 # cover, now or in the previous frame, are restored from it, the moving objects are drawn over them under a scissor, and
 # only those rectangles are read back. Every pixel gets the value of a full redraw.
 
-# OpenGL's enums: GL_READ_FRAMEBUFFER, GL_DRAW_FRAMEBUFFER; depth and colour bits; GL_NEAREST.
-_READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
-_DEPTH, _COLOUR_AND_DEPTH, _NEAREST = 0x0100, 0x4000 | 0x0100, 0x2600
-
 
 def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
     """Return the pixels that the item can touch, from its bounding box; None when it is outside the image."""
@@ -118,16 +113,8 @@ class StillCanvas(Canvas):
 
     def _restore(self, rectangle: Rectangle) -> None:
         """Copy the static picture's colour and depth into the target, inside the rectangle (px of the targets)."""
-        gl = self.painter.gl
-        if not hasattr(self, "_bind"):
-            self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
-            self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
-        self._bind(_READ_FRAMEBUFFER, self._picture.fbo.glo)
-        self._bind(_DRAW_FRAMEBUFFER, self.target.fbo.glo)
-        # A pass without colour outputs has only a depth buffer.
         edges = (rectangle.x0, rectangle.y0, rectangle.x1, rectangle.y1)
-        self._blit(*edges, *edges, _COLOUR_AND_DEPTH if self.outputs else _DEPTH, _NEAREST)
-        self.target.fbo.use()
+        self._picture.copy_into(self.target, edges, depth=True)
 
     def release(self) -> None:
         if self._picture is not None:

@@ -6,13 +6,11 @@ names, is :class:`blinkgl.config.sensor.SensorConfig`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from blinkgl.camera import CameraModel
-from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath, SharedOriginPath
 from blinkgl.scene.motion.pose_path import PosePath
 
@@ -52,13 +50,3 @@ class Rig:
         """Return T_world_sky over time, of the first sensor's sky: at infinity directions do not depend on the camera's
         position, as in a box that is always around it."""
         return SharedOriginPath(self.path_of(self.sensors[0]))
-
-    def with_first(self, **changes: Any) -> Rig:
-        """Return the rig with other values in the first sensor."""
-        return replace(self, sensors=(replace(self.sensors[0], **changes), *self.sensors[1:]))
-
-    def seen_by(self, number: int) -> Rig:
-        """Return the rig with only its sensor of this number. Raises ConfigError where there is none."""
-        if not 0 <= number < len(self.sensors):
-            raise ConfigError("no such sensor", where="seen_by", value=number, accepted=f"0 to {len(self.sensors) - 1}")
-        return replace(self, sensors=(self.sensors[number],))

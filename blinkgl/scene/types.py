@@ -20,6 +20,7 @@ import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.config.lights import LightConfig
+from blinkgl.errors import ConfigError
 
 if TYPE_CHECKING:
     from blinkgl.config.deform import DeformConfig
@@ -450,9 +451,12 @@ class Scene:
 
     def with_camera(self, camera: CameraModel) -> Scene:
         """Return the scene seen by another camera from the same place."""
-        return replace(self, rig=self.rig.with_first(camera=camera))
+        first, *others = self.sensors
+        return replace(self, rig=replace(self.rig, sensors=(replace(first, camera=camera), *others)))
 
     def seen_by(self, number: int) -> Scene:
         """Return the scene as the rig's sensor of this number sees it, with only that one. Raises ConfigError where
         there is none."""
-        return replace(self, rig=self.rig.seen_by(number))
+        if not 0 <= number < len(self.sensors):
+            raise ConfigError("no such sensor", where="seen_by", value=number, accepted=f"0 to {len(self.sensors) - 1}")
+        return replace(self, rig=replace(self.rig, sensors=(self.sensors[number],)))

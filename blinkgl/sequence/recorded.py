@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.base import Refused
+from blinkgl.config.base import placed
 from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
@@ -111,10 +111,8 @@ def used_images(config: FramesConfig, folder: Path) -> list[Path]:
             value=len(files),
             accepted=f"at least {config.count or 3}",
         )
-    try:
+    with placed("frames.fps"):
         check_span(len(files), config.fps)
-    except Refused as error:
-        raise ConfigError(error.problem, where="frames.fps", value=error.value, accepted=error.accepted) from None
     return files
 
 

@@ -23,7 +23,7 @@ from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks, track_points
 from blinkgl.rng import Role, generator, kernel_seed
-from blinkgl.scene.types import Dynamics, Scene, SceneObject
+from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.request import GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.sensor import SensorSimulation
@@ -222,7 +222,15 @@ class RenderedSequence(SensorSimulation):
         return facts
 
     def facts(self) -> dict[str, Any]:
-        gl, scene = self.renderer.gl, self.renderer.scene
+        gl, scene, physics = self.renderer.gl, self.renderer.scene, {}
+        if (falling := scene.dynamics) is not None:
+            physics["dynamics"] = {
+                "engine": falling.engine,
+                "bodies": falling.bodies,
+                "steps": falling.steps,
+                "impacts": len(falling.impacts_ns),
+                "paths_sha256": falling.digest,
+            }
         return {
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
             "timeline": {"kind": self.config.timeline.kind},
@@ -231,7 +239,7 @@ class RenderedSequence(SensorSimulation):
             **self._facts_of_labels(),
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
-            **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),
+            **physics,
             **({} if self.frame_camera is None else {"frame_camera": self.frame_camera.facts()}),
         }
 
@@ -259,16 +267,6 @@ def _described(one: SceneObject) -> dict[str, Any]:
             }
             for part in one.parts
         ],
-    }
-
-
-def _facts_of(dynamics: Dynamics) -> dict[str, Any]:
-    return {
-        "engine": dynamics.engine,
-        "bodies": dynamics.bodies,
-        "steps": dynamics.steps,
-        "impacts": len(dynamics.impacts_ns),
-        "paths_sha256": dynamics.digest,
     }
 
 

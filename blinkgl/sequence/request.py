@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -124,7 +125,7 @@ class StageClock:
     def __init__(self) -> None:
         self.started = working_clock()
         self._compiled = compiled_s()
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -132,10 +133,7 @@ class StageClock:
         try:
             yield
         finally:
-            self.add(stage, working_clock() - begin)
-
-    def add(self, stage: str, seconds: float) -> None:
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+            self.seconds[stage] += working_clock() - begin
 
     @property
     def total(self) -> float:

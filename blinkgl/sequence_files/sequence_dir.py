@@ -201,10 +201,6 @@ class SequenceWriter:
         for form in label.forms[:1] if self.labels is None else label.written(self.labels):
             self._write(form.file(index), partial(self._encoded, label, form, value))
 
-    def poses(self, **arrays: np.ndarray) -> None:
-        """Write ``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
-        self.arrays("poses.npz", **arrays)
-
     def arrays(self, name: str, **arrays: np.ndarray) -> None:
         """Write named numeric arrays as ``name``, an .npz file."""
         arrays = {k: np.array(v) for k, v in arrays.items()}
@@ -461,12 +457,9 @@ def manifest_problems(folder: str | os.PathLike) -> list[str]:
 
 def digest_of(path: Path) -> dict[str, Any]:
     """Return a file's line in a manifest."""
-    digest, size = hashlib.sha256(), 0
     with open(open_regular(path), "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-            size += len(block)
-    return {"bytes": size, "sha256": digest.hexdigest()}
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return {"bytes": file.tell(), "sha256": digest}
 
 
 def _plain(value: Any) -> Any:

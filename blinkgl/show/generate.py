@@ -249,22 +249,29 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
         title_justify="left",
         show_header=False,
     )
-    table.add_row("event frames", f"{s['frames']:,}")
-    table.add_row("events", f"{s['events'] / 1e6:.2f} M")
-    if made.causes:
-        table.add_row("by cause", causes_line(made.causes, made.simulated_s).removeprefix("by cause: "))
-    table.add_row("labels", f"{s['labels']:,}")
-    if elapsed_s is not None and len(made) > 1:
-        table.add_row("elapsed", f"{elapsed_s:.1f} s  ({s['total_s'] / elapsed_s:.2f} sequences at a time)")
-    table.add_row("wall time of all sequences" if len(made) > 1 else "wall time", f"{s['total_s']:.1f} s")
-    table.add_row("per simulated second", f"{s['seconds_per_simulated_second']:.2f} s")
-    table.add_row("rate", f"{s['events_per_second'] / 1e6:.2f} M events/s")
-    table.add_section()
-    for name in (*STAGES, "other"):
-        seconds = s[f"{name}_s"]
-        if name == "images" and not seconds:  # no images requested
-            continue
-        table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
+    several = len(made) > 1
+    counts = {
+        "event frames": f"{s['frames']:,}",
+        "events": f"{s['events'] / 1e6:.2f} M",
+        "by cause": causes_line(made.causes, made.simulated_s).removeprefix("by cause: ") if made.causes else None,
+        "labels": f"{s['labels']:,}",
+        "elapsed": f"{elapsed_s:.1f} s  ({s['total_s'] / elapsed_s:.2f} sequences at a time)"
+        if elapsed_s is not None and several
+        else None,
+        "wall time of all sequences" if several else "wall time": f"{s['total_s']:.1f} s",
+        "per simulated second": f"{s['seconds_per_simulated_second']:.2f} s",
+        "rate": f"{s['events_per_second'] / 1e6:.2f} M events/s",
+    }
+    stages = {
+        name: f"{s[f'{name}_s']:.2f} s  {100 * s[f'{name}_s'] / s['total_s']:4.0f} %"
+        for name in (*STAGES, "other")
+        if name != "images" or s["images_s"]  # else no images were requested
+    }
+    for part in (counts, stages):
+        for name, said in part.items():
+            if said is not None:
+                table.add_row(name, said)
+        table.add_section()
     console.print(table)
     folder = first.path
     say(console, f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}")

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from blinkgl.config.base import placed
 from blinkgl.config.run import load_run
-from blinkgl.errors import ConfigError
 from blinkgl.machine.closing import Closing
 from blinkgl.online.job import MIX, StreamJob, stream_seed
 from blinkgl.online.stream import SampleStream
@@ -65,13 +65,10 @@ def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int 
         split=split,
         seed=seed,
     )
-    try:
+    with placed(lambda where: f"{s.recipe}: {where}" if where else s.recipe):
         return OnlineSource(
             SampleStream.of(template, job, workers=s.workers, first=first, ahead=1 + batch // (MIX * s.samples))
         )
-    except ConfigError as error:
-        where = f"{s.recipe}: {error.where}" if error.where else s.recipe
-        raise ConfigError(error.problem, where=where, value=error.value, accepted=error.accepted) from None
 
 
 class Held:

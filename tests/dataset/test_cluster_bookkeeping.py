@@ -193,10 +193,11 @@ class Worker:
     ],
 )
 def test_a_worker_looks_before_its_first_task(monkeypatch, environment, assets, said):
-    opened, job, board = [], {"out": "o"}, SimpleNamespace(put=SimpleNamespace(remote="tell"))
-    worker = Worker(job, environment, assets)
+    # A job, and the plug-ins that it needs.
+    opened, job, board = [], ({"out": "o"}, []), SimpleNamespace(put=SimpleNamespace(remote="tell"))
+    worker = Worker(job[0], environment, assets)
 
-    def open_(asked):
+    def open_(*asked):
         opened.append(asked)
         monkeypatch.setattr(module, "_maker", worker)
         return worker, worker.hello
@@ -211,14 +212,14 @@ def test_a_worker_looks_before_its_first_task(monkeypatch, environment, assets, 
     module._work(job, 4, 2, expected, board)
     assert message == {"kind": "done", "task": 3} and worker.made == [(3, 1, "tell"), (4, 2, "tell")]
     assert opened == [job], "once for a job"
-    module._work({"out": "another"}, 5, 1, expected, board)
+    module._work(({"out": "another"}, []), 5, 1, expected, board)
     assert len(opened) == 2
 
-    def refuses(asked):
+    def refuses(*asked):
         raise BlinkGLError("no OpenGL")
 
     monkeypatch.setattr(module, "_open", refuses)
-    for message in (module._work({"out": "third"}, 5, 1, expected, board), module._hello(job)):
+    for message in (module._work(({"out": "third"}, []), 5, 1, expected, board), module._hello(job)):
         assert message == {"kind": "refused", "error": "no OpenGL"}
 
 

@@ -37,7 +37,7 @@ def fill(writer: SequenceWriter, labels: int = 3, reuse: bool = True) -> None:
         writer.label("velocity", i, flow * 10, t)
         writer.label("normals", i, buffer, t)
         writer.label("ids", i, np.full((H, W), i), t)
-    writer.poses(T_world_cam=np.eye(4)[None], times_ns=np.arange(3))
+    writer.arrays("poses.npz", T_world_cam=np.eye(4)[None], times_ns=np.arange(3))
     writer.info["seed"] = np.int64(0)
     writer.t_end_us = 100_000 * labels
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
+from blinkgl.config.base import placed
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.materials import MaterialConfig
 from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig, rigid_matrix
@@ -283,18 +284,9 @@ def check_primitive(kind: str, parameters: Mapping[str, Any], name: str) -> None
         (BUILDERS[kind].checked if PRIMITIVES[kind].use == "living" else BUILDERS[kind])(**parameters)
 
 
-@contextmanager
-def _parameters_of(name: str) -> Iterator[None]:
-    try:
-        yield
-    except AssetError as error:
-        key = (error.where or "").partition(".")[2]
-        raise ConfigError(
-            error.problem,
-            where=f"scene.meshes.{name}.parameters" + (f".{key}" if key else ""),
-            value=error.value,
-            accepted=error.accepted,
-        ) from None
+def _parameters_of(name: str) -> AbstractContextManager[None]:
+    at = f"scene.meshes.{name}.parameters"
+    return placed(lambda where: ".".join(filter(None, (at, where.partition(".")[2]))), of=(AssetError,))
 
 
 def _asset(

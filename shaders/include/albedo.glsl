@@ -50,8 +50,8 @@ ALBEDO albedo_at(vec2 uv)
     float level = 0.5 * log2(max(mix(4.0 * along, max(along, 16.0 * across), row), 1e-30));
 #define TAP(at) textureLod(albedo, at, level).CHANNELS
 #else
-    // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
-    // texture.
+    // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples
+    // of the texture.
 #define TAP(at) texture(albedo, at, -1.0).CHANNELS
 #endif
     return 0.25 * (TAP(uv - right - down) + TAP(uv + right - down) + TAP(uv - right + down) + TAP(uv + right + down));

@@ -3,17 +3,14 @@
 #define ALBEDO vec3
 #define CHANNELS rgb
 #define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // weights of the luminance, Rec. 709
+#define TINT(colour) colour
 #else
 #define ALBEDO float
 #define CHANNELS r
 #define WEIGHTS 1.0
-#endif
-#ifdef TINTED
-#ifdef RGB
-#define TINT(colour) colour
-#else
-uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface
 #define TINT(colour) dot(colour, tint_shares)
+#ifdef TINTED
+uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface
 #endif
 #endif
 #ifdef EVERY

@@ -1,7 +1,7 @@
 #version 430 core
-// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture
-// whose pixels are image_scale px of the image apart; velocity is still the image's. LENS: it is that of a lens's
-// picture.
+// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small
+// picture whose pixels are image_scale px of the image apart; velocity is still the image's. LENS: it is that
+// of a lens's picture.
 
 #define NEEDS_LOCAL
 #define NEEDS_RATE

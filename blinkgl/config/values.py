@@ -92,8 +92,8 @@ Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
 Vector3 = tuple[float, float, float]
 
 
-# At 1e9 units float64 still resolves 1e-7 units; a larger value has the wrong unit, and would overflow float32
-# matrices.
+# At 1e9 units float64 still resolves 1e-7 units; a larger value has the wrong unit, and would
+# overflow float32 matrices.
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 

@@ -122,8 +122,8 @@ class Local:
         if self._devices is None:
             self._devices = several_cards(job)
         cores = self._cores or len(os.sched_getaffinity(0))
-        # numba and OpenGL read these once, when they are loaded, so they must be in a worker's environment from its
-        # start.
+        # numba and OpenGL read these once, when they are loaded, so they must be in a worker's environment
+        # from its start.
         self._environment = {**os.environ, **thread_environment(self._wanted, cores)}
         for slot in range(self._wanted):
             self._start(slot)

@@ -150,8 +150,8 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
                 if alive:
                     p.last_ns[i] = v.base_us * 1000 + after_ns
             if alive:
-                # ``packed`` has room for ``cap`` events of each listed pixel; further ones are counted
-                # only.
+                # ``packed`` has room for ``cap`` events of each listed pixel; further ones
+                # are counted only.
                 if emitted < cap:
                     packed[out] = (np.int64(np.uint64(after_ns) // _U1000) << T_SHIFT) | pixel
                     out += 1
@@ -177,8 +177,8 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
 @kernel(error_model="numpy")
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
-    # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active`` has eight
-    # more.
+    # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active``
+    # has eight more.
     cut, pixels = 0, p.log.size
     flags, scratch = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
     active, now = np.empty(BLOCK + 8, np.int32), np.empty(BLOCK, np.int32)

@@ -271,8 +271,8 @@ def compact_flags(flags: np.ndarray, scratch: np.ndarray, first_pixel: int, out:
         # Byte b of the (little-endian) word lands on bit b of the top byte.
         mask = np.int64((words[k] * _BYTES_TO_BITS) >> _S56)
         base = np.int32(first_pixel + 8 * k)
-        # All eight places are written; only the set ones are counted, and the next word writes over the
-        # rest.
+        # All eight places are written; only the set ones are counted, and the next word writes
+        # over the rest.
         for b in range(8):
             out[count + b] = np.int32(base + _BIT_POSITIONS[mask, b])
         count += _BIT_COUNTS[mask]

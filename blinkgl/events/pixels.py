@@ -17,8 +17,8 @@ from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import OPTIONAL, Cause, Events
 
-# Events drawn at once; the highest rate, one event per microsecond; the longest time before the
-# recording.
+# Events drawn at once; the highest rate, one event per microsecond; the longest time
+# before the recording.
 _BATCH, _MOST_HZ, _LONGEST_BEFORE_S = 1024, 1e6, 5.0
 _DEFECT, _OWN = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE)
 
@@ -55,8 +55,8 @@ class PixelNoise:
         decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
         rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
         self.rates = np.where(self.dead, 0.0, rates)
-        # Running sums, in which a uniform finds its pixel. Answers are added to the drawn events, which are reduced
-        # accordingly.
+        # Running sums, in which a uniform finds its pixel. Answers are added to the drawn events, which
+        # are reduced accordingly.
         self._sums = np.cumsum(self.rates / (1.0 + np.where(self.hot, 0.0, config.answered)))
         # The odds of ON against OFF are log-normal over the hot pixels.
         off = (1.0 - config.hot_on_share) * exp_f64(-config.hot_on_spread * prefers)

@@ -61,8 +61,8 @@ from blinkgl.types.events import Events
 _F = np.float32
 # Typed: a float literal is float64 to numba and would widen the loops.
 _ZERO = _F(0)
-# Pixels in their dead time have infinite levels and lie infinitely far beyond them: the distance is cut
-# here.
+# Pixels in their dead time have infinite levels and lie infinitely far beyond them: the
+# distance is cut here.
 _FARTHEST = _F(1e6)
 
 

@@ -145,9 +145,9 @@ def shot_block(
     table = p.shot_table[block]
     whole = np.float64(table[table.size - 1])
     t_ns, index = p.clock_ns[block], p.clock_index[block]
-    # A Poisson process of candidates for the whole block, at the rate of dark pixels, thinned below to the rate at
-    # their intensities (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock per block instead of one per
-    # pixel.
+    # A Poisson process of candidates for the whole block, at the rate of dark pixels, thinned below to the rate
+    # at their intensities (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock per block instead
+    # of one per pixel.
     rate = v.shot_unit_per_ns * whole
     gaps, picks, accepts = draws
     # The expected number of candidates and two standard deviations more.
@@ -171,8 +171,8 @@ def shot_block(
         offset, on = place & (BLOCK - 1), place < BLOCK
         if offset < pixels_in_block:
             i = first + offset
-            # Time after the interval's start and the intensity there, on the straight line between the
-            # frames.
+            # Time after the interval's start and the intensity there, on the straight line
+            # between the frames.
             after = max(t_ns - v.t0_ns, 0)
             intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
             # Thinning: the candidate's rate is that of the dark, DARKEST.

@@ -21,8 +21,8 @@ _F = np.float32
 # _SLOPE is that of the chord from (0, 0) to (20, ln 20).
 _ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
 _SHOT, _U2, _SMALLEST_K = np.uint64(Stream.SHOT), np.uint64(2), _F(1e-6)
-# Place in the table of noise sizes: ln k of its first entry, entries per unit of ln k, the last but one
-# entry.
+# Place in the table of noise sizes: ln k of its first entry, entries per unit of ln k, the last
+# but one entry.
 _TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
 DARK, SETTLED = _F(2.0**-60), _F(2.0**-90)
 """DN below which there is no light, and ln units below which a lag is over. They avoid subnormal numbers, which take a

@@ -127,8 +127,8 @@ def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
         v_end[i] = end
         unspent_end[i] = variance
         flags[i] = np.uint8(near_threshold(v[i], end, variance, here))
-        # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of the diffusion
-        # alone.
+        # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of
+        # the diffusion alone.
         mean_events = _F(abs(drift) + here)
         # Floats >= 0 are ordered as their bits; this loop vectorises.
         most = max(most, mean_events.view(np.int32))

@@ -57,8 +57,8 @@ def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool
     above, below = _ONE - _F(high) * _V_UNIT, _ONE + _F(low) * _V_UNIT
     # room is negative where the mean path crosses a threshold.
     room = select(above < below, above, below)
-    # room |room| <= 6.5^2 variance is room <= 6.5 sigma without a root, and holds for negative room as
-    # well.
+    # room |room| <= 6.5^2 variance is room <= 6.5 sigma without a root, and holds for negative
+    # room as well.
     return (room * abs(room) <= _FAR_SQUARED * variance) | (variance > MOST_STEPS * here)
 
 

@@ -112,8 +112,8 @@ class Search:
             return
         self.target.beside(self._sums(keys, start), floor="expected")
         best = self._descend(keys, start)
-        # First as if the model were exact, with only chance errors; then with the errors that the model turns out to
-        # have.
+        # First as if the model were exact, with only chance errors; then with the errors that the model turns
+        # out to have.
         for floor in ("lowest", "seen"):
             self.target.beside(self._sums(keys, best[1]), floor=floor)
             best = self._descend(keys, best[1])

@@ -263,8 +263,8 @@ def _shear(d):
 @kernel(error_model="numpy")
 def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
     """Return (s, u, v, w, front): ray parameter and barycentrics of corners 0, 1, 2; s = inf for a miss."""
-    # Corners relative to the ray's origin, sheared so that the ray runs along z (Woop et al., section
-    # 3.2).
+    # Corners relative to the ray's origin, sheared so that the ray runs along z (Woop et
+    # al., section 3.2).
     az, bz, cz = tri[0, kz] - o[kz], tri[1, kz] - o[kz], tri[2, kz] - o[kz]
     ax, ay = tri[0, kx] - o[kx] - sx * az, tri[0, ky] - o[ky] - sy * az
     bx, by = tri[1, kx] - o[kx] - sx * bz, tri[1, ky] - o[ky] - sy * bz

@@ -101,8 +101,8 @@ class Renderer:
         # Useful when something besides the camera stands still; a scene of only moving objects is drawn completely.
         some_stand = any(o.is_static for o in scene.objects)
         lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
-        # The maps of the rig's first camera, not equal ones: a sun's path has no equality, so maps are identified by
-        # it.
+        # The maps of the rig's first camera, not equal ones: a sun's path has no equality, so maps are
+        # identified by it.
         self._shadows: tuple[ShadowMap, ...] = ()
         if scene.light.shadows != "off":
             self._shadows = shadow_maps(scene, self.items) if beside is None else beside._shadows  # noqa: SLF001

@@ -168,8 +168,8 @@ class TensorEsim(Batch):
     def _advance(self, flat: Tensor, interval: Interval) -> TensorEvents:
         extremes = self._look(flat)
         firing, counts, sizes = self._sized(flat, extremes)
-        # Caps are only computed where some block could exceed its share: they cost a pass over all
-        # pixels.
+        # Caps are only computed where some block could exceed its share: they cost a pass
+        # over all pixels.
         cap = self._caps(interval, firing) if self._may_cut(interval, sizes.farthest) else None
         # From here on the state changes.
         self._log, self._now = self._now, self._log

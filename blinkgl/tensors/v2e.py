@@ -352,8 +352,8 @@ class TensorV2e(Batch):
         """Return the rows of the pixels to process, without those that stay in their dead time, and their times."""
         if self._has.refractory_ns:
             end_ns = torch.from_numpy(v.end_ns).to(self.device)[self._env_of(flat)]
-            # A level of -inf marks the dead time; of those only the pixels that are released now take
-            # part.
+            # A level of -inf marks the dead time; of those only the pixels that are released
+            # now take part.
             asleep = self._upper[flat] == -_INF
             flat = flat[~asleep | (self._release[flat] <= end_ns)]
         env = self._env_of(flat)

@@ -279,8 +279,8 @@ def waves(
             r["since"] = torch.where(new, r["now"], r["since"])
             r["noise_then"] = torch.where(new, r["noise"] + r["shift"] * r["s"], r["noise_then"])
         put_back(r, v)
-        # Another event follows if the end of the curve is beyond a level, or shot noise of the pixel is
-        # left.
+        # Another event follows if the end of the curve is beyond a level, or shot noise of the
+        # pixel is left.
         passed = (r["end"] >= r["up"]) | (r["end"] <= r["down"])
         if shots is not None:
             passed = passed | (r["shot"] != len(shots.flat))

@@ -3,17 +3,14 @@
 #define ALBEDO vec3
 #define CHANNELS rgb
 #define WEIGHTS vec3(0.2126, 0.7152, 0.0722) // weights of the luminance, Rec. 709
+#define TINT(colour) colour
 #else
 #define ALBEDO float
 #define CHANNELS r
 #define WEIGHTS 1.0
-#endif
-#ifdef TINTED
-#ifdef RGB
-#define TINT(colour) colour
-#else
-uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface
 #define TINT(colour) dot(colour, tint_shares)
+#ifdef TINTED
+uniform vec3 tint_shares; // shares of r, g and b in the luminance of a tinted surface
 #endif
 #endif
 #ifdef EVERY
@@ -50,8 +47,8 @@ ALBEDO albedo_at(vec2 uv)
     float level = 0.5 * log2(max(mix(4.0 * along, max(along, 16.0 * across), row), 1e-30));
 #define TAP(at) textureLod(albedo, at, level).CHANNELS
 #else
-    // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
-    // texture.
+    // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples
+    // of the texture.
 #define TAP(at) texture(albedo, at, -1.0).CHANNELS
 #endif
     return 0.25 * (TAP(uv - right - down) + TAP(uv + right - down) + TAP(uv - right + down) + TAP(uv + right + down));

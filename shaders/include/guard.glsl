@@ -18,8 +18,8 @@ void drop_artefact()
 {
 #ifndef LENS_CLAIMS
     float W = gl_FragCoord.w; // 1/Z: the projection's w is the depth along the optical axis
-    // Below the smallest, the unsigned difference wraps round and is large, too: one comparison for both ends and for
-    // NaN.
+    // Below the smallest, the unsigned difference wraps round and is large, too: one comparison for both ends
+    // and for NaN.
     if (floatBitsToUint(W) - inverse_depths.x > inverse_depths.y || fwidth(W) > STEEPEST * W)
         discard;
 #endif

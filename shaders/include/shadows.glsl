@@ -75,8 +75,8 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
     // llvmpipe executes both sides of an if, and a loop of known length; this one ends with the last pixel.
     int taps = count > 0.0 ? TAPS : 0;
     float blocker = sum / max(count, 1.0);
-    // The penumbra's width: the sun's angle times the distance to the blocker, or by similar triangles from the lamp's
-    // width.
+    // The penumbra's width: the sun's angle times the distance to the blocker, or by similar triangles from
+    // the lamp's width.
     float width = sun ? scale.w * (blocker - at.z) / scale.z : scale.w * max(blocker / at.z - 1.0, 0.0);
     vec2 radius = clamp(0.5 * width / texel, 0.5, WIDEST) * one;
     float lit = 0.0;

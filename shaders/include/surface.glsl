@@ -114,8 +114,8 @@ ILLUMINANT shone(ILLUMINANT base, vec3 normal, vec3 at, vec2 coordinates)
     ILLUMINANT second = mirrored(normalize(mix(up, away, look.b)), look.a);
     sum += mix(second, first, part.a) * mix(ILLUMINANT(even_clear), even_metal, metallic);
 #if defined(SUNS) || defined(LAMPS)
-    // Lamps: D V F of GGX with Smith's height-correlated visibility and Schlick's Fresnel term; pi is in the
-    // strength.
+    // Lamps: D V F of GGX with Smith's height-correlated visibility and Schlick's Fresnel term; pi is
+    // in the strength.
     float seen = sqrt(facing_eye * facing_eye * (1.0 - square) + square);
 #define LOBE(beam, share) \
     float facing = dot(n, beam.towards); \

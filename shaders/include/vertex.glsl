@@ -33,8 +33,8 @@
 #endif
 #endif
 
-// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind. LIGHT_SEEN: the visible
-// side's.
+// LIT_AT_CORNERS (needs.glsl): flat in light_here, of the facet; TWO_SIDED: light_behind. LIGHT_SEEN:
+// the visible side's.
 #ifdef LIT_AT_CORNERS
 #ifdef RGB
 #define LIGHT_HERE vec3

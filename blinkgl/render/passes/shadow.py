@@ -109,8 +109,8 @@ class Shaded(ScenePass):
         for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
             if name in uniforms:
                 texture = shot.inputs[name].texture(DEPTH_BUFFER)
-                # The sampler compares, filtered over four texels: 1 where the surface is at least as near as the map's
-                # depth.
+                # The sampler compares, filtered over four texels: 1 where the surface is at least as near as
+                # the map's depth.
                 if not map_.soft and texture.compare_func != ">=":
                     texture.compare_func, texture.filter = ">=", (LINEAR, LINEAR)
                 texture.use(unit)

@@ -118,8 +118,8 @@ class Clip:
         self._values = np.zeros((len(self._times), 3, 4))
         for track, first in zip(moving, self._first):
             values = np.asarray(track.values, np.float64)
-            # One layout for all kinds: in-tangent, value, out-tangent; the tangents of straight lines are unused
-            # zeros.
+            # One layout for all kinds: in-tangent, value, out-tangent; the tangents of straight lines
+            # are unused zeros.
             values = values if values.ndim == 3 else np.stack([0 * values, values, 0 * values], axis=1)
             if track.path == "rotation":
                 values = values / np.where(

@@ -119,8 +119,8 @@ class Waves(Deformer):
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
         e, terms, n = self._envelope(mesh), list(self._terms(mesh, t_ns)), np.asarray(mesh.normals, np.float64)
         height = sum(A * np.sin(x) for A, _, x, _ in terms)
-        # The map is p + h(p) d: its Jacobian is I + d grad h^T, whose cofactor matrix transforms the normals
-        # (Sherman-Morrison).
+        # The map is p + h(p) d: its Jacobian is I + d grad h^T, whose cofactor matrix transforms
+        # the normals (Sherman-Morrison).
         slope = np.outer(height, self.envelope[0]) + sum(np.outer(e * A * np.cos(x), k) for A, k, x, _ in terms)
         return n * (1 + slope @ self.direction)[:, None] - slope * (n @ self.direction)[:, None]
 
@@ -238,8 +238,8 @@ class Turn(Deformer):
         angles = self._angle(t_ns) * self._share(mesh)
         arm = self._turned(mesh.vertices - self.pivot, angles)
         n = self._turned(np.asarray(mesh.normals, np.float64), angles)
-        # dq/dp is the rotation plus, where the share grows, a shear along axis x arm; cofactors of a rank-one update
-        # again.
+        # dq/dp is the rotation plus, where the share grows, a shear along axis x arm; cofactors of a
+        # rank-one update again.
         shear = np.cross(self.axis, arm)
         along = self._angle(t_ns) * self._turned(np.broadcast_to(self.share[0], arm.shape), angles)
         return n * (1 + (shear * along).sum(axis=1))[:, None] - along * (shear * n).sum(axis=1)[:, None]

@@ -151,7 +151,7 @@ def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
     ]
     objs = json.dumps([(name, changes) for (_, name, _), (_, changes, *_) in kept.items()])
     whole = [frame == int(frame) for frame in frames]
-    np.savez(path, *points, objs=objs, times=[clock.seconds(frame) for frame in frames], whole=whole)
+    np.savez(path, *points, things=objs, times=[clock.seconds(frame) for frame in frames], whole=whole)
     return broken, owners
 
 

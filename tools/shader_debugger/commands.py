@@ -18,7 +18,7 @@ from blinkgl.tools.shader_debugger.compare import (
     parse_tolerances,
     verdict,
 )
-from blinkgl.tools.shader_debugger.filters import TWINNED, twinned_of
+from blinkgl.tools.shader_debugger.filters import FILTERED, filtered_names
 from blinkgl.tools.shader_debugger.moments import (
     MAPS,
     PASSES,
@@ -70,7 +70,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", *TWINNED)  # the background has values, too
+    everywhere = info.name in ("luminance", *FILTERED)  # the background has values, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -114,7 +114,7 @@ def run_diff(
     NAME_error.npy there. Returns the result of :func:`verdict.verdict`, and the reports."""
     # Names are checked before drawing.
     if names:
-        there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
+        there = buffers_of(subject.scene, filtered_names(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
         comparison = Comparison(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps))

@@ -10,11 +10,11 @@ edge) only ids and masks are graded. Pictures made from other pictures (:mod:`fi
 Order: the buffers are graded in the order in which a pass computes them: the surface's place (local position, depth,
 id), the texture lookups there (coordinates, level, albedo), the light, and their product. Each lookup is the pass's
 own, shown by a variant of its own source (``include/lookup.glsl``). A result that depends on an earlier step is graded
-with the GPU's value of that step: the albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and
+with the GPU's value of that step: the albedo against a reference of mip-mapped sampling on the CPU at the GPU's own coordinates and
 level, the result against the GPU's own albedo times its own light. So the first buffer that fails contains the fault;
 the verdict names it, object by object.
 
-The reference has no mip maps, hence the twin, and a loose tolerance: OpenGL does not define how drivers make them. With
+The reference has no mip maps, hence its own one for mip-mapped sampling, and a loose tolerance: OpenGL does not define how drivers make them. With
 anisotropic filtering (``render.anisotropy`` > 1) level and albedo are not graded.
 """
 
@@ -32,7 +32,7 @@ from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import lamps_of, shadowing
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger import appearance, reference
-from blinkgl.tools.shader_debugger.filters import TWINNED
+from blinkgl.tools.shader_debugger.filters import FILTERED
 from blinkgl.tools.shader_debugger.lamps import share_range
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.moments import (
@@ -233,17 +233,17 @@ class Comparison:
 
     @cached_property
     def _there(self) -> list[str]:
-        there = buffers_of(self.ref.seen, self.gpu.renderer.twinned)
+        there = buffers_of(self.ref.seen, self.gpu.renderer.filtered)
         return [name for name in QUANTITIES if name in there]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (GPU, the values to grade it against); equal shapes."""
         gpu, ref = self.gpu, self.ref
         of, what = lookup_of(name)
-        if name in TWINNED:
-            return gpu[name], gpu[f"{name}_twin"]
+        if name in FILTERED:
+            return gpu[name], gpu[f"{name}_reference"]
         if what == "albedo":
-            return gpu[name], self.twin(of)
+            return gpu[name], self.reference_albedo(of)
         if what == "shadow" and self.shares is not None:
             low, high = (self._seen_past(shares) for shares in self.shares)
             return gpu[name], np.clip(gpu[name], low, high)
@@ -268,7 +268,7 @@ class Comparison:
             return np.where(ref.frame.hit, in_fog[..., 0], ref[name])
         return np.where(ref.frame.hit[..., None], in_fog, ref[name])
 
-    def twin(self, of: str) -> np.ndarray:
+    def reference_albedo(self, of: str) -> np.ndarray:
         """Return the (H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates and level; 0
         where it drew nothing."""
         gpu, frame = self.gpu, self.ref.frame
@@ -303,7 +303,7 @@ class Comparison:
         """Return (H, W) bool: pixels at which a buffer is graded."""
         if name in MAPS:
             return ~self.map_band(name)
-        if name in TWINNED:
+        if name in FILTERED:
             return np.ones_like(self.band)
         graded = ~self.band
         if QUANTITIES[name].same_triangle:

@@ -26,7 +26,7 @@ from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison, verdict
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.filters import TWINNED, twinned_of
+from blinkgl.tools.shader_debugger.filters import FILTERED, filtered_names
 from blinkgl.tools.shader_debugger.moments import (
     PASSES,
     GpuMoment,
@@ -209,11 +209,11 @@ class Inspector:
         return made
 
     def _buffers(self):
-        return buffers_of(self.subject.scene, twinned_of(self.subject.config, self.subject.scene))
+        return buffers_of(self.subject.scene, filtered_names(self.subject.config, self.subject.scene))
 
     def _array(self, when: When, name: str, source: str) -> np.ndarray:
-        if name in TWINNED:  # its reference is computed from the GPU's own picture
-            return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
+        if name in FILTERED:  # its reference is computed from the GPU's own picture
+            return self.gpu(when)[name if source == "gpu" else f"{name}_reference"]
         return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
     def _when(self, seconds: float | None) -> When:

@@ -1,4 +1,4 @@
-"""Shadow maps in float64, the pixels where a map may be wrong because of its texels, and a twin of soft shadows."""
+"""Shadow maps in float64, the pixels where a map may be wrong because of its texels, and a reference of soft shadows."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Slow float64 twin of the soft shadows of shaders/include/shadows.glsl, which explains the method.
+# Slow float64 reference of the soft shadows of shaders/include/shadows.glsl, which explains the method.
 #
 # It reads the GPU's own shadow map, which is graded separately.
 

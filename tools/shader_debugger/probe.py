@@ -9,7 +9,7 @@ from trimesh.triangles import points_to_barycentric
 from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger.compare import Comparison
-from blinkgl.tools.shader_debugger.filters import TWINNED
+from blinkgl.tools.shader_debugger.filters import FILTERED
 from blinkgl.tools.shader_debugger.lamps import place_in
 from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of
 from blinkgl.tools.shader_debugger.quantities import QUANTITIES
@@ -50,7 +50,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "band": bool(comparison.band[y, x]),
         "buffers": [
             _row(name, gpu, ref, comparison, x, y)
-            for name in buffers_of(scene, gpu.renderer.twinned)
+            for name in buffers_of(scene, gpu.renderer.filtered)
             if name not in ("triangle", "local", *MAPS)
         ],  # told below
         "surface": {
@@ -72,7 +72,7 @@ def _plain(values):
 
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
-    g, r = (side[y, x] for side in (comparison.pair(name) if name in TWINNED else (gpu[name], ref[name])))
+    g, r = (side[y, x] for side in (comparison.pair(name) if name in FILTERED else (gpu[name], ref[name])))
     row = {
         "name": name,
         "title": PASSES[name].title,

@@ -108,7 +108,7 @@ def _misplaced(g, r, gpu, ref):
     return out
 
 
-_TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
+_MIPMAPPED = "against a reference of mip-mapped sampling on the CPU at the GPU's own uv and level; drivers may make mip maps differently"
 _SHADING = "against the GPU's own albedo times its own light, and what it adds"
 _MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
 LOG2 = 1.0 - (1.0 + math.log(math.log(2.0))) / math.log(2.0) + 1e-3
@@ -116,12 +116,12 @@ LOG2 = 1.0 - (1.0 + math.log(math.log(2.0))) / math.log(2.0) + 1e-3
 takes it: the largest of log2(1 + f) - f; and a thousandth for float32."""
 _LEVEL = "outside of what OpenGL 4.6, section 8.14.1, allows"
 _EDGES = (
-    "soft ones against a float64 twin on the GPU's own map (lamps.py); hard ones against rays, not near an edge "
+    "soft ones against a float64 reference on the GPU's own map (lamps.py); hard ones against rays, not near an edge "
     "nor where light grazes: there a map is off by its texels"
 )
 _MAP = "off its silhouettes"
 _GATHERED = "at all pixels, against the float64 mean of the GPU's own flat picture over each pixel of the lens"
-_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (filters.py)"
+_FILTERED = "at all pixels, against a float64 reference on the GPU's own unfiltered picture and depths (filters.py)"
 
 
 def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
@@ -130,7 +130,7 @@ def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
         Quantity(f"{name}_uv", "px of shifted texture", MISPLACED, _pixels_of_texture, fit=2.0),
         Quantity(f"{name}_level", "levels", LOG2, _beyond_the_range, note=_LEVEL, fit=1.0),
         # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
-        Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
+        Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_MIPMAPPED, fit=1.0),
         Quantity(f"{name}_direct", "1", 1e-4, _relative, note=_MAPPED),
         Quantity(f"{name}_shadow", "light", 1e-3, _of_the_lamps, note=_EDGES),
         Quantity(f"{name}_around", "1", 1e-4, _relative, note=_MAPPED),

@@ -1,4 +1,4 @@
-"""Everything that the float64 reference knows about one pixel: for tests and the shader debugger."""
+"""What the float64 reference knows about one pixel: for tests and the shader debugger."""
 
 from __future__ import annotations
 
@@ -6,37 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blinkgl.render.casting import (
-    Flow,
-    Hits,
-    cast,
-    flow_to,
-    local_at,
-    relative_pose_at,
-    scene_parts,
-    velocity,
-    vertices_at,
-)
+from blinkgl.render.casting import Flow, Hits, cast, flow_to, local_at, relative_pose_at, scene_parts, vertices_at
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.appearance import surface
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Everything about one image point at t_ns and, if requested, at to_ns. float64, None when not there.
+    """One image point at t_ns and, if requested, at to_ns. float64, None when not there.
 
     world, camera : (3,) position of the surface point at t;   world_to, camera_to, xy_to : at t'.
     why : '' when the point is visible at both times, else one line saying why it is invalid or occluded.
     """
 
-    xy: tuple[float, float]
-    t_ns: int
-    to_ns: int | None
     hit: bool
     object_name: str = ""
-    instance: int = 0
-    part: int = -1
-    part_of_object: int = -1
     triangle: int = -1
     front: bool = False
     bary: np.ndarray | None = None
@@ -44,14 +27,6 @@ class Probe:
     local: np.ndarray | None = None
     world: np.ndarray | None = None
     camera: np.ndarray | None = None
-    depth: float = float("inf")
-    normal: np.ndarray | None = None
-    uv: np.ndarray | None = None
-    albedo: np.ndarray | None = None
-    colour: np.ndarray | None = None
-    luminance: float = 0.0
-    velocity: np.ndarray | None = None
-    flow: np.ndarray | None = None
     valid: bool = False
     occluded: bool = False
     world_to: np.ndarray | None = None
@@ -63,56 +38,36 @@ class Probe:
 def probe(scene: Scene, t_ns: int, x: float, y: float, to_ns: int | None = None) -> Probe:
     """Return what is seen at image point (x, y) px at t_ns, and the position of that surface point at to_ns."""
     hits = cast(scene, t_ns, np.array([[x, y]]))
-    looks = surface(scene, hits)
-    colour, luminance = looks.colour[0], float(looks.luminance[0])
     if not hits.hit[0]:
-        return Probe((float(x), float(y)), int(t_ns), to_ns, False, colour=colour, luminance=luminance)
-    parts = scene_parts(scene)
-    p, triangle = int(hits.part[0]), int(hits.triangle[0])
-    thing, part = parts[p]
+        return Probe(False)
+    thing, part = scene_parts(scene)[hits.part[0]]
+    triangle = int(hits.triangle[0])
 
-    def world(at):
-        pose = thing.path.pose(at)
+    def placed(pose: np.ndarray, at: int) -> np.ndarray:
         return pose[:3, :3] @ local_at(scene, hits, at)[0] + pose[:3, 3]
 
     later = {}
     if to_ns is not None:
         flow = flow_to(scene, hits, to_ns)
-        pose = relative_pose_at(scene, thing, to_ns)
         valid = bool(flow.valid[0])
         later = {
-            "flow": flow.flow[0] if valid else None,
             "valid": valid,
             "occluded": bool(flow.occluded[0]),
-            "world_to": world(to_ns),
-            "camera_to": pose[:3, :3] @ local_at(scene, hits, to_ns)[0] + pose[:3, 3],
+            "world_to": placed(thing.path.pose(to_ns), to_ns),
+            "camera_to": placed(relative_pose_at(scene, thing, to_ns), to_ns),
             "xy_to": hits.xy[0] + flow.flow[0] if valid else None,
             "why": _why(scene, hits, flow),
         }
-    now = relative_pose_at(scene, thing, t_ns)
     return Probe(
-        xy=(float(x), float(y)),
-        t_ns=int(t_ns),
-        to_ns=to_ns,
         hit=True,
         object_name=thing.name,
-        instance=thing.instance_id,
-        part=p,
-        part_of_object=next(i for i, own in enumerate(thing.parts) if own is part),
         triangle=triangle,
         front=bool(hits.front[0]),
         bary=hits.bary[0],
         corners=vertices_at(part.mesh, t_ns)[part.mesh.faces[triangle]],
         local=hits.local[0],
-        world=world(t_ns),
-        camera=now[:3, :3] @ hits.local[0] + now[:3, 3],
-        depth=float(hits.depth[0]),
-        normal=looks.normal[0],
-        uv=looks.uv[0],
-        albedo=looks.albedo[0],
-        colour=colour,
-        luminance=luminance,
-        velocity=velocity(scene, hits)[0],
+        world=placed(thing.path.pose(t_ns), t_ns),
+        camera=placed(relative_pose_at(scene, thing, t_ns), t_ns),
         **{"why": "", **later},
     )
 

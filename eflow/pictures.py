@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from contextlib import ExitStack
-from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from blinkgl.io.atomic import atomic_file
+from blinkgl.io.atomic import atomic_file, write_whole
 from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.images import encode_image
 from blinkgl.io.video import VideoWriter
@@ -136,5 +135,4 @@ class FlowVideo:
 
 def write_picture(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write a PNG, completely or not at all."""
-    with atomic_file(path) as temporary:
-        Path(temporary).write_bytes(encode_image(image))
+    write_whole(path, encode_image(image))

@@ -9,7 +9,7 @@ import numpy as np
 
 from blinkgl.errors import OutputError
 from blinkgl.io import pictures
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.io.images import encode_npy
 from blinkgl.tools.shader_debugger.compare import (
     BufferReport,
@@ -55,7 +55,7 @@ def write_passes(
         gpu = GpuMoment(renderer, when)
         for name in names:
             info, array = PASSES[name], gpu[name]
-            _save(folder / f"{name}.npy", array)
+            write_whole(folder / f"{name}.npy", encode_npy(array))
             rgb, legend = pictures.picture(info.kind, array, hit=_meaningful(gpu, info))
             picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
             paths += [folder / f"{name}.npy", folder / f"{name}.png"]
@@ -78,11 +78,6 @@ def _meaningful(moment, info) -> np.ndarray | None:
             else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
         )
     return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
-
-
-def _save(path: Path, array: np.ndarray) -> None:
-    with atomic_file(path) as temporary, output_errors(path):
-        temporary.write_bytes(encode_npy(array))
 
 
 def _folder(out: str) -> Path:
@@ -127,7 +122,7 @@ def run_diff(
 
         folder = _folder(out)
         for report in reports:
-            _save(folder / f"{report.quantity.name}_error.npy", report.errors)
+            write_whole(folder / f"{report.quantity.name}_error.npy", encode_npy(report.errors))
         title = (
             f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
             f"{when.t_ns * 1e-9:.6g} s"

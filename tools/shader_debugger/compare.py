@@ -10,12 +10,12 @@ edge) only ids and masks are graded. Pictures made from other pictures (:mod:`fi
 Order: the buffers are graded in the order in which a pass computes them: the surface's place (local position, depth,
 id), the texture lookups there (coordinates, level, albedo), the light, and their product. Each lookup is the pass's
 own, shown by a variant of its own source (``include/lookup.glsl``). A result that depends on an earlier step is graded
-with the GPU's value of that step: the albedo against a reference of mip-mapped sampling on the CPU at the GPU's own coordinates and
-level, the result against the GPU's own albedo times its own light. So the first buffer that fails contains the fault;
-the verdict names it, object by object.
+with the GPU's value of that step: the albedo against a reference of mip-mapped sampling at the GPU's own coordinates
+and level, the result against the GPU's own albedo times its own light. So the first buffer that fails contains the
+fault; the verdict names it, object by object.
 
-The reference has no mip maps, hence its own one for mip-mapped sampling, and a loose tolerance: OpenGL does not define how drivers make them. With
-anisotropic filtering (``render.anisotropy`` > 1) level and albedo are not graded.
+The frame of the reference has no mip maps, hence :mod:`mipmaps`, and a loose tolerance: OpenGL does not define how
+drivers make them. With anisotropic filtering (``render.anisotropy`` > 1) level and albedo are not graded.
 """
 
 from __future__ import annotations
@@ -167,15 +167,14 @@ class Comparison:
             self.band |= reference.silhouette_band(flat.instance, flat.depth, jump=NEVER)
             # No buffer has the triangle that a lens's ray met on the GPU; away from the sides both met the same one.
             self._same_label = (seen.bary.min(axis=-1) > SIDE) | ~seen.hit
-        things = [thing for thing, _ in casting.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
         self.objects = [
             name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
             for name, thing in zip(names, ref.scene.objects)
         ] + [NOTHING]
-        # Objects may have several parts, and a name may occur twice.
-        index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
-        self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
+        # In the order of casting.scene_parts; the last is that of part -1.
+        of_parts = [i for i, thing in enumerate(ref.scene.objects) for _ in thing.parts]
+        self._object_of_part = np.array([*of_parts, len(names)], np.intp)
 
     def owner(self, name: str) -> np.ndarray:
         """Return the (H, W) number of the object to which a pixel's error in buffer ``name`` is assigned: the one that

@@ -1,4 +1,4 @@
-"""Pictures that a program makes from another picture, and their float64 references from the same picture: silhouettes by
+"""Pictures that a program makes from another picture, and their float64 references from the same one: silhouettes by
 area (``edges.glsl``), and the picture of a lens (``gather.glsl``)."""
 
 from __future__ import annotations
@@ -310,12 +310,9 @@ def pass_of(renderer: Renderer, what: str, samples: Samples = Samples()) -> Pass
 
 def _parts(renderer: Renderer, name: str) -> tuple[str, Pass, Pass]:
     """Return (what the picture is of, the pass that draws it before, the pass that makes ``name`` from it)."""
-    what = name.partition("_")[0]
-    if name in LENSED:
-        of = pass_of(renderer, what)
-        return what, of, Gather(of, renderer.scene.camera, True)
-    of = pass_of(renderer, what, samples_of("edges"))
-    return what, of, Edged(of)
+    what, of_lens = name.partition("_")[0], name in LENSED
+    of = pass_of(renderer, what, Samples() if of_lens else samples_of("edges"))
+    return what, of, Gather(of, renderer.scene.camera, True) if of_lens else Edged(of)
 
 
 def drawn(renderer: Renderer, name: str, t_ns: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -201,12 +202,11 @@ class Inspector:
 
     # ---- moments -----------------------------------------------------------------------------------------------
 
-    def _draw_all(self, when: When) -> GpuMoment:
+    def _draw_all(self, when: When) -> None:
         made = GpuMoment(self.renderer, when)
         # Programs are compiled at the first drawing: draw with all, so that an error is shown now.
         for name in self._buffers():
             made[name]
-        return made
 
     def _buffers(self):
         return buffers_of(self.subject.scene, filtered_names(self.subject.config, self.subject.scene))
@@ -239,14 +239,11 @@ class Inspector:
             "interval": config.time.interval_ns * 1e-9,
             "maps": pictures.MAPS,
             "folder": str(self.folder),
-            "passes": [
-                {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
-                for p in self._buffers().values()
-            ],
+            "passes": [asdict(info) for info in self._buffers().values()],
         }
 
     def shaders(self) -> dict:
-        return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
+        return {"generation": self.generation, "errors": [asdict(d) | {"where": d.where} for d in self.errors]}
 
     def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
         """Return PNG and legend of one buffer. q : the result of :func:`questions.read_query`, here and below."""

@@ -312,12 +312,9 @@ class ReferenceMoment(_Lazy):
             return {name: getattr(frame, name.removesuffix("_level0"))}
         if name in MAPS:
             return {name: map_of(self.scene, self.when.t_ns, self.maps[MAPS.index(name)])[0]}
-        if name == "triangle":
-            return {name: frame.triangle + 1}
-        if name == "part":
-            return {name: frame.part}
-        if name == "local":
-            return {name: np.where(frame.hit[..., None], frame.local, 0.0)}
+        if name in ("triangle", "part", "local"):
+            local = np.where(frame.hit[..., None], frame.local, 0.0)
+            return {"triangle": frame.triangle + 1, "part": frame.part, "local": local}
         if name == "velocity_pass":
             return {name: self["velocity"] if self._places is None else self._velocity_drawn()}
         of, what = lookup_of(name)

@@ -73,26 +73,22 @@ def _plain(values):
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
     g, r = (side[y, x] for side in (comparison.pair(name) if name in FILTERED else (gpu[name], ref[name])))
+    info = PASSES[name]
+    exact = info.kind in ("mask", "ids")
+    apart = None if exact else ulps(g, r)
+    distance = float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if apart else 0.0
     row = {
         "name": name,
-        "title": PASSES[name].title,
-        "unit": PASSES[name].unit,
+        "title": info.title,
+        "unit": info.unit,
         "gpu": g.tolist(),
         "reference": r.tolist(),
-        "error": None,
-        "error_unit": "",
-        "ulps": None,
+        "error": float(g != r) if exact else distance,
+        "error_unit": "mismatch" if exact else info.unit,
+        "ulps": apart,
         "ok": None,
         "note": "",
     }
-    if PASSES[name].kind in ("mask", "ids"):
-        row |= {"error": float(g != r), "error_unit": "mismatch"}
-    else:
-        row["ulps"] = ulps(g, r)
-        row |= {
-            "error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
-            "error_unit": PASSES[name].unit,
-        }
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
@@ -243,11 +239,10 @@ def as_text(found: dict) -> str:
     lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]
     for row in found["buffers"]:
         mark = {True: "", False: "!!", None: ""}[row["ok"]]
-        error = "" if row["error"] is None else f"{row['error']:.3g}"
         count = "" if row["ulps"] is None else f"{row['ulps']:.3g}"
         lines.append(
-            f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} "
-            f"{count:>9}  {row['error_unit']}"
+            f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} "
+            f"{row['error']:>10.3g} {count:>9}  {row['error_unit']}"
         )
         if row["note"]:
             lines.append(f"{'':24}{row['note']}")

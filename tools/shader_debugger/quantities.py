@@ -108,7 +108,9 @@ def _misplaced(g, r, gpu, ref):
     return out
 
 
-_MIPMAPPED = "against a reference of mip-mapped sampling on the CPU at the GPU's own uv and level; drivers may make mip maps differently"
+_MIPMAPPED = (
+    "against a reference of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
+)
 _SHADING = "against the GPU's own albedo times its own light, and what it adds"
 _MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
 LOG2 = 1.0 - (1.0 + math.log(math.log(2.0))) / math.log(2.0) + 1e-3

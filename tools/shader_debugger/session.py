@@ -24,7 +24,7 @@ from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.filters import pass_of, places_of, filtered_names
+from blinkgl.tools.shader_debugger.filters import filtered_names, pass_of, places_of
 
 DEBUG_PROGRAM = "debug.glsl"
 

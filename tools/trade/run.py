@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.errors import ConfigError
 from blinkgl.gl import create_context
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.machine.bench import machine_line
 from blinkgl.tools.trade.measure import ENOUGH, QUICK, Bench, Level, Options
 from blinkgl.tools.trade.settings import SIZES, Setting, design, pareto_front
@@ -139,19 +140,22 @@ def write(result: dict, out: str | Path) -> list[Path]:
     """Write trade.json, trade.csv, pareto.png and trade.html to the folder ``out``. Raises OutputError."""
     from blinkgl.tools.trade.plot import page, pareto
 
-    out = Path(out)
-    paths = [out / name for name in ("trade.json", "trade.csv", "pareto.png", "trade.html")]
-    with atomic_file(paths[0]) as path, output_errors(paths[0]):
-        path.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
-    with atomic_file(paths[1]) as path, output_errors(paths[1]), path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-        rows.writeheader()
-        rows.writerows(result["settings"])
+    paths = write_tables(Path(out) / "trade", result, COLUMNS, result["settings"])
+    pages = [Path(out) / name for name in ("pareto.png", "trade.html")]
     picture = pareto(result)
-    with atomic_file(paths[2]) as path, output_errors(paths[2]):
-        path.write_bytes(picture)
-    with atomic_file(paths[3]) as path, output_errors(paths[3]):
-        path.write_text(page(result, picture), encoding="utf-8")
+    write_whole(pages[0], picture)
+    write_whole(pages[1], page(result, picture))
+    return [*paths, *pages]
+
+
+def write_tables(path: Path, result: dict, columns: tuple[str, ...], rows: Iterable[dict]) -> list[Path]:
+    """Write ``path``.json with the result, and ``path``.csv with the rows; return both paths. Raises OutputError."""
+    paths, table = [path.with_suffix(ending) for ending in (".json", ".csv")], io.StringIO(newline="")
+    write_whole(paths[0], json.dumps(plain(result), indent=1) + "\n")
+    written = csv.DictWriter(table, columns, extrasaction="ignore")
+    written.writeheader()
+    written.writerows(rows)
+    write_whole(paths[1], table.getvalue())
     return paths
 
 

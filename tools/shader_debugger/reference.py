@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from blinkgl.render.casting import Flow, Hits, cast, flow_to, moved_in_space, velocity
+from blinkgl.render.casting import Flow, Hits, cast, flow_to, moved_in_space, scene_parts, velocity
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.appearance import Surface, surface
 
@@ -72,6 +72,24 @@ def render(
         forward=flow(forward_ns),
         backward=flow(backward_ns),
     )
+
+
+def why(scene: Scene, frame: ReferenceFrame, way: str, x: int, y: int) -> str:
+    """Return one line that says why the point at a pixel is invalid or occluded at the end of its flow ``way``,
+    "forward" or "backward"; "" where it is visible at both times."""
+    flow = getattr(frame, way)
+    depth, (part, triangle) = flow.depth[y, x], flow.hidden_by[y, x]
+    if not frame.hit[y, x]:
+        return "nothing hit"
+    if not flow.valid[y, x]:
+        return f"behind the camera at t' (Z' = {depth:.6g})"
+    if flow.outside[y, x]:
+        return "outside the image at t' (x' = {:.3f}, y' = {:.3f})".format(*(frame.xy[y, x] + flow.flow[y, x]))
+    if depth < scene.camera.near:
+        return f"in front of the near plane at t' (Z' = {depth:.6g} < {scene.camera.near:g})"
+    if part >= 0:
+        return f"hidden at t' by {scene_parts(scene)[part][0].name}, triangle {triangle}"
+    return "seen from its culled back at t'" if flow.occluded[y, x] else ""
 
 
 def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: float = 0.02) -> np.ndarray:

@@ -353,22 +353,25 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
     return flow
 
 
-class FlowWriter:
-    """Writes a new folder of flow, completely or not at all: ``%06d.png`` (DSEC's 16 bits), ``pictures/%06d.png`` and
-    ``timestamps.txt`` (from_us, to_us).
+@contextlib.contextmanager
+def flow_folder(final: str | os.PathLike, *, npy: bool = False) -> Iterator[FlowWriter]:
+    """Open a new folder of flow, which appears completely or not at all: ``%06d.png`` (DSEC's 16 bits),
+    ``pictures/%06d.png`` and ``timestamps.txt`` (from_us, to_us).
 
     npy : also write exact flow to ``npy/%06d.npy``, (H, W, 2) float32. Raises OutputError: the folder exists."""
+    with atomic_folder(final) as folder:
+        writer = FlowWriter(folder, Path(final), npy)
+        yield writer
+        with output_errors(final):
+            (folder / "timestamps.txt").write_text("\n".join(writer.lines) + "\n", encoding="utf-8")
 
-    def __init__(self, final: str | os.PathLike, *, npy: bool = False, pictures: bool = True):
-        self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
-        self._lines = ["# from_timestamp_us, to_timestamp_us"]
 
-    def __enter__(self) -> FlowWriter:
-        with contextlib.ExitStack() as opened:
-            self._tmp = opened.enter_context(atomic_folder(self.final))
-            opened.push(self._finish)
-            self._opened = opened.pop_all()
-        return self
+class FlowWriter:
+    """Writes windows into the folder of :func:`flow_folder`. lines : of its time stamps."""
+
+    def __init__(self, folder: Path, final: Path, npy: bool):
+        self._folder, self._final, self.npy, self.count = folder, final, npy, 0
+        self.lines = ["# from_timestamp_us, to_timestamp_us"]
 
     def add(
         self,
@@ -384,29 +387,20 @@ class FlowWriter:
         near = near_events(tensor)
         if at_events:
             valid &= near
-        write_flow_png(self._tmp / f"{name}.png", flow, valid)
-        with output_errors(self.final):
+        write_flow_png(self._folder / f"{name}.png", flow, valid)
+        with output_errors(self._final):
             if self.npy:
                 values = np.where(valid[..., None], flow, np.float32(np.nan)) if at_events else flow
                 self._part("npy", f"{name}.npy").write_bytes(encode_npy(values))
-            if self.pictures:
-                where = None if truth is None else np.isfinite(truth).all(-1)
-                strip = comparison(events_of(tensor), flow, truth, where, near=near)
-                write_picture(self._part("pictures", f"{name}.png"), strip)
-        self._lines.append(f"{window.new.t0}, {window.new.t1}")
+            where = None if truth is None else np.isfinite(truth).all(-1)
+            strip = comparison(events_of(tensor), flow, truth, where, near=near)
+            write_picture(self._part("pictures", f"{name}.png"), strip)
+        self.lines.append(f"{window.new.t0}, {window.new.t1}")
         self.count += 1
 
     def _part(self, folder: str, name: str) -> Path:
-        (self._tmp / folder).mkdir(exist_ok=True)
-        return self._tmp / folder / name
-
-    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            with output_errors(self.final):
-                (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
-
-    def __exit__(self, *error) -> bool | None:
-        return self._opened.__exit__(*error)
+        (self._folder / folder).mkdir(exist_ok=True)
+        return self._folder / folder / name
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -116,6 +116,11 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
     return lambda window: predictor(window)[0]
 
 
+def reads_two(name: str) -> bool:
+    """Whether it is a network that reads two windows, of a burst its halves."""
+    return name not in METHODS and "old" in load_model(name.removesuffix(SHARPENED)).reads
+
+
 def likely_span(events: Events, height: int, width: int) -> int:
     """Length, µs, over which the middle of the recording moves by about :data:`LIKELY_PX`, by contrast maximisation."""
     translation = answer_of("contrast-translation", height, width)
@@ -209,12 +214,10 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
             except BlinkGLError as error:
                 print(f"{name}: {error}")
             continue
-        plain = name.removesuffix(SHARPENED)
-        model = load_model(plain)
-        predictor = Predictor(model, height, width, empty="zero", sharpen=plain != name)
-        if "old" not in model.reads:
-            flows[name] = predictor(whole)[0]
-        flows[f"{name}, halves"] = predictor(halves)[0] * ((t1 - t0) / (t1 - middle))
+        answer = answer_of(name, height, width)
+        if not reads_two(name):
+            flows[name] = answer(whole)
+        flows[f"{name}, halves"] = answer(halves) * ((t1 - t0) / (t1 - middle))
     return {name: row_of([(np.asarray(flow, np.float64), truth, valid, hit)]) for name, flow in flows.items()}
 
 
@@ -234,10 +237,8 @@ def changed(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
     def error(name: str, part: Events, wide: int, high: int) -> float:
         left, top = (wide - width) // 2, (high - height) // 2
         moved = Events(part.x + np.uint16(left), part.y + np.uint16(top), part.t, part.p)
-        halves = name not in METHODS and "old" in load_model(name.removesuffix(SHARPENED)).reads
-        pair, factor = (
-            (cut(moved, middle, t1 - middle), (t1 - t0) / (t1 - middle)) if halves else (cut(moved, t0, t1 - t0), 1)
-        )
+        meet = middle if reads_two(name) else t0
+        pair, factor = cut(moved, meet, t1 - meet), (t1 - t0) / (t1 - meet)
         flow = answer_of(name, high, wide, focal)(pair)[top : top + height, left : left + width] * factor
         hit = (
             np.isfinite(truth).all(-1)

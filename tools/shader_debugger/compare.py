@@ -214,12 +214,6 @@ class Comparison:
         arrives = (each * np.moveaxis(shares, 0, -1)).sum(axis=-1)
         return np.where(total > 0, arrives / np.maximum(total, 1e-30), 1.0)
 
-    def map_band(self, name: str) -> np.ndarray:
-        """Return (texels, texels) bool: silhouettes of a shadow map."""
-        depth = self.ref[name]
-        with np.errstate(divide="ignore"):
-            return reference.silhouette_band(depth > 0, 1.0 / depth, jump=MAP_JUMP)
-
     def names(self) -> list[str]:
         """Return every buffer that can be graded here."""
         left_out = self.left_out()
@@ -301,7 +295,9 @@ class Comparison:
     def graded(self, name: str) -> np.ndarray:
         """Return (H, W) bool: pixels at which a buffer is graded."""
         if name in MAPS:
-            return ~self.map_band(name)
+            depth = self.ref[name]
+            with np.errstate(divide="ignore"):
+                return ~reference.silhouette_band(depth > 0, 1.0 / depth, jump=MAP_JUMP)
         if name in FILTERED:
             return np.ones_like(self.band)
         graded = ~self.band

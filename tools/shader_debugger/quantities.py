@@ -82,10 +82,6 @@ def _of_the_picture(g, r, gpu, ref):
     return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
 
 
-def _per_interval(g, r, gpu, ref):
-    return motion_per_interval(g, r, gpu.when.interval_s)
-
-
 def _misplaced(g, r, gpu, ref):
     """Return (H, W) px from each pixel's centre to the drawn point by the true poses, or, if larger, from that point to
     the plane of the drawn triangle at that time; inf where it is not visible. It does not use the ray caster, so that a
@@ -166,7 +162,12 @@ _SHADED = (
         Quantity(name, "of the pixel or mean", 2e-3, _of_the_picture, same_triangle=False, note=_GATHERED)
         for name in LENSED
     ),
-    Quantity("velocity_pass", "px per label interval", 0.01, _per_interval),
+    Quantity(
+        "velocity_pass",
+        "px per label interval",
+        0.01,
+        lambda g, r, gpu, ref: motion_per_interval(g, r, gpu.when.interval_s),
+    ),
 )
 
 

@@ -11,10 +11,8 @@ import typer
 
 from blinkgl.errors import ConfigError
 from blinkgl.machine import event_options as of_events
-from blinkgl.machine.command_line import run_app
+from blinkgl.machine.command_line import new_app, run_app
 from blinkgl.machine.interrupts import interruptible
-from blinkgl.machine.plugins import load_plugins
-from blinkgl.version import __version__
 from eflow.cli_arguments import (
     Answer,
     Dataset,
@@ -46,30 +44,7 @@ from eflow.cli_arguments import (
 )
 from eflow.methods.table import METHODS
 
-app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")
-    ] = False,
-    plugin: Annotated[
-        list[str] | None,
-        typer.Option(metavar="FILE", help="Python file that registers parts of yours; before the command."),
-    ] = None,
-) -> None:
-    """Train, evaluate and run event-flow networks."""
-    load_plugins(plugin or ())
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"eflow {__version__}")
-        raise typer.Exit
+app = new_app("eflow", "Train, evaluate and run event-flow networks.")
 
 
 @app.command()

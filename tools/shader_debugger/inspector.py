@@ -66,10 +66,6 @@ def _choice(what: str, known: tuple[str, ...], default: str | None) -> Reader:
     return read
 
 
-def _pass(key: str, text: str) -> str:
-    return check_pass(text, where=key)
-
-
 def _pass_and_source(key: str, text: str) -> tuple[str, str]:
     name, _, source = text.partition(":")
     if source not in SOURCES:
@@ -104,10 +100,6 @@ def _count(key: str, text: str) -> int:
     return int(text) if text else -1
 
 
-def _text(key: str, text: str) -> str:
-    return text  # session.check_pixel parses both together
-
-
 _VIEW: dict[str, Reader] = {
     "t": _seconds,
     "component": _choice("no such component", COMPONENTS, "auto"),
@@ -118,9 +110,14 @@ _VIEW: dict[str, Reader] = {
 
 ROUTES: dict[str, dict[str, Reader]] = {
     "/state": {},
-    "/image": {"pass": _pass, "source": _choice("unknown source", SOURCES, "gpu"), **_VIEW},
+    "/image": {
+        "pass": lambda key, text: check_pass(text, where=key),
+        "source": _choice("unknown source", SOURCES, "gpu"),
+        **_VIEW,
+    },
     "/difference": {"a": _pass_and_source, "b": _pass_and_source, **_VIEW},
-    "/probe": {"x": _text, "y": _text, "t": _seconds},
+    # session.check_pixel parses x and y together.
+    "/probe": {"x": lambda _, text: text, "y": lambda _, text: text, "t": _seconds},
     "/verdict": {"t": _seconds},
     "/wait": {"version": _count},
 }

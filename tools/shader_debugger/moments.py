@@ -229,7 +229,13 @@ class GpuMoment(_Lazy):
         if name in MAPS:
             return {name: draw.shadow_map(MAPS.index(name), when.t_ns)}
         if name in ("triangle", "part", "local", "window"):
-            return self._inspect()
+            out = draw.inspect(when.t_ns)
+            return {
+                "triangle": out["TRIANGLE"],
+                "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
+                "local": out["LOCAL"][..., :3],
+                "window": out["WINDOW"],
+            }
         if name.endswith(("_count", "_light_rgb")) or lookup_of(name)[0]:
             of = name.partition("_")[0]
             shown = draw.lookups(of, when.t_ns)
@@ -239,15 +245,6 @@ class GpuMoment(_Lazy):
             raw = draw.raw(when.t_ns, f"flow_{way}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
             return {name: raw[f"flow_{way}"][..., 2]}
         return self._labels()
-
-    def _inspect(self):
-        out = self.renderer.inspect(self.when.t_ns)
-        return {
-            "triangle": out["TRIANGLE"],
-            "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
-            "local": out["LOCAL"][..., :3],
-            "window": out["WINDOW"],
-        }
 
     def _labels(self):
         when = self.when

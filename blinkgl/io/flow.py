@@ -11,7 +11,7 @@ import numpy as np
 
 from blinkgl.config.frames import FLOW_FORMATS
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.io.images import encode_npy, encode_png, read_npy, read_pfm, read_png
 from blinkgl.io.records import input_errors
 
@@ -224,6 +224,5 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray) -> 
         encoded, lost = encode_flow_png(flow, valid)
     else:
         encoded = encode_flo(flow, valid) if ending == ".flo" else encode_flow_npy(flow, valid)
-    with atomic_file(path, overwrite=True) as temporary:
-        temporary.write_bytes(encoded)
+    write_whole(path, encoded)
     return lost

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds, unit_of
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
@@ -383,5 +383,4 @@ def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarra
     for t, p, q in zip(np.asarray(t_ns).tolist(), poses[:, :3, 3].tolist(), quaternions.tolist()):
         sign, t = ("-", -t) if t < 0 else ("", t)
         lines.append(f"{sign}{t // 1_000_000_000}.{t % 1_000_000_000:09d} " + " ".join(f"{v:.12g}" for v in (*p, *q)))
-    with atomic_file(path) as temporary, output_errors(path):
-        Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(path, "\n".join(lines) + "\n")

@@ -405,6 +405,7 @@ def _frame_intervals(
         before = None
         for k, (frame, _, name) in enumerate(source):
             if lo <= k <= hi:
+                # The offset is in 8-bit codes, so the luminance is scaled to them.
                 log = np.log(found.decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
                 if before is not None:
                     yield log - before

@@ -196,7 +196,6 @@ def calibrate_events(
     else:
         clip, before = _of_scene(events, frames, size, reading, base, keys, starts, seed, say)
         notes, warnings = _of_frames(clip, reading)
-    # The first half is fitted and the other half tests the fit.
     half = (clip.intervals + 1) // 2
     halves = ((0, half), (half, clip.intervals))
     found = Search([(clip, half)], base, seed, lambda done: say("fitting", done))
@@ -208,7 +207,6 @@ def calibrate_events(
         start = found.roughly(keys, starts) if keys else np.empty(0)
     found.run(keys, start)
     say("judging", 1.0)
-    # With another seed than the fit's: the parameters are judged, not the draws that they were fitted with.
     streams = [clip.simulate(one, seed + 1) for one in (base, found.config())]
     judged = [_judged(clip, stream, halves) for stream in streams]
     return Calibration(

@@ -182,7 +182,6 @@ def _loop(
     upcoming = next(fresh, None)
     while upcoming or again or running:
         while (upcoming or again) and executor.free() > 0:
-            # Sequences that have not been tried come before those that failed.
             if upcoming:
                 (number, attempt), upcoming = upcoming, next(fresh, None)
             else:

@@ -219,8 +219,8 @@ def noise_threshold(config: V2eConfig) -> float:
 
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
-    # The low-pass's corner f_c (I + 20)/275 Hz.
     """Draw stationary photoreceptor noise at the first frame, (H*W,) float32 ln units."""
+    # The low-pass's corner f_c (I + 20)/275 Hz.
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
     pixels = np.arange(len(intensity), dtype=np.uint64)
     _, normal = in_blocks(lambda part: normal2(seed, part, np.uint64(Stream.START), np.uint64(1)), pixels)

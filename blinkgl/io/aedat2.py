@@ -188,8 +188,8 @@ def _scale(header: str, key: str, prefix: str, usual: float) -> float:
 
 
 def _kinds(address: np.ndarray) -> np.ndarray:
-    # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
     """Return _DVS, _PIN, _APS or _IMU for every address (int64); frame samples of the unused sub-type are _PIN."""
+    # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
     low = address >> 10 & 3
     return np.where(
         address >> 31 == 0, np.where(low & 1, _PIN, _DVS), np.where(low == 3, _IMU, np.where(low == 2, _PIN, _APS))

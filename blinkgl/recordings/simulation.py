@@ -253,6 +253,7 @@ def stepped(
 
     def shown() -> Iterator[EventFrame]:
         for luminance, t_ns in stream:
+            # Holds the frame that the emulator has taken last, for its step.
             seen[:] = [luminance]
             yield EventFrame(t_ns, luminance)
 

@@ -38,6 +38,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
             continue
         corners = px[np.unique(drawn)]
         amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+        # No pixel of it is visible, and its box lies outside the picture.
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
         # Pixels that it would cover if nothing were in front of it.
@@ -59,6 +60,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
                 "instance": obj.instance_id,
                 "category": category_of(obj, categories),
                 "kind": class_of(obj),
+                # Extents are numbers of pixels, each of which reaches half a px beyond its centre.
                 "visible_box": np.array([x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]) if seen else np.zeros(4),
                 "visible_pixels": seen,
                 "amodal_box": amodal,
@@ -182,6 +184,7 @@ def extents(ids: np.ndarray, count: int) -> np.ndarray:
     """Return (count, 5) int64: for every id below ``count`` the first and last column and row of its pixels, as x0, y0,
     x1, y1, and their number."""
     out = np.zeros((count, 5), np.int64)
+    # Ids without pixels keep a first column and row beyond the picture.
     out[:, 0], out[:, 1] = ids.shape[1], ids.shape[0]
     for y in range(ids.shape[0]):
         for x in range(ids.shape[1]):

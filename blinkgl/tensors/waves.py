@@ -66,8 +66,8 @@ class Step(NamedTuple):
 
 
 def add_curves(r: Rows, v: Step, has: Parts) -> None:
-    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak change linearly.
     """Compute c, rise, fall, k and end of the rows' signals, from the interval's start (s = 0, e = e^(-k s) = 1)."""
+    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak change linearly.
     dx = r["x1"] - r["x0"]
     base, drift = r["x0"] + r["noise"] + r["leak"] * v.since_0, r["shift"] + r["leak"] * v.dt
     r["rise"], r["s"], r["e"] = drift + dx, torch.zeros_like(dx), torch.ones_like(dx)

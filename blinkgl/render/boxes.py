@@ -38,7 +38,6 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
             continue
         corners = px[np.unique(drawn)]
         amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-        # No pixel of it is visible, and its box lies outside the picture.
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
         # Pixels that it would cover if nothing were in front of it.
@@ -60,7 +59,6 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
                 "instance": obj.instance_id,
                 "category": category_of(obj, categories),
                 "kind": class_of(obj),
-                # Extents are numbers of pixels, each of which reaches half a px beyond its centre.
                 "visible_box": np.array([x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]) if seen else np.zeros(4),
                 "visible_pixels": seen,
                 "amodal_box": amodal,

@@ -222,6 +222,7 @@ def _parts(shown: str, text: str) -> tuple[tuple[tuple[str, ...], tuple[tuple[st
             lines, origin = [], []
         elif not in_comment and _VERSION.match(line):
             parts.append((tuple(lines), tuple(origin), number, None))
+            # An empty line stands for #version, which goes to the head.
             lines, origin = [""], [(shown, number)]
         else:
             # Left over: includes in comments, which moderngl's own resolver would try to follow.

@@ -70,6 +70,7 @@ class RecordingSide:
         if not self.iei.sum():
             return float("nan")
         i = int(np.searchsorted(np.cumsum(self.iei), self.iei.sum() / 2))
+        # The geometric middle of the bin, as bins are equal on a logarithmic scale.
         return float(np.sqrt(IEI_EDGES_US[i] * IEI_EDGES_US[i + 1]))
 
 

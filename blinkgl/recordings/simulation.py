@@ -259,6 +259,7 @@ def stepped(
 
     for t_ns, events in emulate(shown(), camera):
         report.add(t_ns, events, camera)
+        # An interpolated frame lies before the given frame that has been read last.
         yield Step(t_ns, events, seen[0], given.decode, t_ns == given.t_ns)
 
 

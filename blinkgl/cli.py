@@ -14,36 +14,11 @@ from typing import Annotated
 import typer
 
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
-from blinkgl.machine.command_line import run_app
-from blinkgl.machine.plugins import load_plugins
+from blinkgl.machine.command_line import new_app, run_app
 from blinkgl.tools.shader_debugger.cli import app as shader_app
-from blinkgl.version import __version__
 
-app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = new_app("blinkgl", "Event-camera and optical-flow data sets by rasterisation.")
 app.add_typer(shader_app)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"blinkgl {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _global_options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show the traceback of an error; may also follow the command.")
-    ] = False,
-    plugin: Annotated[
-        list[str] | None,
-        typer.Option(metavar="FILE", help="Python file that registers parts of yours; before the command."),
-    ] = None,
-) -> None:
-    """Event-camera and optical-flow data sets by rasterisation."""
-    load_plugins(plugin or ())
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------

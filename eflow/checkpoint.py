@@ -13,7 +13,6 @@ import json
 import os
 import re
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -88,23 +87,15 @@ def metadata_of(model: FlowModel) -> dict[str, str]:
     return {"format": FORMAT, "model": model.config.model_dump_json()}
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint on disk: its ``folder`` (None for a single file) and the file of weights to use."""
-
-    folder: Path | None
-    weights: Path
-
-
-def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkpoint:
-    """Return the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder, a run folder (its newest
-    checkpoint), or a network that comes with the package (:mod:`eflow.shipped`). A file or folder of that name has
-    priority over the package's network. Raises AssetError."""
+def find_weights(path: str | os.PathLike, *, averaged: bool = True) -> Path:
+    """Return the file of weights of the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder, a
+    run folder (its newest checkpoint), or a network that comes with the package (:mod:`eflow.shipped`). A file or
+    folder of that name has priority over the package's network. Raises AssetError."""
     path = Path(path)
     if path.is_file():
-        return Checkpoint(None, path)
+        return path
     if shipped.is_shipped(path):
-        return Checkpoint(None, shipped.weights_of(shipped.FOLDER / path))
+        return shipped.weights_of(shipped.FOLDER / path)
     if not path.is_dir():
         raise AssetError(
             f"no such checkpoint{shipped.suggestion(str(path))}",
@@ -112,14 +103,14 @@ def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkp
             accepted=f"a .safetensors file, a checkpoint folder or a run folder{shipped.known()}",
         )
     if (path / shipped.WEIGHTS).is_file():
-        return Checkpoint(None, shipped.weights_of(path))
+        return shipped.weights_of(path)
     folder = path if (path / "weights.safetensors").is_file() else newest(path)
     if folder is None:
         raise AssetError(
             "no checkpoint in this folder", where=str(path), accepted="weights.safetensors, or checkpoints/<step>"
         )
     ema = folder / "ema.safetensors"
-    return Checkpoint(folder, ema if averaged and ema.is_file() else folder / "weights.safetensors")
+    return ema if averaged and ema.is_file() else folder / "weights.safetensors"
 
 
 def newest(run: Path) -> Path | None:
@@ -142,7 +133,7 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
 
     averaged : use the averaged weights if there are any. expected : configuration that the checkpoint must have.
     Raises AssetError: no checkpoint, a damaged one, a pickle, or another model or configuration."""
-    file = find_checkpoint(path, averaged=averaged).weights
+    file = find_weights(path, averaged=averaged)
     tensors, metadata = read_tensors(file)
     try:
         if metadata["format"] != FORMAT:

@@ -17,7 +17,6 @@ AFFINE = 0.33
 """Mean distance of the flow from its nearest affine field, as a share of its mean length, below which only the camera
 moves. Medians of windows were .17 to .27 for seven recordings of moving cameras, .36 for a head that turns, and .42 to
 .88 for 24 simulated sequences of independent bodies (docs/results_eflow.md)."""
-_PLACES = (0.25, 0.5, 0.75)
 
 
 def chosen(file: EventFile, asked: WindowsAsked, load: Callable[[str], infer.Predictor]) -> tuple[str, str]:
@@ -40,18 +39,13 @@ def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> 
     if asked.whole:
         yield infer.whole_file(file)[0]
         return
-    ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
-    if not ends:
+    if (ends := infer.ends_of(file)) is None:
         return
-    first, last = ends[0][0], ends[-1][1]
+    first, last = ends
     start, end = (None if ms is None else first + round(ms * 1000) for ms in (asked.start_ms, asked.end_ms))
     first, last = max(first, start or first), min(last, end or last)
     span = infer.likely_span(file, predictor)[0] if asked.milliseconds is None else round(asked.milliseconds * 1000)
-    for place in _PLACES:
-        begin = max(first, min(round(first + place * (last - first)) - span, last + 1 - 2 * span))
-        pair = next(infer.windows(file, span, start_us=begin, end_us=last + 1), None)
-        if pair is not None:
-            yield pair
+    yield from infer.at_places(file, span, first, last)
 
 
 def from_affine(flow: np.ndarray, hit: np.ndarray) -> float:

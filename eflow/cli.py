@@ -11,10 +11,8 @@ import typer
 
 from blinkgl.errors import ConfigError
 from blinkgl.machine import event_options as of_events
-from blinkgl.machine.command_line import run_app
+from blinkgl.machine.command_line import new_app, run_app
 from blinkgl.machine.interrupts import interruptible
-from blinkgl.machine.plugins import load_plugins
-from blinkgl.version import __version__
 from eflow.cli_arguments import (
     Answer,
     Dataset,
@@ -37,41 +35,16 @@ from eflow.cli_arguments import (
     WarmStart,
     Whole,
     WindowMs,
-    known_format,
     method_named,
     network_of,
     one_of,
-    precision_for,
     ranges_of,
     rendered,
     windows_of,
 )
 from eflow.methods.table import METHODS
 
-app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")
-    ] = False,
-    plugin: Annotated[
-        list[str] | None,
-        typer.Option(metavar="FILE", help="Python file that registers parts of yours; before the command."),
-    ] = None,
-) -> None:
-    """Train, evaluate and run event-flow networks."""
-    load_plugins(plugin or ())
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"eflow {__version__}")
-        raise typer.Exit
+app = new_app("eflow", "Train, evaluate and run event-flow networks.")
 
 
 @app.command()
@@ -194,14 +167,13 @@ def evaluate(
     """Score a network or a method on a data set, beside baselines: zero flow, and global motions fitted to the
     truth."""
     from blinkgl.machine.terminal import plain_console
-    from eflow.data.sources import open_source
+    from eflow.data.sources import FORMATS, open_source
     from eflow.evaluate import evaluate as score, show
 
     one_of("--empty", empty, ("error", "skip"))
     model = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     if model is None:
-        model = network_of(checkpoint, device, raw, precision, iterations, warm_start)
-        precision = precision_for(model, precision)
+        model, precision = network_of(checkpoint, device, raw, precision, iterations, warm_start)
     console = plain_console(stderr=True)
     if dataset.endswith((".yaml", ".yml")):
         with console.status("rendering"):
@@ -210,7 +182,8 @@ def evaluate(
         raise ConfigError("needs a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
         mvsec = {"protocol": protocol, "truth": ground_truth, "frames": ranges_of(frames), "dense": dense}
-        source = open_source(dataset, known_format(format), dt=dt, **mvsec)
+        one_of("--format", format, ("auto", *FORMATS))
+        source = open_source(dataset, format, dt=dt, **mvsec)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -295,8 +268,8 @@ def predict(
     outputs = Outputs(out, video, npy, infer.read_truth(truth, *shape) if truth else None, at_events)
 
     def predictor_of(name: str, **options) -> infer.Predictor:
-        model = network_of(name, device, raw, precision, iterations, options.get("warm_start", False))
-        return infer.Predictor(model, *shape, precision=precision_for(model, precision), empty=empty, **options)
+        model, own = network_of(name, device, raw, precision, iterations, options.get("warm_start", False))
+        return infer.Predictor(model, *shape, precision=own, empty=empty, **options)
 
     if checkpoint == AUTO and not Path(AUTO).exists():
         checkpoint, why = chosen(file, asked, predictor_of)
@@ -327,8 +300,7 @@ def submit(
     from eflow.submit import submit_blinkflow, submit_dsec
 
     one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
-    model = network_of(checkpoint, device, False, precision, warm_start=warm_start)
-    precision = precision_for(model, precision)
+    model, precision = network_of(checkpoint, device, False, precision, warm_start=warm_start)
     with plain_console(stderr=True).status("predicting") as status:
         progress = lambda i, n: status.update(f"{i}/{n} flows")
         options = {"precision": precision, "warm_start": warm_start, "progress": progress}

@@ -110,11 +110,13 @@ def ranges_of(frames: list[str] | None) -> tuple[tuple[int, int], ...]:
 def network_of(
     checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None, warm_start: bool = False
 ):
-    """Return the trained network on its device. Raises ConfigError: this network or machine lacks an option."""
+    """Return (the trained network on its device, the precision to use there: fp32 if it does not support bf16). Raises
+    ConfigError: this network or machine lacks an option."""
     import torch
 
     from eflow.allocator import keep_memory
     from eflow.checkpoint import load_model
+    from eflow.precision import precision_on
 
     one_of("--precision", precision, ("fp32", "bf16"))
     one_of("--device", device, ("auto", "cpu", "cuda"))
@@ -127,22 +129,8 @@ def network_of(
             raise ConfigError("this network has no iterations", where=option, value=model.config.name)
     if iterations is not None:
         model.config = model.config.model_copy(update={"iterations": iterations})
-    return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def precision_for(model, wanted: str) -> str:
-    """Return the precision to use on the model's device: fp32 if it does not support bf16."""
-    from eflow.precision import precision_on
-
-    return precision_on(next(model.parameters()).device, wanted)
-
-
-def known_format(name: str) -> str:
-    """Return the name of a layout of data sets. Raises ConfigError: there is none of that name."""
-    from eflow.data.sources import FORMATS
-
-    one_of("--format", name, ("auto", *FORMATS))
-    return name
+    place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+    return model.to(place), precision_on(place, precision)
 
 
 def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:

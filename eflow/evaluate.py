@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.table import Table
 
 from blinkgl.errors import AssetError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.io.records import inside
 from blinkgl.machine.terminal import plain_console
 from blinkgl.sequence_files.sequence_dir import refuse_existing
-from eflow.data.dataset import FlowDataset, collate
+from eflow.data.dataset import FlowDataset, collate, evenly
 from eflow.data.sources import Source
-from eflow.infer import PICTURED, WarmStart, predict
+from eflow.infer import PICTURED, WarmStart
 from eflow.methods import Method
 from eflow.methods.contrast import sharpest_length
 from eflow.metrics import NAMES, Tally, frame_metrics
@@ -70,11 +70,11 @@ def evaluate(
     representation = model.representation if method is None else PICTURED
     reads = model.reads if method is None and not sharpen else ("old", "new")
     dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads, option="--empty skip")
-    indices = _evenly(len(dataset), limit or len(dataset))
-    shown = {indices[k] for k in _evenly(len(indices), pictures)}
+    indices = evenly(len(dataset), limit or len(dataset))
+    shown = {indices[k] for k in evenly(len(indices), pictures)}
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
-    spent, sum_aee, scored, left_out, warm = 0.0, 0.0, 0, 0, WarmStart()
+    spent, sum_aee, scored, left_out, warm = 0.0, 0.0, 0, 0, WarmStart(warm_start)
     for done, i in enumerate(indices, 1):
         if (sample := dataset[i]) is None:
             left_out += 1
@@ -83,10 +83,7 @@ def evaluate(
         raw, scene = batch["raw"][0], batch["scene"][0]
         began = time.perf_counter()
         if method is None:
-            prediction = predict(model, warm.begin(batch, (scene, raw.new.t0)), precision=precision)
-            if warm_start:
-                warm.end(prediction, (scene, raw.new.t1))
-            flow = prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+            flow = warm.predict(model, batch, (scene, raw.new.t0), (scene, raw.new.t1), precision)
             if sharpen:
                 flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow)[0])
         else:
@@ -95,7 +92,7 @@ def evaluate(
         truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
         metrics = frame_metrics(flow, truth, valid)
         tallies["network"].add(scene, metrics)
-        for name, constant in zip(BASELINES, (np.zeros(2), median, *_from_truth(truth, valid)), strict=True):
+        for name, constant in zip(BASELINES, (np.zeros(2), median, *best_motions(truth, valid)), strict=True):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
@@ -117,13 +114,8 @@ def evaluate(
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
     }
     if out is not None:
-        write_json(out / "results.json", result)
+        write_whole(out / "results.json", json.dumps(result, indent=1) + "\n")
     return result
-
-
-def _evenly(of: int, count: int) -> list[int]:
-    """Return ``count`` integers from 0 to ``of`` - 1, evenly spaced, both ends included."""
-    return [int(k) for k in np.linspace(0, of - 1, min(count, of)).round()]
 
 
 def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
@@ -137,7 +129,7 @@ def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
     return {"model": config, "parameters": parameters_of(model), "device": name}
 
 
-def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the median (2,) and the least-squares affine field (H, W, 2) of the truth; zeros if nothing is valid."""
     if not valid.any():
         return np.zeros(2), np.zeros_like(truth)
@@ -159,12 +151,6 @@ def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
         rows.append(sample["flow"][:, ::8, ::8][:, keep].numpy())
     values = np.concatenate(rows, axis=1) if rows else np.zeros((2, 0))
     return np.median(values, axis=1) if values.size else np.zeros(2)
-
-
-def write_json(path: Path, tree: dict) -> None:
-    """Write a JSON file, completely or not at all."""
-    with atomic_file(path) as temporary, output_errors(path):
-        Path(temporary).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
 
 
 def show(result: dict[str, Any], console: Console | None = None) -> None:

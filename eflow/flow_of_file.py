@@ -16,7 +16,7 @@ from eflow.infer import StreamWindow
 from eflow.methods.contrast import LEAST_EVENTS, ContrastMaximisation
 from eflow.methods.iwe import flow_warp_loss
 from eflow.metrics import frame_metrics
-from eflow.pictures import FlowVideo, events_of, near_events
+from eflow.pictures import events_of, flow_video, near_events
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,12 @@ def show_flows(
     kept.clear()  # of the windows that were looked at to choose their length
     count = began = 0
     with contextlib.ExitStack() as opened:
-        writer = opened.enter_context(infer.FlowWriter(outputs.folder, npy=outputs.npy)) if outputs.folder else None
-        shown = FlowVideo(outputs.video, file.height, file.width, _fps(span)) if outputs.video else None
-        if shown:
-            opened.enter_context(shown)
+        writer = shown = None
+        if outputs.folder:
+            writer = opened.enter_context(infer.flow_folder(outputs.folder, npy=outputs.npy))
+        if outputs.video:
+            fps = min(20.0, 1e6 / span)  # windows per second of video: real time, but at most 20
+            shown = opened.enter_context(flow_video(outputs.video, file.height, file.width, fps))
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
@@ -163,8 +165,3 @@ def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> 
         if m:
             lines += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
     return lines
-
-
-def _fps(span_us: int) -> float:
-    """Return the windows per second of video: real time, but at most 20."""
-    return min(20.0, 1e6 / span_us)

@@ -15,9 +15,9 @@ import torch.nn.functional as F
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import atomic_folder, output_errors
-from blinkgl.io.flow import write_flow_png
+from blinkgl.io.flow import read_flo, read_flow_png, write_flow_png
 from blinkgl.io.formats import EventFile, open_events
-from blinkgl.io.images import encode_npy
+from blinkgl.io.images import encode_npy, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
 from eflow.data.representation import VoxelGrid
@@ -101,6 +101,11 @@ class StreamWindow:
     old: Window
     new: Window
 
+    @classmethod
+    def of(cls, events: Events, start: int, t_us: int, end: int) -> StreamWindow:
+        """Return the windows [start, t_us) and [t_us, end) µs of a stream."""
+        return cls(t_us, Window.of(events, start, t_us), Window.of(events, t_us, end))
+
 
 def windows(
     file: EventFile,
@@ -131,13 +136,13 @@ def windows(
                     where=f"{file.path}, {(t - start_us) / 1000:g} ms after the first",
                     accepted="--end-ms before the jump or --start-ms after it",
                 )
-            yield _pair(pending, t, span_us)
+            yield StreamWindow.of(pending, t - span_us, t, t + span_us)
             pending = pending.window(t, last + 1)
             t += span_us
         if end_us is not None and last >= end_us:
             return
     if t is not None and last + 1 >= t + span_us and (end_us is None or t + span_us <= end_us):
-        yield _pair(pending, t, span_us)
+        yield StreamWindow.of(pending, t - span_us, t, t + span_us)
 
 
 JUMP = 10_000
@@ -157,20 +162,14 @@ def likely_span(
     changed until that speed fits it, or until the flow no longer grows with it. Δ is at least 1 ms and at most half of
     the recording, or all of it if the predictor ``reads`` only the new window. Raises EventDataError: no events, or
     none at those places."""
-    ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
-    if not ends:
+    if (ends := ends_of(file)) is None:
         raise EventDataError("holds no events", where=str(file.path))
-    first, last = ends[0][0], ends[-1][1]
-    pair = 2 if "old" in reads else 1
-    longest = max((last + 1 - first) // pair, 1000)
+    first, last = ends
+    longest = max((last + 1 - first) // (2 if "old" in reads else 1), 1000)
     span, before = min(30_000, longest), None
     for _ in range(4):
         speeds = []
-        for place in (0.25, 0.5, 0.75):
-            start = max(first, min(round(first + place * (last - first)) - span, last + 1 - pair * span))
-            window = next(windows(file, span, start_us=start, reads=reads), None)
-            if window is None or not all(len(getattr(window, name)) for name in reads):
-                continue
+        for window in at_places(file, span, first, last, reads):
             flow, _ = predictor(window)
             speeds.append(float(np.median(np.hypot(*flow[window.new.y, window.new.x].T))))
         if not speeds:
@@ -194,6 +193,24 @@ def likely_span(
     return span, longest
 
 
+def ends_of(file: EventFile) -> tuple[int, int] | None:
+    """Return the times of the first and the last event, µs; None: there is none."""
+    ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
+    return (ends[0][0], ends[-1][1]) if ends else None
+
+
+def at_places(
+    file: EventFile, span: int, first: int, last: int, reads: Sequence[str] = ("old", "new")
+) -> Iterator[StreamWindow]:
+    """Yield a window, or pair, of ``span`` µs at a quarter, half and three quarters from ``first`` to ``last``; those
+    without events are left out."""
+    for place in (0.25, 0.5, 0.75):
+        start = max(first, min(round(first + place * (last - first)) - span, last + 1 - len(reads) * span))
+        window = next(windows(file, span, start_us=start, end_us=last + 1, reads=reads), None)
+        if window is not None and all(len(getattr(window, name)) for name in reads):
+            yield window
+
+
 def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tuple[StreamWindow, float]:
     """Return the whole file as one pair, and the factor from the flow of its new window to that of the whole file at
     constant velocity.
@@ -205,15 +222,7 @@ def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tupl
         raise EventDataError("fewer than two events", where=str(file.path))
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
     t = (t0 + t1) // 2 if "old" in reads else t0
-    cut = lambda a, b: Window(*(getattr(events.window(a, b), k) for k in "xytp"), a, b)
-    return StreamWindow(t, cut(t0, t), cut(t, t1)), (t1 - t0) / (t1 - t)
-
-
-def _pair(events: Events, t: int, span: int) -> StreamWindow:
-    old, new = events.window(t - span, t), events.window(t, t + span)
-    return StreamWindow(
-        t, Window(old.x, old.y, old.t, old.p, t - span, t), Window(new.x, new.y, new.t, new.p, t, t + span)
-    )
+    return StreamWindow.of(events, t0, t, t1), (t1 - t0) / (t1 - t)
 
 
 class MethodPredictor:
@@ -241,23 +250,29 @@ class MethodPredictor:
 
 
 class WarmStart:
-    """Starts the refinement of each window from the flow of the previous one, moved along itself, where it follows it.
+    """Predicts flow window by window. If ``on``, the refinement of each window starts from the flow of the previous
+    one, moved along itself, where it follows it.
 
     ``count`` : windows that did."""
 
-    def __init__(self):
-        self._end, self._low, self.count = None, None, 0
+    def __init__(self, on: bool):
+        self.on, self._end, self._low, self.count = on, None, None, 0
 
-    def begin(self, batch: dict, start: Hashable) -> dict:
-        """Return the batch with the initial flow, if a window ended at ``start``: a time, or a sequence and a time."""
-        if self._low is None or start != self._end:
-            return batch
-        self.count += 1
-        return {**batch, "flow_init": forward_warp(self._low)}
+    def predict(self, model: FlowModel, batch: dict, start: Hashable, end: Hashable, precision: str) -> np.ndarray:
+        """Return the flow (H, W, 2) px of a window, :func:`predict` of a batch of one.
 
-    def end(self, prediction: FlowPrediction | None, end: Hashable) -> None:
-        """Keep the flow of the window that ends at ``end``; None: it has none."""
-        self._end, self._low = end, None if prediction is None else prediction.low
+        start, end : of the window: a time, or a sequence and a time."""
+        if self._low is not None and start == self._end:
+            self.count += 1
+            batch = {**batch, "flow_init": forward_warp(self._low)}
+        prediction = predict(model, batch, precision=precision)
+        if self.on:
+            self._end, self._low = end, prediction.low
+        return prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+
+    def forget(self) -> None:
+        """Start the next window from nothing: this one has no flow."""
+        self._low = None
 
 
 class Predictor:
@@ -281,7 +296,7 @@ class Predictor:
     ):
         self.model, self.height, self.width = model, height, width
         self.precision, self.empty, self.sharpen = precision, empty, sharpen
-        self._warm = WarmStart() if warm_start else None
+        self._warm = WarmStart(warm_start)
         self.unsharpened: Counter[str] = Counter()
 
     def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
@@ -298,16 +313,10 @@ class Predictor:
         grids = {name: self.model.representation(w, self.height, self.width) for name, w in read.items()}
         new = grids["new"]
         if not all(len(w) for w in read.values()):
-            if self._warm is not None:
-                self._warm.end(None, None)
+            self._warm.forget()
             return np.zeros((self.height, self.width, 2), np.float32), new
         batch = {name: torch.from_numpy(grid)[None] for name, grid in grids.items()}
-        if self._warm is not None:
-            batch = self._warm.begin(batch, window.new.t0)
-        prediction = predict(self.model, batch, precision=self.precision)
-        if self._warm is not None:
-            self._warm.end(prediction, window.new.t1)
-        flow = prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+        flow = self._warm.predict(self.model, batch, window.new.t0, window.new.t1, self.precision)
         if self.sharpen:
             follows = len(window.old) and window.old.t1 == window.new.t0
             seen = [window.old, window.new] if follows else [window.new]
@@ -330,21 +339,12 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
     path : .npy of shape (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC) or .flo. Raises AssetError."""
     path = Path(path)
     if path.suffix == ".npy":
-        from blinkgl.io.images import read_npy
-
         flow = read_npy(path)
         flow = flow[0] if flow.ndim == 4 and flow.shape[0] == 1 else flow
         flow = np.moveaxis(flow, 0, -1) if flow.ndim == 3 and flow.shape[0] == 2 else flow
         flow = flow.astype(np.float32) if flow.ndim == 3 and flow.dtype.kind == "f" else flow
-    elif path.suffix == ".flo":
-        from blinkgl.io.flow import read_flo
-
-        flow, valid = read_flo(path)
-        flow = np.where(valid[..., None], flow, np.nan)
     else:
-        from blinkgl.io.flow import read_flow_png
-
-        flow, valid = read_flow_png(path)
+        flow, valid = (read_flo if path.suffix == ".flo" else read_flow_png)(path)
         flow = np.where(valid[..., None], flow, np.nan)
     if flow.shape != (height, width, 2):
         raise AssetError(
@@ -353,22 +353,25 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
     return flow
 
 
-class FlowWriter:
-    """Writes a new folder of flow, completely or not at all: ``%06d.png`` (DSEC's 16 bits), ``pictures/%06d.png`` and
-    ``timestamps.txt`` (from_us, to_us).
+@contextlib.contextmanager
+def flow_folder(final: str | os.PathLike, *, npy: bool = False) -> Iterator[FlowWriter]:
+    """Open a new folder of flow, which appears completely or not at all: ``%06d.png`` (DSEC's 16 bits),
+    ``pictures/%06d.png`` and ``timestamps.txt`` (from_us, to_us).
 
     npy : also write exact flow to ``npy/%06d.npy``, (H, W, 2) float32. Raises OutputError: the folder exists."""
+    with atomic_folder(final) as folder:
+        writer = FlowWriter(folder, Path(final), npy)
+        yield writer
+        with output_errors(final):
+            (folder / "timestamps.txt").write_text("\n".join(writer.lines) + "\n", encoding="utf-8")
 
-    def __init__(self, final: str | os.PathLike, *, npy: bool = False, pictures: bool = True):
-        self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
-        self._lines = ["# from_timestamp_us, to_timestamp_us"]
 
-    def __enter__(self) -> FlowWriter:
-        with contextlib.ExitStack() as opened:
-            self._tmp = opened.enter_context(atomic_folder(self.final))
-            opened.push(self._finish)
-            self._opened = opened.pop_all()
-        return self
+class FlowWriter:
+    """Writes windows into the folder of :func:`flow_folder`. lines : of its time stamps."""
+
+    def __init__(self, folder: Path, final: Path, npy: bool):
+        self._folder, self._final, self.npy, self.count = folder, final, npy, 0
+        self.lines = ["# from_timestamp_us, to_timestamp_us"]
 
     def add(
         self,
@@ -384,29 +387,20 @@ class FlowWriter:
         near = near_events(tensor)
         if at_events:
             valid &= near
-        write_flow_png(self._tmp / f"{name}.png", flow, valid)
-        with output_errors(self.final):
+        write_flow_png(self._folder / f"{name}.png", flow, valid)
+        with output_errors(self._final):
             if self.npy:
                 values = np.where(valid[..., None], flow, np.float32(np.nan)) if at_events else flow
                 self._part("npy", f"{name}.npy").write_bytes(encode_npy(values))
-            if self.pictures:
-                where = None if truth is None else np.isfinite(truth).all(-1)
-                strip = comparison(events_of(tensor), flow, truth, where, near=near)
-                write_picture(self._part("pictures", f"{name}.png"), strip)
-        self._lines.append(f"{window.new.t0}, {window.new.t1}")
+            where = None if truth is None else np.isfinite(truth).all(-1)
+            strip = comparison(events_of(tensor), flow, truth, where, near=near)
+            write_picture(self._part("pictures", f"{name}.png"), strip)
+        self.lines.append(f"{window.new.t0}, {window.new.t1}")
         self.count += 1
 
     def _part(self, folder: str, name: str) -> Path:
-        (self._tmp / folder).mkdir(exist_ok=True)
-        return self._tmp / folder / name
-
-    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            with output_errors(self.final):
-                (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
-
-    def __exit__(self, *error) -> bool | None:
-        return self._opened.__exit__(*error)
+        (self._folder / folder).mkdir(exist_ok=True)
+        return self._folder / folder / name
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from blinkgl.io.atomic import atomic_file
+from blinkgl.io.atomic import atomic_file, write_whole
 from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.images import encode_image
 from blinkgl.io.video import VideoWriter
@@ -99,42 +99,40 @@ def full_colour(flow: np.ndarray) -> float:
     return (float(np.percentile(speed, 99)) if speed.size else 0.0) or 1.0
 
 
-class FlowVideo:
-    """Writes a video of the events and flow of successive windows, completely or not at all.
+@contextmanager
+def flow_video(path: str | os.PathLike, height: int, width: int, fps: float) -> Iterator[FlowVideo]:
+    """Open a video that appears completely or not at all. Small sensors are enlarged twice.
 
-    The colour scale grows at once and falls slowly, so that colours do not flicker. Small sensors are enlarged twice.
     fps : windows per second of video. Raises OutputError: the video cannot be written."""
+    factor, still = 2 if height < 200 else 1, np.zeros((height, width, 2), np.float32)
+    blank = _fitted(comparison(np.zeros((height, width, 3), np.uint8), still), factor)
+    with atomic_file(path, overwrite=False) as final, VideoWriter(final, *blank.shape[:2], fps) as video:
+        yield FlowVideo(video, factor)
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, fps: float):
-        self._path, self._fps, self._factor, self._largest = path, fps, 2 if height < 200 else 1, 0.0
-        still = np.zeros((height, width, 2), np.float32)
-        blank = comparison(np.zeros((height, width, 3), np.uint8), still)
-        self._shape = self._fit(blank).shape
 
-    def __enter__(self) -> FlowVideo:
-        with ExitStack() as opened:
-            final = opened.enter_context(atomic_file(self._path, overwrite=False))
-            self._video = opened.enter_context(VideoWriter(final, *self._shape[:2], self._fps))
-            self._opened = opened.pop_all()
-        return self
+class FlowVideo:
+    """Draws the events and flow of successive windows into a video, enlarged by ``factor``.
+
+    The colour scale grows at once and falls slowly, so that colours do not flicker."""
+
+    def __init__(self, video: VideoWriter, factor: int):
+        self._video, self._factor, self._largest = video, factor, 0.0
 
     def add(self, caption: str, events: np.ndarray, flow: np.ndarray, near: np.ndarray | None = None) -> None:
         """Add one window.   caption : text above the events, e.g. their time.   events : (H, W, 3) uint8; flow (H, W,
         2) px.   near : as of :func:`comparison`."""
         told = flow if near is None or not near.any() else flow[near]
         self._largest = max(_STEADY * self._largest, full_colour(told))
-        self._video.write(self._fit(comparison(events, flow, largest=self._largest, caption=caption, near=near)))
+        strip = comparison(events, flow, largest=self._largest, caption=caption, near=near)
+        self._video.write(_fitted(strip, self._factor))
 
-    def _fit(self, strip: np.ndarray) -> np.ndarray:
-        """Return the strip enlarged and padded to an even height and width, which the codec needs."""
-        strip = strip.repeat(self._factor, 0).repeat(self._factor, 1)
-        return np.pad(strip, ((0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)), constant_values=255)
 
-    def __exit__(self, *error) -> bool | None:
-        return self._opened.__exit__(*error)
+def _fitted(strip: np.ndarray, factor: int) -> np.ndarray:
+    """Return the strip enlarged and padded to an even height and width, which the codec needs."""
+    strip = strip.repeat(factor, 0).repeat(factor, 1)
+    return np.pad(strip, ((0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)), constant_values=255)
 
 
 def write_picture(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write a PNG, completely or not at all."""
-    with atomic_file(path) as temporary:
-        Path(temporary).write_bytes(encode_image(image))
+    write_whole(path, encode_image(image))

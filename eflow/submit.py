@@ -17,7 +17,7 @@ from blinkgl.io.flow import encode_flow_png
 from blinkgl.io.images import encode_png
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import FolderSource, open_source
-from eflow.infer import WarmStart, predict
+from eflow.infer import WarmStart
 from eflow.models import FlowModel
 
 DSEC_SEQUENCES = (
@@ -187,14 +187,11 @@ def _flows(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield (number, flow) of every sample; with ``warm_start`` those that follow the one before start from its
     flow."""
-    dataset, warm = FlowDataset([source], model.representation, raw=True, reads=model.reads), WarmStart()
+    dataset, warm = FlowDataset([source], model.representation, raw=True, reads=model.reads), WarmStart(warm_start)
     for i in range(len(dataset)):
         batch = collate([dataset[i]])
         raw = batch["raw"][0]
-        prediction = predict(model, warm.begin(batch, (raw.scene, raw.new.t0)), precision=precision)
-        if warm_start:
-            warm.end(prediction, (raw.scene, raw.new.t1))
-        yield i, prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+        yield i, warm.predict(model, batch, (raw.scene, raw.new.t0), (raw.scene, raw.new.t1), precision)
         if progress is not None:
             progress(i + 1, len(dataset))
 

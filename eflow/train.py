@@ -34,7 +34,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from blinkgl.config.reader import to_yaml
 from blinkgl.errors import ConfigError
-from blinkgl.io.atomic import atomic_file, lock_folder, output_errors, refuse_existing
+from blinkgl.io.atomic import lock_folder, output_errors, refuse_existing, write_whole
 from eflow import checkpoint as ckpt
 from eflow.checkpoint import resume_run, weights_of
 from eflow.config import OptimConfig, TrainConfig
@@ -115,7 +115,7 @@ class Training:
         self.net = self._parallel()
         self.net.train()
         if self.lead:
-            _write_config(out, self.config)
+            write_whole(out / "config.yaml", as_yaml(self.config))
         self.began, self.read = time.monotonic(), Readings(out)
         self.course = Course(config.optim, clock(), spent, clock)
         self.done = self.course.done(self.start, self.device, self.world)
@@ -409,8 +409,3 @@ def _held(out: Path, resume: bool, begun: Callable[[], bool]) -> Iterator[None]:
             os.close(handle)
         if made and not begun():
             shutil.rmtree(out, ignore_errors=True)
-
-
-def _write_config(out: Path, config: TrainConfig) -> None:
-    with atomic_file(out / "config.yaml") as path, output_errors(path):
-        Path(path).write_text(as_yaml(config), encoding="utf-8")

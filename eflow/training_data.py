@@ -13,8 +13,8 @@ from torch import Tensor
 
 from blinkgl.config.run import derived_seed
 from blinkgl.errors import AssetError, ConfigError
-from eflow.config import SourceConfig, TrainConfig
-from eflow.data.dataset import FlowDataset, Key, Mixture, collate, is_endless
+from eflow.config import TrainConfig
+from eflow.data.dataset import FlowDataset, Key, Mixture, collate, evenly, is_endless
 from eflow.data.sources import Source, open_source
 from eflow.infer import predict
 from eflow.metrics import frame_metrics
@@ -70,8 +70,8 @@ def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, Fl
         else:
             source = open_source(s.path, s.format, dt=s.dt)
         dataset = FlowDataset([source], model.representation, empty=config.data.empty, reads=model.reads)
-        count = min(config.data.validate_samples, len(dataset))
-        sets.append((_title(s), dataset, [int(i) for i in np.linspace(0, len(dataset) - 1, count).round()]))
+        title = Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
+        sets.append((title, dataset, evenly(len(dataset), config.data.validate_samples)))
     return sets
 
 
@@ -85,10 +85,6 @@ def check_truth(dataset: FlowDataset, mixture: Mixture, validation: list[tuple[s
         samples = (sample for i in indices if (sample := scored[i]) is not None)
         if not any("flow" in s and (s["valid"] & s["mask"]).any() for s in samples):
             raise AssetError("no sample has events and a valid ground-truth pixel", where=f"data.validate_on: {name}")
-
-
-def _title(s: SourceConfig) -> str:
-    return Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@
 // crossing a line. A hidden line changes nothing, because both of its sides show one surface. Within the accuracy of
 // the samples the shares decide.
 //
-// contours.py computes which lines cross which pixels (line_drawer.py): one vertex and one point for each crossed pixel.
+// contours.py computes which lines cross which pixels (line_drawer.py): a vertex and a point for each crossed pixel.
 //
 // LIGHT: the type of a pixel's value, OF: its components in the picture.
 

@@ -11,11 +11,11 @@ import sys
 
 import numpy as np
 import pytest
-import typer
 
 from blinkgl import __version__, cli
 from blinkgl.errors import ConfigError
 from blinkgl.gl import ShaderError
+from blinkgl.machine.command_line import new_app
 
 
 def gone_of(program: str) -> list[str]:
@@ -28,7 +28,7 @@ def gone_of(program: str) -> list[str]:
 @pytest.fixture
 def failing(monkeypatch):
     """``failing(error)`` makes ``blinkgl fail`` raise it."""
-    app = typer.Typer(callback=cli._global_options)
+    app = new_app("blinkgl", "A command that fails.")
     error: list[BaseException] = []
 
     @app.command()

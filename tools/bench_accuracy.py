@@ -15,7 +15,7 @@ from importlib import resources
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from blinkgl.config.run import load_run
 from blinkgl.gl import create_context
@@ -88,9 +88,9 @@ def main() -> None:
         console.print(bench.machine_line(gl.renderer), highlight=False, soft_wrap=True)
         rows = [compare(gl, template, i) for i in range(options.sequences)]
     console.width = max(console.width, 110)
-    table = Table(title="labels against the float64 reference, off the one-pixel silhouette band", title_justify="left")
-    for name in ("sequence", *(str(r["sequence"]) for r in rows)):
-        table.add_column(name, justify="right")
+    columns = (Column(name, justify="right") for name in ("sequence", *(str(r["sequence"]) for r in rows)))
+    title = "labels against the float64 reference, off the one-pixel silhouette band"
+    table = Table(*columns, title=title, title_justify="left")
     line = lambda title, text: table.add_row(title, *(text(r) for r in rows))
     line("triangles", lambda r: f"{r['triangles']:,}")
     line("ids that differ (in the band)", lambda r: f"{r['ids_wrong']} ({r['ids_wrong_in_band']} of {r['band']:,})")

@@ -108,7 +108,8 @@ class _Page:
             children = [] if model is RigSensorConfig and name in SECTIONS else _models(info.annotation)
             known = [self.described[child] for child in children if child in self.described]
             rows[name] = self._row(name, info, known[0] if known and len(children) == 1 else None)
-            place = inner + (".<name>" if _is_dict(info.annotation) else "[]" if _is_list(info.annotation) else "")
+            origin = typing.get_origin(info.annotation)
+            place = inner + (".<name>" if origin is dict else "[]" if origin in (tuple, list) else "")
             for child in children:
                 tag = tag_of(child) if len(children) > 1 else None
                 below.append((child, place, f" with `{tag[0]}: {tag[1]}`" if tag else ""))
@@ -155,14 +156,6 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     if is_model(annotation):
         return members(annotation)
     return [m for a in typing.get_args(annotation) for m in _models(a)]
-
-
-def _is_dict(annotation: Any) -> bool:
-    return typing.get_origin(annotation) is dict
-
-
-def _is_list(annotation: Any) -> bool:
-    return typing.get_origin(annotation) in (tuple, list)
 
 
 def _type(info: FieldInfo) -> str:

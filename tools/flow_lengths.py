@@ -25,7 +25,7 @@ from blinkgl.machine.terminal import plain_console, say
 from blinkgl.tools.real_recordings import PANS, of_pans, table
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
-from eflow.data.window import RawSample
+from eflow.data.window import RawSample, hit_pixels
 from eflow.infer import Predictor, StreamWindow
 from eflow.models import FlowModel
 
@@ -113,9 +113,7 @@ def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -
     """Of every pair whose new window has events enough."""
     for pair, truth in pairs:
         height, width = truth.shape[:2]
-        hit = np.zeros((height, width), bool)
-        hit[pair.new.y, pair.new.x] = True
-        hit &= np.isfinite(truth).all(-1)
+        hit = hit_pixels([pair.new], height, width) & np.isfinite(truth).all(-1)
         if len(pair.new) < LEAST_EVENTS or not hit.any():
             continue
         true, row = truth[hit], []

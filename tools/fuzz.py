@@ -16,10 +16,10 @@ import contextlib
 import faulthandler
 import gzip
 import json
+import multiprocessing
 import os
 import re
 import resource
-import select
 import shlex
 import shutil
 import signal
@@ -32,6 +32,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from importlib import resources
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +64,7 @@ from eflow.data.sources import open_source
 HEIGHT, WIDTH = 24, 32
 CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048
 READ, REFUSED = "read", "refused"
+FORK = multiprocessing.get_context("fork")
 CONFIG = resources.files("blinkgl.configs") / "demo.yaml"
 
 
@@ -81,11 +83,11 @@ def _events() -> Events:
     return Events(x, y, np.sort(t), p)
 
 
-def _events_as(make: Callable[[Path], object] | None = None) -> Format:
-    """Events, written by ``make`` (None: as the ending says), are read; the whole parts of a damaged file, too."""
+Make = Callable[[Path, Events], object]
 
-    def write(path: Path) -> None:
-        write_events(path, _events(), HEIGHT, WIDTH)
+
+def _events_as(make: Make = lambda path, events: write_events(path, events, HEIGHT, WIDTH)) -> Format:
+    """Events, written by ``make`` (as the ending says), are read; the whole parts of a damaged file, too."""
 
     def read(path: Path) -> None:
         with contextlib.suppress(BlinkGLError), open_events(path, EventReading(damaged="keep", sort=True)) as file:
@@ -95,40 +97,36 @@ def _events_as(make: Callable[[Path], object] | None = None) -> Format:
             for events in sized.chunks():
                 assert not len(events) or (events.x.max() < sized.width and events.y.max() < sized.height)
 
-    return Format(make or write, read)
+    return Format(lambda path: make(path, _events()), read)
 
 
-def _es(path: Path) -> None:
+def _es(path: Path, e: Events) -> None:
     """Event Stream, version 2."""
-    data, e, last = bytearray(b"Event Stream" + bytes([2, 0, 0, 1, WIDTH, 0, HEIGHT, 0])), _events(), 0
+    data, last = bytearray(b"Event Stream" + bytes([2, 0, 0, 1, WIDTH, 0, HEIGHT, 0])), 0
     for x, y, t, p in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist()):
         data += b"\xff" * ((t - last) // 127) + bytes([(t - last) % 127 << 1 | p, x, 0, y, 0])
         last = t
     path.write_bytes(data)
 
 
-def _dat(path: Path) -> None:
-    e = _events()
+def _dat(path: Path, e: Events) -> None:
     rows = np.stack([e.t, e.x | e.y.astype(np.int64) << 14 | e.p.astype(np.int64) << 28], axis=1).astype("<u4")
     path.write_bytes(f"% Version 2\n% Height {HEIGHT}\n% Width {WIDTH}\n".encode() + bytes([12, 8]) + rows.tobytes())
 
 
-def _bin(path: Path) -> None:
-    e = _events()
+def _bin(path: Path, e: Events) -> None:
     rows = zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist())
     path.write_bytes(b"".join(bytes([x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255]) for x, y, t, p in rows))
 
 
-def _mat(path: Path) -> None:
-    e = _events()
+def _mat(path: Path, e: Events) -> None:
     savemat(path, {"events": {"x": e.x * 1.0, "y": e.y, "ts": e.t * 1.0, "p": e.p}}, do_compression=True)
 
 
-def _h5(*packed: Any) -> Callable[[Path], object]:
+def _h5(*packed: Any) -> Make:
     """Columns of a stranger's HDF5, packed by filters."""
 
-    def make(path: Path) -> None:
-        e = _events()
+    def make(path: Path, e: Events) -> None:
         with h5py.File(path, "w") as file:
             file["t_offset"] = np.array([7])
             for k, name in enumerate(("x", "y", "t", "p")):
@@ -137,14 +135,12 @@ def _h5(*packed: Any) -> Callable[[Path], object]:
     return make
 
 
-def _rows(path: Path) -> None:
-    e = _events()
+def _rows(path: Path, e: Events) -> None:
     with h5py.File(path, "w") as file:
         file["davis/left/events"] = np.stack([e.x, e.y, e.t * 1e-6, e.p * 2.0 - 1], axis=1)
 
 
-def _mat73(path: Path) -> None:
-    e = _events()
+def _mat73(path: Path, e: Events) -> None:
     with h5py.File(path, "w", userblock_size=512) as file:
         for name in "xytp":
             file[name] = getattr(e, name)[None]
@@ -152,19 +148,18 @@ def _mat73(path: Path) -> None:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
 
 
-def _gz(path: Path) -> None:
-    e = _events()
+def _gz(path: Path, e: Events) -> None:
     with gzip.open(path, "wt") as file:
         file.writelines(f"{t} {x} {y} {p}\n" for x, y, t, p in zip(e.x, e.y, e.t, e.p))
 
 
-def _bag(path: Path) -> None:
+def _bag(path: Path, e: Events) -> None:
     from rosbags.rosbag1 import Writer
 
     from blinkgl.io.ros import event_array, typestore
 
     with Writer(path) as bag:
-        kind, data = event_array(_events(), HEIGHT, WIDTH)
+        kind, data = event_array(e, HEIGHT, WIDTH)
         bag.write(bag.add_connection("/events", kind, typestore=typestore(False)), 1, data)
 
 
@@ -368,24 +363,28 @@ def judge(read: Callable[[Path], object], path: Path) -> str:
 
 def in_a_process(read: Callable[[Path], object], path: Path) -> str:
     """:func:`judge` in a child that may die or hang."""
-    receiver, sender = os.pipe()
+    receiver, sender = FORK.Pipe(duplex=False)
     sys.stdout.flush()
-    pid = os.fork()
-    if pid == 0:
-        _limit()
-        os.write(sender, judge(read, path).encode("utf-8", "replace")[:4000])
-        os._exit(0)
-    os.close(sender)
-    answered = bool(select.select([receiver], [], [], WALL_S)[0])
-    text = os.read(receiver, 4096).decode() if answered else ""
-    os.close(receiver)
+    child = FORK.Process(target=_answer, args=(sender, read, path))
+    child.start()
+    sender.close()
+    answered, text = receiver.poll(WALL_S), ""
+    with contextlib.suppress(EOFError):  # the child has died
+        text = receiver.recv() if answered else ""
     if not answered:
-        os.kill(pid, signal.SIGKILL)
-    _, status = os.waitpid(pid, 0)
+        child.kill()
+    child.join()
     if text:
         return text
-    killed = not answered or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU)
-    return "hangs" if killed else f"the process ends with status {os.waitstatus_to_exitcode(status)}"
+    killed = not answered or child.exitcode == -signal.SIGXCPU
+    return "hangs" if killed else f"the process ends with status {child.exitcode}"
+
+
+def _answer(sender: Connection, read: Callable[[Path], object], path: Path) -> None:
+    """Of the child: what is said of a file."""
+    _limit()
+    sender.send(judge(read, path)[:4000])
+    os._exit(0)
 
 
 def _limit() -> None:

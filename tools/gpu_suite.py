@@ -38,7 +38,7 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import BlinkGLError
 from blinkgl.events.table import emulator_of
 from blinkgl.gl import create_context
-from blinkgl.io.atomic import atomic_file
+from blinkgl.io.atomic import write_whole
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.show import doctor
@@ -285,8 +285,7 @@ def write(out: Path, report: dict[str, Any]) -> None:
     plain = lambda value: value.item() if isinstance(value, np.generic) else str(value)
     text = json.dumps(report, indent=1, default=plain)
     for name, content in (("gpu_suite.json", text), ("gpu_suite.md", "\n".join(lines))):
-        with atomic_file(out / name, overwrite=True) as part:
-            part.write_text(content + "\n", encoding="utf-8")
+        write_whole(out / name, content + "\n")
 
 
 def measured(name: str, options: Namespace, deadline: float, report: dict[str, Any]) -> dict[str, Any]:

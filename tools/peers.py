@@ -16,9 +16,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from pathlib import Path
 from statistics import median
+from types import ModuleType
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -27,8 +28,8 @@ from blinkgl.machine.bench import machine_line
 from blinkgl.tools.bench import FPS, HEIGHT, WIDTH, clip
 
 PAGE = Path("docs/peers.md")
-NOT_USED = ("screeninfo", "easygui", "tkinter", "engineering_notation", "dv_processing")
-"""Modules that v2e imports for its windows and output files and that need not be installed here."""
+NOT_USED = ("screeninfo", "easygui", "tkinter", "engineering_notation", "dv_processing", "easydict")
+"""Modules that the programs import for windows, output files and options, and that need not be installed here."""
 PARAMETERS = {
     "v2e": "its command line's defaults",
     "voltmeter": "the authors' values for a DVS346",
@@ -50,14 +51,24 @@ def ours(kind: str) -> Step:
     return lambda frame, t: len(emulator.step(frame.astype(np.float32) / 255, round(t * 1e9)))
 
 
-def v2e(checkout: str) -> Step:
-    """A step of v2e's own emulator."""
+def imported(checkout: str, module: str) -> ModuleType:
+    """A module of a checkout, with one thread."""
     import torch
 
     torch.set_num_threads(1)
     sys.path.insert(0, checkout)
     sys.modules.update({name: MagicMock() for name in NOT_USED if name not in sys.modules})
-    emulator = importlib.import_module("v2ecore.emulator").EventEmulator(
+    return importlib.import_module(module)
+
+
+def counted(events: Sized | None) -> int:
+    """The number of events that an authors' program returns."""
+    return 0 if events is None else len(events)
+
+
+def v2e(checkout: str) -> Step:
+    """A step of v2e's own emulator."""
+    emulator = imported(checkout, "v2ecore.emulator").EventEmulator(
         pos_thres=0.2,
         neg_thres=0.2,
         sigma_thres=0.03,
@@ -67,30 +78,15 @@ def v2e(checkout: str) -> Step:
         refractory_period_s=0.0005,
         device="cpu",
     )
-
-    def step(frame: np.ndarray, t: float) -> int:
-        events = emulator.generate_events(frame.astype(np.float32), t)
-        return 0 if events is None else len(events)
-
-    return step
+    return lambda frame, t: counted(emulator.generate_events(frame.astype(np.float32), t))
 
 
 def voltmeter(checkout: str) -> Step:
     """A step of the DVS-Voltmeter authors' own simulator."""
-    import torch
-
-    torch.set_num_threads(1)
-    sys.path.insert(0, checkout)
-    sys.modules.setdefault("easydict", MagicMock())
     config = MagicMock()
     config.SENSOR.K = K
-    simulator = importlib.import_module("src.simulator").EventSim(config, "", "")
-
-    def step(frame: np.ndarray, t: float) -> int:
-        events = simulator.generate_events(frame, round(t * 1e6))
-        return 0 if events is None else len(events)
-
-    return step
+    simulator = imported(checkout, "src.simulator").EventSim(config, "", "")
+    return lambda frame, t: counted(simulator.generate_events(frame, round(t * 1e6)))
 
 
 def timed(program: str, checkout: str, density: str, frames: int) -> dict[str, float]:

@@ -20,8 +20,8 @@ from pathlib import Path
 
 from blinkgl.config.quality import QUALITIES
 from blinkgl.config.reader import apply_overrides, to_yaml
-from blinkgl.config.run import RunTemplate
 from blinkgl.tools.trade.settings import excess, suite_design
+from blinkgl.tools.trade.suite import meaning
 
 KEPT = (
     "name",
@@ -114,12 +114,6 @@ def main() -> None:
         beaten = [f"{scene} by {100 * e:.0f} %" for scene, _, e in found if e > 0]
         print(f"{quality}: {name}: not beaten in {len(found) - len(beaten)} of {len(found)}; {', '.join(beaten)}")
         (folder / f"{quality}.yaml").write_text(preset_text(quality, name, kept), encoding="utf-8")
-
-
-def meaning(overrides: tuple[str, ...]) -> dict:
-    """What ``explain`` compares a configuration with: timeline and render, every value filled in."""
-    config = RunTemplate(apply_overrides({"quality": None}, list(overrides)), Path()).sequence(0)
-    return {"timeline": config.timeline.model_dump(), "render": config.render.model_dump()}
 
 
 def _short(value: object) -> object:

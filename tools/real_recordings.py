@@ -34,7 +34,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -48,7 +48,8 @@ from blinkgl.scene.surfaces.images import photographs
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
-from eflow.data.window import Window, hit_pixels
+from eflow.data.window import hit_pixels
+from eflow.evaluate import best_motions
 from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
 from eflow.methods.iwe import flow_warp_loss
 from eflow.methods.table import METHODS, make_method
@@ -100,11 +101,7 @@ def looked_at(path: Path) -> tuple[Events, int, int]:
 
 def cut(events: Events, t: int, span: int) -> StreamWindow:
     """The pair of windows of ``span`` µs that meet at t."""
-    sides = []
-    for t0 in (t - span, t):
-        e = events.window(t0, t0 + span)
-        sides.append(Window(e.x, e.y, e.t, e.p, t0, t0 + span))
-    return StreamWindow(t, *sides)
+    return StreamWindow.of(events, t - span, t, t + span)
 
 
 def answer_of(name: str, height: int, width: int, focal: float | None = None) -> Answer:
@@ -117,6 +114,11 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
     else:
         predictor = Predictor(load_model(plain), height, width, empty="zero", sharpen=plain != name)
     return lambda window: predictor(window)[0]
+
+
+def reads_two(name: str) -> bool:
+    """Whether it is a network that reads two windows, of a burst its halves."""
+    return name not in METHODS and "old" in load_model(name.removesuffix(SHARPENED)).reads
 
 
 def likely_span(events: Events, height: int, width: int) -> int:
@@ -156,8 +158,7 @@ def judged(path: Path, names: list[str], most: int) -> dict[str, Any]:
         spent = (time.process_time() - began) / len(pairs)
         cosines, lengths, along = [], [], []
         for pair, flow, other, fwl in zip(pairs, flows, best, sharp, strict=True):
-            hit = np.zeros((height, width), bool)
-            hit[pair.new.y, pair.new.x] = True
+            hit = hit_pixels([pair.new], height, width)
             mine, its = flow[hit].astype(np.float64), other[hit].astype(np.float64)
             sizes = np.hypot(*mine.T), np.hypot(*its.T)
             along.append(float(np.abs(mine[:, 0]).sum() / max(sizes[0].sum(), 1e-9)))
@@ -176,36 +177,47 @@ def judged(path: Path, names: list[str], most: int) -> dict[str, Any]:
     return {"size": size, "span_ms": span / 1000, "windows": len(pairs), "moves": float(np.median(sharp)), "rows": rows}
 
 
+class Burst(NamedTuple):
+    """A burst with its flow, (H, W, 2) px, NaN where it is unknown, and the focal length of its camera, px."""
+
+    events: Events
+    truth: np.ndarray
+    focal: float
+
+    @classmethod
+    def read(cls, folder: Path) -> Burst:
+        """Return the burst of a folder. Raises BlinkGLError."""
+        events, height, width = read(folder / "events.txt")
+        focal = float((folder / "calib.txt").read_text().split()[0])
+        return cls(events, read_truth(folder / "flow.npy", height, width).astype(np.float64), focal)
+
+    @property
+    def times(self) -> tuple[int, int, int]:
+        """First time, middle and end, µs."""
+        t0, t1 = int(self.events.t[0]), int(self.events.t[-1]) + 1
+        return t0, (t0 + t1) // 2, t1
+
+
 def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
     """A burst with its flow, as one window, for each: AEE, its share of zero flow's, cosine (mean over pixels), all
     pixels and those with events; and what the best constant and affine flow would have."""
-    events, height, width = read(folder / "events.txt")
-    truth = read_truth(folder / "flow.npy", height, width).astype(np.float64)
-    focal = float((folder / "calib.txt").read_text().split()[0])
-    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
-    whole = Window(events.x, events.y, events.t, events.p, t0, t1)
-    middle = (t0 + t1) // 2
-    halves = cut(events, middle, t1 - middle)
-    valid = np.isfinite(truth).all(-1)
-    hit = np.zeros_like(valid)
-    hit[events.y, events.x] = True
+    events, truth, focal = known = Burst.read(folder)
+    (height, width), (t0, middle, t1) = truth.shape[:2], known.times
+    # A method's flow is over its new window, which must lie behind an old one.
+    whole, halves = cut(events, t0, t1 - t0), cut(events, middle, t1 - middle)
+    valid, hit = np.isfinite(truth).all(-1), hit_pixels([whole.new], height, width)
     flows = best_of(truth, valid)
-    nothing = events.x[:0], events.y[:0], events.t[:0], events.p[:0]
     for name in names:
         if name in METHODS:
-            # A method's flow is over its new window, which must lie behind an old one.
-            empty = Window(*nothing, t0 - (t1 - t0), t0)
             try:
-                flows[name] = make_method(name, focal)(empty, whole, height, width)
+                flows[name] = make_method(name, focal)(whole.old, whole.new, height, width)
             except BlinkGLError as error:
                 print(f"{name}: {error}")
             continue
-        plain = name.removesuffix(SHARPENED)
-        model = load_model(plain)
-        predictor = Predictor(model, height, width, empty="zero", sharpen=plain != name)
-        if "old" not in model.reads:
-            flows[name] = predictor(StreamWindow(t0, Window(*nothing, t0 - (t1 - t0), t0), whole))[0]
-        flows[f"{name}, halves"] = predictor(halves)[0] * ((t1 - t0) / (t1 - middle))
+        answer = answer_of(name, height, width)
+        if not reads_two(name):
+            flows[name] = answer(whole)
+        flows[f"{name}, halves"] = answer(halves) * ((t1 - t0) / (t1 - middle))
     return {name: row_of([(np.asarray(flow, np.float64), truth, valid, hit)]) for name, flow in flows.items()}
 
 
@@ -219,19 +231,14 @@ def changed(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
     """AEE of a burst as a share of zero flow's, at its pixels with events, for each name: of a share of its events
     (:data:`SHARES`), and in the middle of larger sensors (:data:`SENSORS`). A network of two windows has the burst's
     halves."""
-    events, height, width = read(folder / "events.txt")
-    truth = read_truth(folder / "flow.npy", height, width).astype(np.float64)
-    focal = float((folder / "calib.txt").read_text().split()[0])
-    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
-    middle, rows = (t0 + t1) // 2, {}
+    events, truth, focal = known = Burst.read(folder)
+    (height, width), (t0, middle, t1), rows = truth.shape[:2], known.times, {}
 
     def error(name: str, part: Events, wide: int, high: int) -> float:
         left, top = (wide - width) // 2, (high - height) // 2
         moved = Events(part.x + np.uint16(left), part.y + np.uint16(top), part.t, part.p)
-        halves = name not in METHODS and "old" in load_model(name.removesuffix(SHARPENED)).reads
-        pair, factor = (
-            (cut(moved, middle, t1 - middle), (t1 - t0) / (t1 - middle)) if halves else (cut(moved, t0, t1 - t0), 1)
-        )
+        meet = middle if reads_two(name) else t0
+        pair, factor = cut(moved, meet, t1 - meet), (t1 - t0) / (t1 - meet)
         flow = answer_of(name, high, wide, focal)(pair)[top : top + height, left : left + width] * factor
         hit = (
             np.isfinite(truth).all(-1)
@@ -253,13 +260,11 @@ def changed(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
 
 def best_of(truth: np.ndarray, valid: np.ndarray) -> dict[str, np.ndarray]:
     """Zero flow, and the best constant and affine flow, which know the truth (H, W, 2)."""
-    v, u = np.mgrid[: truth.shape[0], : truth.shape[1]]
-    basis = np.stack([np.ones_like(u), u, v], -1).astype(np.float64)
-    fit = np.linalg.lstsq(basis[valid], truth[valid], rcond=None)[0]
+    median, affine = best_motions(truth, valid)
     return {
         "zero": np.zeros_like(truth),
-        "best constant": np.broadcast_to(np.median(truth[valid], 0), truth.shape),
-        "best affine": basis @ fit,
+        "best constant": np.broadcast_to(median, truth.shape),
+        "best affine": affine,
     }
 
 

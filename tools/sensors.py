@@ -43,7 +43,7 @@ from blinkgl.recordings.judge import judge
 from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import sums
-from blinkgl.tools.real_recordings import read
+from blinkgl.tools.real_recordings import read, table
 from blinkgl.types.events import Events
 
 FIT, WHOLE = 1_000_000, 10**10
@@ -172,7 +172,7 @@ def row(clip: Clip, config: EmulatorConfig, kick: float = 0.0) -> list[str]:
 
 def lines(found: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterator[str]:
     heads = ["judged by", "fitted to", "rate", "intervals, KS", "polarity", "counts", "judge"]
-    table = ["| camera, emulator | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+    rows: list[list[str]] = []
     for (camera, recordings), emulator in itertools.product(found.items(), emulators):
         small, whole = ({name: make(most) for name, make in recordings.items()} for most in (FIT, WHOLE))
         middle = of_camera(list(small.values()), camera, emulator)
@@ -184,13 +184,11 @@ def lines(found: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterat
             for said, values in (("the others", others), ("all", middle)):
                 config = emulator_config({"emulator": emulator, **noise(camera, emulator), **values})
                 kick = kick_of(clip, config) if len(clip.bursts) and said == "all" else KICK
-                table.append(
-                    f"| {camera}, {emulator} | {name} | {said} | " + " | ".join(row(clip, config, kick)) + " |"
-                )
+                rows.append([f"{camera}, {emulator}", name, said, *row(clip, config, kick)])
                 if len(clip.bursts) and said == "all":
                     every = resets(clip, kick).frame_resets.interval_ms
                     yield f"{camera}, {name}, {emulator}: resets every {every:.1f} ms by {kick:.2f} thresholds"
-    yield from table
+    yield table("camera, emulator", heads, rows)
 
 
 def picture(found: dict[str, dict[str, MakeClip]], emulators: list[str], path: Path) -> None:

@@ -22,9 +22,11 @@ _GRID = 33  # grid points along each side of the picture at which the magnificat
 def radius_limit(coefficients: tuple[float, ...]) -> float:
     """Return the smallest r > 0 with g'(r) = 0, where ``g(r) = r (1 + k1 r^2 + k2 r^4 + …)`` stops growing; inf if it
     always grows."""
+    # g'(r) = 1 + 3 k1 r^2 + 5 k2 r^4 + …, a polynomial in r^2.
     slopes = [(2 * i + 3) * k for i, k in enumerate(coefficients)]
     roots = np.roots([*reversed(slopes), 1.0])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    # The roots are squares of radii.
     return float(np.sqrt(real.min())) if len(real) else math.inf
 
 
@@ -47,6 +49,7 @@ def radial_inverse(y: np.ndarray, coefficients: tuple[float, ...], limit: float)
     :data:`STEPS` steps at most."""
     y = np.asarray(y, np.float64)
     low, high = np.zeros_like(y), np.full_like(y, min(1.0, limit))
+    # The upper end is doubled until g reaches y there, or until it is at the limit.
     for _ in range(STEPS):
         short = (high < limit) & (high * radial(high, coefficients)[0] < y)
         if not short.any():
@@ -109,6 +112,7 @@ class DistortedModel(CameraModel):
         """Return (4, n, 2) px along the picture's sides (top, bottom, left, right), a pixel apart or less."""
         n = max(self.width, self.height) + 1
         x, y = np.linspace(-0.5, self.width - 0.5, n), np.linspace(-0.5, self.height - 0.5, n)
+        # The edges' coordinates: left and top; bottom; right.
         ends = [np.full(n, v) for v in (-0.5, self.height - 0.5, self.width - 0.5)]
         return np.stack([np.stack(s, axis=-1) for s in ((x, ends[0]), (x, ends[1]), (ends[0], y), (ends[2], y))])
 
@@ -157,6 +161,7 @@ class DistortedModel(CameraModel):
 
 def largest_stretch(J: np.ndarray) -> np.ndarray:
     """Return the (n,) largest singular values of (n, 2, 3) Jacobians: the largest factor on a step's length."""
+    # J J^T is [[a, b], [b, c]], and the root of its larger eigenvalue is the largest singular value of J.
     a, b, c = (J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)
     return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
 

@@ -53,6 +53,7 @@ def _seen_through(camera: DistortedModel) -> PinHole:
     # d(X / Z, Y / Z) / d px: its smallest singular value tells where pixels are closest to each other.
     z = rays[:, 2, None]
     slopes = camera.ray_jacobian(xy)
+    # The quotient rule on (X / Z, Y / Z).
     slopes = (slopes[:, :2] - rays[:, :2, None] / z[..., None] * slopes[:, 2:]) / z[..., None]
     focal = DENSITY / float(np.linalg.svd(slopes, compute_uv=False)[:, 1].min())
     left, right, top, bottom = edges
@@ -64,4 +65,5 @@ def _seen_through(camera: DistortedModel) -> PinHole:
             value=list(camera.distortion),
             accepted=f"at most {LARGEST} along a side: less distortion, or fewer pixels",
         )
+    # x0 and y0 are edges of the first pixel, whose centre, pixel 0, lies half a pixel further.
     return PinHole(x1 - x0, y1 - y0, focal, focal, -x0 - 0.5, -y0 - 0.5, camera.near)

@@ -45,6 +45,7 @@ class Equidistant(DistortedModel):
 
     @property
     def plane_limit(self) -> float:
+        # Directions at 90 degrees or more have no point on the plane Z = 1, so it sets no limit.
         return min(math.tan(self._limit), 1e18) if self._limit < math.pi / 2 else 1e18
 
     @property
@@ -58,6 +59,7 @@ class Equidistant(DistortedModel):
         x, y, z = np.moveaxis(points, -1, 0)
         rho = np.hypot(x, y)
         theta = np.arctan2(rho, z)
+        # The centre of the camera has no direction, so it is nan as well.
         theta = np.where((theta < self._limit) & (rho + np.abs(z) > 0), theta, np.nan)
         off = rho > 0
         return (
@@ -86,6 +88,7 @@ class Equidistant(DistortedModel):
         with np.errstate(divide="ignore", invalid="ignore"):
             across = np.where(rho > 0, theta * ratio / rho, 1 / z)  # the limit on the axis
         out = np.empty((*z.shape, 2, 3))
+        # With d = (c, s) the derivative is along d d^T + across (I - d d^T): along the radius and across it.
         out[..., 0, 0] = along * c * c + across * s * s
         out[..., 1, 1] = along * s * s + across * c * c
         out[..., 0, 1] = out[..., 1, 0] = (along - across) * c * s
@@ -116,11 +119,13 @@ class Equidistant(DistortedModel):
         distance, c, s, theta = self._angles(np.asarray(xy, np.float64))
         slope = radial(theta, self._k)[1]
         across = np.divide(np.sin(theta), distance, out=np.ones_like(distance), where=distance > 0)
+        # Split along the radius and across it, as in ``jacobian``.
         out = np.empty((*distance.shape, 3, 2))
         along = np.cos(theta) / slope
         out[..., 0, 0] = along * c * c + across * s * s
         out[..., 1, 1] = along * s * s + across * c * c
         out[..., 0, 1] = out[..., 1, 0] = (along - across) * c * s
+        # Z = cos theta, so dZ = -sin theta d theta, along the radius only.
         out[..., 2, 0], out[..., 2, 1] = -np.sin(theta) / slope * c, -np.sin(theta) / slope * s
         out[np.isnan(theta)] = np.nan
         return out / [self.fx, self.fy]

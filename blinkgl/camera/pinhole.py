@@ -26,6 +26,7 @@ class PinHole(CameraModel):
     @classmethod
     def centred(cls, width: int, height: int, fx: float, fy: float | None = None, near: float = 0.05) -> PinHole:
         """Return a camera with the principal point in the middle of the image; ``fy``: default fx."""
+        # Pixel centres are at whole numbers, so the middle of the image is at (size - 1) / 2.
         return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
 
     def from_lens_point(self, a: float, b: float, focus: float) -> PinHole:
@@ -49,6 +50,7 @@ class PinHole(CameraModel):
         out = np.zeros((*z.shape, 2, 3))
         out[..., 0, 0], out[..., 0, 2] = self.fx / z, -self.fx * x / z**2
         out[..., 1, 1], out[..., 1, 2] = self.fy / z, -self.fy * y / z**2
+        # There are no cross terms, but they are nan where the point is not visible.
         out[..., 0, 1] = out[..., 1, 0] = np.where(z > 0, 0.0, np.nan)
         return out
 
@@ -103,6 +105,7 @@ class PinHole(CameraModel):
         # Not by `project`, to save time: this runs for every moving body in every frame, and no point here is behind
         # the camera.
         x, y = self.fx * points[:, 0] / z + self.cx, self.fy * points[:, 1] / z + self.cy
+        # A pixel of margin on each side; x1 and y1 are exclusive.
         x0, x1 = max(0, math.floor(x.min()) - 1), min(self.width, math.ceil(x.max()) + 2)
         y0, y1 = max(0, math.floor(y.min()) - 1), min(self.height, math.ceil(y.max()) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None

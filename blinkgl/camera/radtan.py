@@ -73,6 +73,7 @@ class Radtan(DistortedModel):
         D[:, 0, 0] = ratio + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
         D[:, 1, 1] = ratio + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
         D[:, 0, 1] = D[:, 1, 0] = cross
+        # The map is one-to-one while both leading minors of its symmetric derivative are positive.
         inside = (np.sqrt(r2) < self._limit) & (D[:, 0, 0] > 0) & (D[:, 0, 0] * D[:, 1, 1] > cross * cross)
         out[~inside], D[~inside] = np.nan, np.nan
         return out, D
@@ -87,6 +88,7 @@ class Radtan(DistortedModel):
         r = radial_inverse(distance, (self.k1, self.k2, self.k3), self._limit)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = d * np.where(distance > 0, r / distance, 1.0)[:, None]
+        # Without a tangential part the radial inverse is the whole inverse.
         if self.p1 == 0.0 and self.p2 == 0.0:
             return np.where((distance <= self.reach)[:, None] & (np.hypot(u[:, :1], u[:, 1:]) < self._limit), u, np.nan)
         at, D = self._distort(u)
@@ -98,6 +100,7 @@ class Radtan(DistortedModel):
         error, scale = at - d, np.ones(len(u))
         size = np.linalg.norm(error, axis=1)
         for _ in range(STEPS):
+            # Points that are not solved to rounding and whose step has not been halved to nothing.
             active = (size > 1e-15 * (1 + distance)) & (scale > 1e-9)
             if not active.any():
                 break
@@ -108,6 +111,7 @@ class Radtan(DistortedModel):
             good = k[nearer]
             u[good], D[good], error[good] = trial[nearer], slopes[nearer], at[nearer] - d[good]
             size[good] = np.linalg.norm(error[good], axis=1)
+            # After a step that came nearer the next one is twice as long, up to Newton's own; after another it is half.
             scale[k] = np.where(nearer, np.minimum(1.0, 2 * scale[k]), 0.5 * scale[k])
         return np.where((size <= 1e-12 * (1 + distance))[:, None], u, np.nan)
 
@@ -124,6 +128,7 @@ class Radtan(DistortedModel):
         flat = points.reshape(-1, 3)
         z = np.where(flat[:, 2] > 0, flat[:, 2], np.nan)
         u = flat[:, :2] / z[:, None]
+        # The derivative of (X / Z, Y / Z) by (X, Y, Z).
         flattening = np.zeros((len(flat), 2, 3))
         flattening[:, 0, 0] = flattening[:, 1, 1] = 1 / z
         flattening[:, :, 2] = -u / z[:, None]
@@ -144,5 +149,6 @@ class Radtan(DistortedModel):
         # Cramer's rule, through which the nan of a pixel without a ray passes.
         inverse = np.stack([D[:, 1, 1], -D[:, 0, 1], -D[:, 1, 0], D[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
         inverse /= (D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0])[:, None, None]
+        # Z of a ray is always 1, so its row is 0, and nan where there is no ray.
         out = np.concatenate([inverse / [self.fx, self.fy], 0.0 * inverse[:, :1]], axis=1)
         return out.reshape(*xy.shape[:-1], 3, 2)

@@ -74,6 +74,7 @@ class RayCluster:
         self._expected = hellos[0]["environment"], hellos[0]["assets"]
         here = self._affinity(ray.get_runtime_context().get_node_id(), soft=True)
         self._board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
+        # Ray repeats nothing by itself: the run counts the attempts.
         self._work = ray.remote(_work).options(num_cpus=1, num_gpus=self._gpus, max_retries=0)
         return hellos
 
@@ -88,6 +89,7 @@ class RayCluster:
         if not self._tasks:
             return []
         ready, _ = self._ray.wait(list(self._tasks), num_returns=1, timeout=timeout_s)
+        # Whatever else is ready by now is collected in the same turn.
         more, _ = self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=0)
         for message in self._news():
             if message["task"] in self._tasks.values():

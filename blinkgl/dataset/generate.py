@@ -115,6 +115,7 @@ def generate_run(
         gl = None
         for task in plan.tasks:
             config = plan.config(task)
+            # The first sequence that is drawn opens the context, which the others share.
             if gl is None and config.frames is None:
                 gl = stack.enter_context(create_context(config.gl.backend, config.gl.device))
             yield generate_sequence(config, task.index, out, gl, base=template.base, progress=progress)

@@ -119,6 +119,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     if taken is not None:
         about["camera"] = {"image": taken[0], **asdict(taken[1])}
     with DsecEventReader(folder / "events.h5", size=(manifest["height"], manifest["width"])) as reader:
+        # The interval before the label is as long as the label's own.
         windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
         if EVENT_LABELS in manifest["files"]:
             first = reader.number(2 * start - end), reader.number(start)
@@ -143,6 +144,7 @@ def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]
     if POSES not in manifest["files"]:
         return {}
     poses = read_poses(folder / POSES)
+    # The pose whose microsecond is nearest to the label's.
     T_world_cam = poses["T_world_cam"][int(np.argmin(np.abs(poses["t_ns"] // 1000 - t_us)))]
     return {"K": poses["K"].tolist(), "near": float(poses["near"]), "T_world_cam": T_world_cam.tolist()}
 

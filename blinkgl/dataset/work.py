@@ -263,4 +263,5 @@ def _disk_is_full(error: BaseException) -> bool:
         if isinstance(error, OutputError) and "no space" in error.problem:
             return True
         error = error.__cause__
+    # The operating system's error is often the cause of a BlinkGLError.
     return False

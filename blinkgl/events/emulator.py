@@ -150,6 +150,7 @@ class Emulator(ABC):
                 accepted=f"at most {MAX_CAUSE_ROWS} rows, or events without causes",
             )
         first, stop = (0, self.height) if rows is None or self.t_ns is None else rows
+        # [first, stop) in pixels: the rows that may differ from the last frame's.
         self._changed = (max(0, first) * self.width, min(self.height, stop) * self.width)
         self._check_intensity(frame)
         events = self._start(frame, t_ns) if self.t_ns is None else self._advance(frame, t_ns)
@@ -249,6 +250,7 @@ class Emulator(ABC):
         progress = np.zeros((bands, 3), np.int64)  # next block, events so far, events cut
         progress[:, 0] = edges[:-1]
         while True:
+            # The first room is for one event of every fourth pixel.
             packed = self._buffer.rows(bands, self.height * self.width // (4 * bands))
             run(kernel, bands, (edges, progress, share, packed, *arguments), threads)
             if (progress[:, 0] >= edges[1:]).all():

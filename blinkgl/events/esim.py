@@ -252,6 +252,7 @@ class Esim(Emulator):
 
     Config = EsimConfig
     _still_pixels_sleep = True
+    # Thresholds of the pixels are drawn again from the seed, so a saved state does not hold them.
     _state: ClassVar[tuple[str, ...]] = ("_upper", "_lower", "_fired", "_last_ns", "_log")
 
     @classmethod
@@ -294,6 +295,7 @@ class Esim(Emulator):
         self._tables_changed()
 
     def _tables_changed(self) -> None:
+        # A uint8 frame has 256 values, so their logarithms are taken once and looked up.
         self._table = log_q25(self._decode + np.float32(self.config.log_eps))
 
     def _start(self, frame: np.ndarray, t_ns: int) -> Events:

@@ -35,7 +35,7 @@ class Stream(IntEnum):
     JITTER = 1  # (ON, OFF) threshold jitter, index = the pixel's event count
     LEAK = 2  # (leak rate, hot pixel) frozen per pixel
     LEAK_JITTER = 3
-    SHOT = 4  # shot noise; "pixel" is the image row
+    SHOT = 4  # shot noise; "pixel" is the block of 1024 pixels
     NOISE = 5  # photoreceptor noise, index = step
     HOT = 6
     DIFFUSION = 7  # Voltmeter, index = step * 2^20 + draw within the step

@@ -47,8 +47,10 @@ class FrameResets:
         self._jump, self._emulator = config.kick * threshold, emulator
         self._every, self._first = (round(1e6 * ms) for ms in (config.interval_ms, config.first_ms))
         if emulator.push(np.ones((1, 1), np.float32), self._jump, 1e-9 * RISE_NS) is None:
+            # Times after a reset, ns, and the share of the jump at each: here the light rises and returns along lines.
             self._corners, self._share = (0, RISE_NS, RISE_NS + round(1e6 * config.length_ms)), (0.0, 1.0, 0.0)
         else:
+            # Here the light steps up within a microsecond, stays while the signal rises, and steps back.
             self._corners, self._share = (0, 1000, RISE_NS, RISE_NS + 1000), (0.0, 1.0, 1.0, 0.0)
         self._began: int | None = None
         self._last: _Seen | None = None
@@ -84,12 +86,14 @@ class FrameResets:
     def _at(self, t_ns: int) -> float:
         """Return the share of the jump at a time."""
         assert self._began is not None
+        # -1: before the first reset, where the share is 0.
         since = (t_ns - self._began - self._first) % self._every if t_ns >= self._began + self._first else -1
         return float(np.interp(since, self._corners, self._share, left=0.0, right=0.0))
 
     def _knots(self, after_ns: int, before_ns: int) -> Iterator[int]:
         """Yield the times strictly between two frames at which the jump begins, is highest and ends."""
         assert self._began is not None
+        # Resets of smaller numbers have returned by ``after_ns``.
         first = max((after_ns - self._began - self._first - self._corners[-1]) // self._every, 0)
         for number in itertools.count(first):
             reset = self._began + self._first + number * self._every

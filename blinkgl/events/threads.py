@@ -43,6 +43,7 @@ def take_part(taken: np.ndarray, start: int) -> int:
     A thread that starts at the same place every time finds its last data in its core's cache."""
     for k in range(taken.size):
         part = (start + k) % taken.size
+        # The plain read spares the atomic exchange for parts that are taken already.
         if taken[part] == 0 and _exchange(taken, part, 1) == 0:
             return part
     return -1
@@ -56,6 +57,7 @@ class _Job:
         self._taken = np.zeros(parts, np.int64)
         self._lock, self._all_out = threading.Lock(), threading.Lock()
         self._inside, self._helped, self._closed, self._error = 0, 0, False, None
+        # This lock is released by the last helper that leaves after the work is closed.
         self._all_out.acquire()
 
     def help(self) -> None:
@@ -65,6 +67,7 @@ class _Job:
                 return
             self._inside += 1
             self._helped += 1
+            # Helpers start at different parts, so that they rarely reach for the same one.
             start = len(self._taken) * self._helped // self._threads
         error = None
         try:

@@ -53,6 +53,7 @@ class SurfaceTruth:
         memory_s : (H, W) how long a pixel follows a past change, s; None: not at all."""
         if memory_s is not None and self._seen:
             before = self._seen[-1][1]
+            # The surface that the pixel showed was nearer and is gone.
             gone = (before.depth < surfaces.depth) & (before.ids != surfaces.ids)
             if self._left is None:
                 self._left = Surfaces(*(array.copy() for array in before))
@@ -68,6 +69,7 @@ class SurfaceTruth:
         truth = np.empty(len(events), TRUTH)
         at = next(k for k, (t_ns, _) in enumerate(self._seen) if t_ns == done_ns)
         (before_ns, before), (after_ns, after) = self._seen[max(at - 1, 0)], self._seen[at]
+        # Compared as twice the times, in whole numbers; an event is in the middle of its microsecond.
         late = 2 * (1000 * events.t + 500) >= before_ns + after_ns
         x, y = events.x.astype(np.intp), events.y.astype(np.intp)
         height, width = after.ids.shape

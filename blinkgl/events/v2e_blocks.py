@@ -296,6 +296,7 @@ def emit(
             if emitted < cap:
                 word = bits | polarity
                 if told:
+                    # Parts of the change since the reference was taken, from which the cause is decided.
                     by_leak = leak * ((at_ns - since_ns) * 1e-9)
                     by_noise = noise + noise_change * s - noise_then
                     word |= _cause(by_shot, hot[i], on if polarity else -off, by_leak, by_noise) << CAUSE_SHIFT

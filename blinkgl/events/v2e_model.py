@@ -136,6 +136,7 @@ def crossing_fraction(
         guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
         if 0.0 < guess < 1.0:
             s = low + width * guess
+    # 60 halvings exhaust the 53 bits of a double, so the loop ends even where no Newton step is accepted.
     for _ in range(60):
         e = fall * fall_f64(k * s)
         f = sign * (c + rise * s + e - target)
@@ -144,6 +145,7 @@ def crossing_fraction(
         else:
             high = s
         slope = sign * (rise - k * e)
+        # Where the curve falls against the crossing's direction there is no Newton step, and the bracket is halved.
         following = s - f / slope if slope > 0 else -1.0
         newton = low <= following <= high
         if not newton:
@@ -217,8 +219,8 @@ def noise_threshold(config: V2eConfig) -> float:
 
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
-    # The low-pass's corner f_c (I + 20)/275 Hz.
     """Draw stationary photoreceptor noise at the first frame, (H*W,) float32 ln units."""
+    # The low-pass's corner f_c (I + 20)/275 Hz.
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
     pixels = np.arange(len(intensity), dtype=np.uint64)
     _, normal = in_blocks(lambda part: normal2(seed, part, np.uint64(Stream.START), np.uint64(1)), pixels)
@@ -327,6 +329,7 @@ def _start_of(
 
 def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:
     """Return (1 - e^-q)/q for q >= 0."""
+    # The series (1 - q/2 + q^2/6) has the error q^3/24, below 5e-14 at this bound, where 1 - e^-q would lose digits.
     small = q < 1e-4
     safe = np.where(small, 1.0, q)
     return np.where(small, 1.0 - q * (0.5 - q / 6.0), (1.0 - exp_f64(-safe)) / safe)
@@ -334,6 +337,7 @@ def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:
 
 def _age(uniform: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Draw an age a in (0, 1) of density e^-qa, by inverting its cumulative distribution."""
+    # The inverse of F(a) = (1 - e^-qa)/(1 - e^-q), which tends to the uniform distribution for small q.
     small = q < 1e-6
     safe = np.where(small, 1.0, q)
     return np.where(small, uniform, np.minimum(-log_f64(1.0 - uniform * (1.0 - exp_f64(-safe))) / safe, 1.0))

@@ -28,6 +28,7 @@ from blinkgl.gl.shader import ShaderLoader
 # ``load_opengl_function``, ``__enter__``, ``__exit__`` and ``release``. Mesa dropped OSMesa in 25.1, so this is the
 # fallback for machines without EGL, not the way forward.
 
+# Numbers of OSMesa and OpenGL; the list of attributes is made of pairs and ends with a 0.
 _FORMAT, _RGBA = 0x22, 0x1908
 _DEPTH_BITS, _STENCIL_BITS, _PROFILE, _CORE_PROFILE = 0x30, 0x31, 0x33, 0x34
 _MAJOR, _MINOR = 0x36, 0x37
@@ -211,6 +212,7 @@ class GLContext:
         """Draw one pixel and read it back. A driver that resets its GPU discards contexts, mostly without an error;
         reads then return invalid data. Raises GLError; the work must then be repeated in another context."""
         self.resume()
+        # A different colour each time, so that an old answer is noticed.
         self._checks = self._checks % 250 + 1
         red, green = self._checks, 255 - self._checks
         asked = bytes([red, green, 85, 170])
@@ -349,6 +351,7 @@ def _egl(device: int) -> Any:
         message = _one_line(error)
         if "but found 0 devices" in message:
             raise _EGLUnavailable("no driver (Mesa's is in libegl-mesa0 and libgl1-mesa-dri)") from None
+        # 0x3001 is EGL_NOT_INITIALIZED.
         if "0x3001" in message:
             message += ", i.e. no working DRI driver"
         elif "eglCreateContext" in message:
@@ -405,6 +408,7 @@ def egl_devices() -> list[str]:
 
 
 def _device_text(query_string: Any, handle: int) -> str:
+    # EGL_EXTENSIONS, EGL_RENDERER_EXT and EGL_DRM_DEVICE_FILE_EXT.
     _EXTENSIONS, _RENDERER_EXT, _DRM_FILE = 0x3055, 0x335F, 0x3233
     extensions = (query_string(handle, _EXTENSIONS) or b"").decode().split()
     if "EGL_MESA_device_software" in extensions:

@@ -19,6 +19,7 @@ from blinkgl.errors import GLError
 if TYPE_CHECKING:
     from blinkgl.gl.context import GLContext
 
+# OpenGL's own numbers, for the calls that moderngl does not wrap.
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER, _COLOR_BIT, _DEPTH_BIT, _NEAREST = 0x8CA8, 0x8CA9, 0x4000, 0x0100, 0x2600
 _COLOR_ATTACHMENT0 = 0x8CE0
 _TEXTURE_2D, _RENDERBUFFER, _TEXTURE0 = 0x0DE1, 0x8D41, 0x84C0
@@ -128,6 +129,7 @@ class Target:
             gl.function(
                 "glTexImage2D", None, uint, integer, integer, integer, integer, integer, uint, uint, ctypes.c_void_p
             )(_TEXTURE_2D, 0, _TEXTURES[kind], *size, 0, _DEPTH_COMPONENT, _FLOAT, None)
+            # Without a comparison a shader reads the depth itself.
             depth.compare_func = ""
             depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
             depth.repeat_x = depth.repeat_y = False
@@ -205,6 +207,7 @@ class Target:
         if self.depth is None:
             raise GLError("this target has no depth")
         out = checked_array(out, (self.height, self.width), np.dtype(np.float32))
+        # For moderngl, attachment -1 is the depth.
         self.fbo.read_into(out, (0, 0, self.width, self.height), 1, attachment=-1, alignment=1, dtype="f4")
         return out
 

@@ -38,6 +38,7 @@ folder has priority."""
 _VERSION = re.compile(r"\s*#\s*version\b")
 _INCLUDE = re.compile(r"\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$")
 _QUOTED = re.compile(r'"([^"]+)"$')
+# GLSL reserves names that begin with gl_ and names with two underscores in a row.
 _NAME = re.compile(r"(?!gl_|GL_)[A-Za-z](?!\w*__)\w*$")
 # Where drivers put the line number: Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD/Intel/Apple "ERROR:
 # 0:12: …".
@@ -203,6 +204,7 @@ class _Expansion:
 
 @lru_cache(maxsize=256)
 def _guard(name: str) -> str:
+    # Other characters become their codes, so that two names never share a guard.
     return "INCLUDED_" + "".join(c if c.isalnum() else f"_{ord(c):x}x" for c in name)
 
 
@@ -220,6 +222,7 @@ def _parts(shown: str, text: str) -> tuple[tuple[tuple[str, ...], tuple[tuple[st
             lines, origin = [], []
         elif not in_comment and _VERSION.match(line):
             parts.append((tuple(lines), tuple(origin), number, None))
+            # An empty line stands for #version, which goes to the head.
             lines, origin = [""], [(shown, number)]
         else:
             # Left over: includes in comments, which moderngl's own resolver would try to follow.

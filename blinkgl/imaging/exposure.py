@@ -41,7 +41,9 @@ class Exposure:
         span = float(self.end_ns - self.start_ns)
         edges = np.linspace(0.0, span, count + 1)
         times = [self.start_ns + math.floor(middle) for middle in (edges[1:] + edges[:-1]) / 2]
+        # begins: when each row's exposure starts; the last row's ends with the span.
         begins = np.linspace(0.0, span - self.exposure_ns, self.rows) if self.rows > 1 else np.zeros(1)
+        # overlap: the time that cell and exposure have in common, (count, rows); below 0 where they do not meet.
         overlap = np.minimum(edges[1:, None], begins + self.exposure_ns) - np.maximum(edges[:-1, None], begins)
         weights = np.maximum(overlap, 0.0)
         return times, weights / weights.sum(axis=0)
@@ -53,6 +55,7 @@ def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: i
     span_ns = exposure.end_ns - exposure.start_ns
     moving = speed * span_ns * 1e-9 / max_px
     focusing = lens * span_ns / exposure.exposure_ns if lens > 1 else 1.0
+    # 1e-6, so that a rounding error adds no instant.
     return int(min(most, max(1.0, math.ceil(min(moving, 1e9) - 1e-6), math.ceil(focusing - 1e-6))))
 
 
@@ -112,4 +115,5 @@ def next_setting(config: AutoExposureConfig, setting: Setting, mean: float, dt_s
     wanted = setting.product * (config.target / max(mean, _DARKEST)) ** share
     shortest, longest = NS_PER_US * config.shortest_us, NS_PER_US * config.longest_us
     exposure_ns = round(min(max(wanted, shortest), longest))
+    # The gain supplies what the longest exposure does not.
     return Setting(exposure_ns, min(max(wanted / exposure_ns, 1.0), factor(config.max_gain_db)))

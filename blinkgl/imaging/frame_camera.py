@@ -106,6 +106,7 @@ class FrameCamera:
         """Return the next image. Raises GLError."""
         started, drawing = working_clock(), self._drawing_s
         image = self._take()
+        # Without the time that the renderer has counted as its own.
         self.seconds += working_clock() - started - (self._drawing_s - drawing)
         return image
 
@@ -186,6 +187,7 @@ class FrameCamera:
         if lens is None:
             return 1
         depth = self.renderer.draw(self.renderer.geometry(("depth",)), t_ns).read("depth")
+        # A depth of 0 stands for no surface, which is infinitely far.
         depth = np.where(depth > 0, depth, np.inf)
         largest = float(thin_lens.blur_px(lens, self.renderer.scene.camera, depth).max())
         return thin_lens.samples(largest, LENS_SPACING * self.config.max_px)
@@ -228,6 +230,7 @@ class FrameCamera:
 
     def _codes(self, reading: np.ndarray) -> np.ndarray:
         config = self.config
+        # No light gives the black level, and full light the largest code.
         return encode(config.black + (1.0 - config.black) * reading, config.response, config.gamma, config.bits)
 
 

@@ -26,6 +26,7 @@ def blur_px(lens: LensConfig, camera: CameraModel, depth: np.ndarray) -> np.ndar
 def samples(largest_px: float, spacing_px: float) -> int:
     """Return the number of lens points that gives discs of at most this diameter samples with this spacing; 1 where the
     diameter is below a quarter of it."""
+    # A disc of diameter D has room for pi / 4 (D / d)^2 points at a spacing of d.
     return 1 if largest_px < spacing_px / 4 else max(4, math.ceil(math.pi / 4 * min(largest_px / spacing_px, 1e4) ** 2))
 
 
@@ -38,6 +39,7 @@ def points(count: int, diameter: float) -> np.ndarray:
     bits = max(1, (count - 1).bit_length())
     order = [int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits)]
     k = np.array([number for number in order if number < count], np.float64)
+    # The square root gives every point the same area; pi (3 - sqrt(5)) is the golden angle.
     radius, angle = diameter / 2 * np.sqrt((k + 0.5) / count), k * math.pi * (3 - math.sqrt(5))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
@@ -56,6 +58,7 @@ def _drawn(camera: CameraModel) -> PinHole:
 def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Return the pose of that camera, (4, 4)."""
     moved = T_world_cam.copy()
+    # Columns 0 and 1 of the pose are the axes of the plane of the lens.
     moved[:3, 3] += T_world_cam[:3, :2] @ point
     return moved
 

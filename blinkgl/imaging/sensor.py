@@ -62,6 +62,7 @@ def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
     if mean <= 0.0:
         return 0.0
     first = index * _TRIES
+    # Inversion: the probabilities of 0, 1, 2, … are subtracted from u until it lies within one.
     if mean < _FEW:
         u, _ = uniform2(seed, pixel, _PHOTONS, first)
         k, p = 0.0, exp_f64(-mean)
@@ -70,6 +71,7 @@ def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
             k += 1.0
             p *= mean / k
         return k
+    # The constants of PTRS for its hat; below v_r most points lie under the squeeze.
     b = 0.931 + 2.53 * np.sqrt(mean)
     a = -0.059 + 0.02483 * b
     inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
@@ -80,6 +82,7 @@ def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
         u -= 0.5
         us = 0.5 - abs(u)
         k = np.floor((2.0 * a / us + b) * u + mean + 0.43)
+        # The squeeze accepts most points without a logarithm.
         if us >= 0.07 and v <= v_r:
             return k
         if k < 0.0 or (us < 0.013 and v > us):
@@ -92,6 +95,7 @@ def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
             ln_k = _log_factorial(k)
         if log_f64(v * inverse_alpha / (a / (us * us) + b)) <= k * ln_mean - mean - ln_k:
             return k
+    # So many rejections do not occur; the mean is a valid result.
     return np.floor(mean)
 
 

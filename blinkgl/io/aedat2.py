@@ -59,6 +59,7 @@ class Aedat2Reader:
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path, self._keep = Path(path), reading.keep
         self._header, self._start = _read_header(self.path)
+        # jAER names the chip by its Java class, whose last part is such as DAVIS346B.
         chip = re.search(r"^#\s*AEChip:\s*(\S+)", self._header, re.M)
         name = chip.group(1).rpartition(".")[2] if chip else None
         size = next((size for known, size in SIZES.items() if name and name.upper().startswith(known)), None)
@@ -187,8 +188,8 @@ def _scale(header: str, key: str, prefix: str, usual: float) -> float:
 
 
 def _kinds(address: np.ndarray) -> np.ndarray:
-    # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
     """Return _DVS, _PIN, _APS or _IMU for every address (int64); frame samples of the unused sub-type are _PIN."""
+    # Bits 11 and 10 tell the kinds of records with and without bit 31 apart.
     low = address >> 10 & 3
     return np.where(
         address >> 31 == 0, np.where(low & 1, _PIN, _DVS), np.where(low == 3, _IMU, np.where(low == 2, _PIN, _APS))
@@ -252,6 +253,7 @@ class _Frames:
             first, last, signal = self._times.tolist()
             # A global shutter resets all rows before the first is read; a rolling one does not.
             begin = last if last <= signal else first
+            # Row 0 of the samples is the bottom of the image.
             yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
         self._clear()
 

@@ -103,6 +103,7 @@ class Aedat4Reader:
         with _damage(self.path):
             packets, sound = iter(_decoder(self.path)), _check_claims(self.path)
             while True:
+                # Check what this packet claims before the decoder sets memory aside for it.
                 next(sound, None)
                 packet = next(packets, None)
                 if packet is None:
@@ -129,10 +130,15 @@ def _check_claims(path: Path) -> Iterator[None]:
             raise AssetError(f"a header of {length} bytes", where=str(path), accepted=f"at most {total - _HEADER}")
         header, end = file.read(length), total
         with contextlib.suppress(struct.error):
+            # A FlatBuffer begins with the offset of its root table, and the table with the signed distance back
+            # to its vtable.
             table = struct.unpack_from("<I", header)[0]
+            # In the vtable two sizes and the offset of field 0, two bytes each, come before that of field 1; 0:
+            # no such field.
             place = struct.unpack_from("<H", header, table - struct.unpack_from("<i", header, table)[0] + 6)[0]
             end = struct.unpack_from("<q", header, table + place)[0] if place else end
         while len(packet := file.read(8)) == 8 and file.tell() - 8 != end:
+            # The first four bytes are the stream's number, the others the packet's length.
             size = int.from_bytes(packet[4:], "little")
             if size > total - file.tell():
                 at = file.tell() - 8
@@ -161,6 +167,7 @@ def _damage(path: Path) -> Iterator[None]:
     except OSError as error:
         raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
     except BaseException as error:
+        # A panic of Rust code derives from BaseException; anything else of that kind, such as an interrupt, passes.
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":
             raise
         text = " ".join(str(error).split())[:160]

@@ -27,7 +27,9 @@ from blinkgl.types.events import Events
 #
 # scipy's parser of the same ends the process on damaged files, so this one checks every length against the file.
 
+# Numbers of the format's data types, miINT8 to miUINT64.
 _NUMBERS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
+# miMATRIX and miCOMPRESSED; then classes of arrays, mxSTRUCT_CLASS, and mxDOUBLE_CLASS to mxUINT64_CLASS.
 _MATRIX, _COMPRESSED, _STRUCT, _ARRAYS = 14, 15, 2, range(6, 16)
 _MOST_BYTES, _MOST_RATIO = 1 << 26, 100
 """A file may unpack to so many bytes, or to so many times its own: columns of events pack a tenth of that."""
@@ -38,6 +40,7 @@ def read_mat(path: str | os.PathLike) -> dict[str, Any]:
     """Return arrays, (N,) or (N, K), by the names of their variables, a struct (or an array of structs, joined) as a
     table of arrays; None for anything else. Raises AssetError: damaged, or it unpacks to far more than it holds."""
     data = memoryview(Path(path).read_bytes())
+    # The version, and the mark of the byte order, which reads IM in a little-endian file.
     if data[124:128] != b"\0\1IM":
         raise AssetError("not a little-endian .mat of version 5 to 7", where=os.fspath(path))
     try:
@@ -52,6 +55,7 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
     at = 0
     while at < len(data):
         kind, size = struct.unpack_from("<II", data, at)
+        # Elements are padded to eight bytes, except for compressed ones.
         start, following = at + 8, at + 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
         if kind >> 16:
             kind, size, start, following = kind & 0xFFFF, kind >> 16, at + 4, at + 8
@@ -95,6 +99,7 @@ def _matrix(body: memoryview) -> tuple[str, Any]:
     name = bytes(called).decode("latin-1")
     if flags[0] == _STRUCT:
         width, names = int.from_bytes(next(parts)[1], "little"), bytes(next(parts)[1])
+        # Names of fields have a fixed width and end with a zero.
         fields = [names[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(names), width)]
         values = [_matrix(one)[1] for _, one in parts]
         if not fields or len(values) % len(fields):
@@ -103,6 +108,7 @@ def _matrix(body: memoryview) -> tuple[str, Any]:
     if flags[0] in _ARRAYS:
         kind, numbers = next(parts)
         values = np.frombuffer(numbers, _NUMBERS[kind])
+        # MATLAB stores columns one after another.
         return name, values.reshape(shape, order="F") if len(shape) == 2 and shape.min() > 1 else values
     return name, None
 

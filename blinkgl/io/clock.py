@@ -93,6 +93,7 @@ def guessed_frame_unit(values: np.ndarray, where: str) -> TimeUnit:
     values = np.asarray(values, np.float64)
     steps = np.diff(values)
     if not len(steps):
+        # A single time has no step: a fraction is of seconds, a whole number is in µs.
         return TimeUnit("s" if (values % 1).any() else "us", "guessed", (float(values[0]), float(values[-1])))
     size = np.abs(values)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -112,6 +113,7 @@ def guessed_frame_unit(values: np.ndarray, where: str) -> TimeUnit:
             )
     positive = steps[steps > 0]
     usual = float(np.median(positive)) if len(positive) else 1.0
+    # Decades between the frame rate that a unit gives and the typical one; a time of this century counts for 2.5.
     likely = {
         unit: abs(np.log10(1e9 / (usual * ns * _TYPICAL_HZ)))
         - (2.5 if _EPOCH_S[0] <= values[0] * ns / 1e9 <= _EPOCH_S[1] else 0)
@@ -149,6 +151,7 @@ def guessed_event_unit(values: np.ndarray, count: int, span: tuple[float, float]
     values = np.asarray(values, np.float64)
     first, last = (float(v) for v in span or ((values.min(), values.max()) if len(values) else (0.0, 0.0)))
     whole, thousands = not (values % 1).any(), not (values % 1000).any()
+    # Scores, the lowest is the likeliest: a preference for each unit, to which distances are added.
     if whole:
         likely = {"us": -3.0, "ns": -4.0 if thousands and values.any() else 0.0}
     else:

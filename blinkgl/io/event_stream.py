@@ -16,6 +16,7 @@ from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
+# 12 bytes of magic, 3 of the version, 1 of the type of events, then width and height, 16 bits each.
 _HEADER = 20
 _DVS = 1
 
@@ -47,6 +48,7 @@ class EventStreamReader:
         with open(self.path, "rb") as file:
             file.seek(_HEADER)
             while data := file.read(size):
+                # An event has five bytes, and the first one may have begun in the piece before.
                 most = len(data) // 5 + 1
                 made = Events(*(np.empty(most, dtype) for dtype in (np.uint16, np.uint16, np.int64, np.uint8)))
                 n = _decode(np.frombuffer(data, np.uint8), state, made.x, made.y, made.t, made.p)
@@ -69,6 +71,7 @@ def _decode(data, state, x, y, t, p):
                 time += value >> 1
                 polarity, column, row, got = value & 1, 0, 0, 1
         else:
+            # Bytes 1 and 2 of an event are x, 3 and 4 are y, each with the low byte first.
             if got <= 2:
                 column |= value << (8 * (got - 1))
             else:

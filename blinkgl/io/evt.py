@@ -107,6 +107,7 @@ class EvtReader:
             for first, raw in read_records(self.path, self._start, dtype, words, lambda _: f"the last {name} word"):
                 events, bad = self._decode(raw, state, buffers)
                 while bad >= 0 and self._keep:
+                    # The bad word is skipped, and the words after it are decoded with the state as it is.
                     first, raw, lost = first + bad + 1, raw[bad + 1 :], lost + 1
                     more, bad = self._decode(raw, state, buffers)
                     events = Events.concatenate([events, more])
@@ -119,6 +120,8 @@ class EvtReader:
                 if len(events):
                     yield events
         finally:
+            # The state's last entries, see START: TIME_HIGH words that were missing (EVT3 only), and events
+            # without a time.
             missing = state[-2] if self.version == "evt3" else 0
             said = (
                 (lost, f"left out: words that {name} does not have: {lost:,}"),
@@ -174,6 +177,7 @@ def decode(
     elif version == "evt2":
         n, bad = _decode_evt2(words, _single(len(words)), state, *columns)
     else:
+        # As 32-bit words in file order: the lower half comes first, unless the header says otherwise.
         upper, lower = (words.view("<u4")[half::2].copy() for half in ((0, 1) if upper_first else (1, 0)))
         n, bad = _decode_evt2(upper, lower, state, *columns)
     return Events(*(column[:n].copy() for column in columns)), bad
@@ -237,11 +241,14 @@ def _decode_evt2(words, masks, state, x, y, t, p):
 
 @kernel
 def _encode_evt3(x, y, t, p, state, first, words):
+    # Types in the upper four bits: 0x8000 TIME_HIGH, 0x6000 TIME_LOW, 0x2000 ADDR_X; ADDR_Y is 0, so its word
+    # is the row.
     n = 0
     time, row = state
     # TIME_HIGH 0.
     if first:
         words[0] = 0x8000
+        # -1 differs from every time, so that an event at time 0 gets its TIME_LOW.
         n, time = 1, -1
     for i in range(len(t)):
         if t[i] != time:
@@ -278,6 +285,7 @@ def _decode_evt3(words, state, x, y, t, p, mend):
         word = np.int64(words[i])
         kind = word >> 12
         if kind <= 1:
+            # Type 1: the events that follow are no contrast changes; row -1 leaves them out.
             row = word & 0x7FF if kind == 0 else -1
         elif kind == 2:
             if row < 0:

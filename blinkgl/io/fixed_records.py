@@ -56,6 +56,7 @@ class DatReader:
         with open(path, "rb") as file:
             begin = file.read(_LONGEST_HEADER)
         found = re.match(rb"(?:% [^\n]*\n)*", begin)
+        # Two bytes follow the header's lines: the type of events and the size of a record.
         header, self._start = found[0].decode("latin-1") if found else "", found.end() + 2 if found else 2
         kind = begin[self._start - 2 : self._start]
         if len(kind) < 2 or kind[0] not in (0, 12) or kind[1] != _DAT.itemsize:
@@ -94,8 +95,10 @@ class NMnistReader:
         passed = 0
         for _, rows in read_records(self.path, 0, _NMNIST, count):
             marks = rows["y"] == _PASSES
+            # Every mark delays all records from its own place on.
             base = passed + np.cumsum(marks) * _PASSED_US
             passed = int(base[-1])
+            # Of the third byte the upper bit is the polarity, and the other seven begin the time.
             t = ((rows["high"].astype(np.int64) & 0x7F) << 16) + rows["low"] + base
             x, y, p = rows["x"].astype(np.uint16), rows["y"].astype(np.uint16), rows["high"] >> 7
             yield Events(x, y, t, p).part(~marks)

@@ -11,7 +11,7 @@ import numpy as np
 
 from blinkgl.config.frames import FLOW_FORMATS
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.io.images import encode_npy, encode_png, read_npy, read_pfm, read_png
 from blinkgl.io.records import input_errors
 
@@ -44,6 +44,7 @@ def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_
     stored = valid & holds
     code[~stored] = _ZERO
     bgr = np.empty((*valid.shape, 3), np.uint16)
+    # In OpenCV's order: blue is validity, green is y and red is x.
     bgr[..., 0], bgr[..., 1:] = stored, code[..., ::-1]
     # Level 1: half as large as level 0 and as fast; level 6 saves another half for three times the time.
     return encode_png(bgr, cv2.IMWRITE_PNG_STRATEGY_DEFAULT), int(np.count_nonzero(valid & ~holds))
@@ -63,6 +64,7 @@ def read_flow_png(path: str | os.PathLike, *, scale: float = DSEC_SCALE) -> tupl
     Raises AssetError when the file is not a 16-bit RGB PNG."""
     raw = _sixteen_bits(Path(path))
     valid = raw[..., 0] > 0
+    # Channel 2, red, is x and channel 1, green, is y.
     flow = (raw[..., 2:0:-1].astype(np.float32) - np.float32(_ZERO)) / np.float32(scale)
     return np.where(valid[..., None], flow, np.float32(0)), valid
 
@@ -124,8 +126,10 @@ def flow_form(path: str | os.PathLike) -> tuple[str, str | None]:
         return suffix[1:], None
     raw = _sixteen_bits(path)
     third, first = raw[..., 0], raw[..., 2]  # on disk blue and red
+    # A mask has small numbers, while flow near 0 is stored near 2^15.
     if first.max() <= 255 and (third.max() > 255 or raw[..., 1].max() > 255):
         form = "tartanair2"  # its mask comes first
+    # Every eighth row and column is enough to see that the channel is a mask.
     elif set(np.unique(third[::8, ::8]).tolist()) <= {0, 65535} and third.max() == 65535:
         form = "vkitti2"
     else:
@@ -224,6 +228,5 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray) -> 
         encoded, lost = encode_flow_png(flow, valid)
     else:
         encoded = encode_flo(flow, valid) if ending == ".flo" else encode_flow_npy(flow, valid)
-    with atomic_file(path, overwrite=True) as temporary:
-        temporary.write_bytes(encoded)
+    write_whole(path, encoded)
     return lost

@@ -237,6 +237,7 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
     opened = [open_stills(p) for p in files] if stacked else [first]
     pages = sum(one.pages for one in opened) if stacked else len(files)
     delays = [delay for one in opened for delay in one.delays_ms or []]
+    # A frame begins when the delays before it have passed.
     own = [round(1e6 * t) for t in np.cumsum([0.0, *delays])] if len(delays) == pages else None
     times = None
     if own is not None and declared.fps is None:
@@ -272,6 +273,7 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
 def _white_of(top: int, notes: list[str]) -> tuple[float, float] | None:
     """Return the levels of 16-bit frames whose largest code, in a sample of the whole clip, is ``top``."""
     for bits in _BITS:
+        # The largest code uses one of the upper two bits.
         if 2 ** (bits - 2) <= top < 2**bits:
             notes.append(
                 f"16-bit codes up to {top:,}: taken as {bits} bits, white {2**bits - 1:,} (--white-level 65535 if dark)"

@@ -153,6 +153,7 @@ def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
         if code == hdf5plugin.Blosc.filter_id and len(values) < _BLOSC_VALUES:
             raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks data that Blosc needs", where=str(path))
     if found.chunks is None:
+        # Compact data lie in the object's header and are always whole.
         whole = layout.get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
     else:
         if math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
@@ -162,6 +163,7 @@ def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
                 value=found.chunks,
                 accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each",
             )
+        # The number of chunks along each axis is the quotient, rounded up.
         whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
     if not whole:
         raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
@@ -214,7 +216,9 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
         data.resize(start + len(rows), axis=0)
         data[start:] = rows
         return
+    # Value 6 of Blosc's filter is the number of its codec.
     step, codec = data.chunks[0], data.id.get_create_plist().get_filter(0)[2][6]
+    # The chunk in which the new rows begin is packed again as a whole.
     begin = start // step * step
     rows = np.ascontiguousarray(rows, data.dtype)
     if begin < start:
@@ -286,6 +290,7 @@ def _compressed(array: np.ndarray, codec: bytes) -> bytes | None:
         out,
         size(array.nbytes),
         codec,
+        # A block size of 0 lets Blosc choose; one thread.
         size(0),
         1,
     )

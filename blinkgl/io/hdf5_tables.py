@@ -72,6 +72,7 @@ def _tables(file: h5py.File, path: Path, reading: EventReading, named: bool) -> 
             if not named and rows and data.shape[1] in (4, len(reading.columns or ())):
                 check_storage(data, place, path)
                 if place in EVENTS:
+                    # MVSEC's columns, in seconds, of its sensor of 346x260 px.
                     asked = reading if reading.columns else EventReading(columns=("x", "y", "t", "p"))
                     yield table_of_rows(data, str(path), asked, place=place, unit="s", size=(260, 346))
                 else:

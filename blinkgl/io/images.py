@@ -256,6 +256,7 @@ def _image_problem(data: bytes) -> str | None:
     """Return a problem of an image file that OpenCV would ignore: it fills missing parts with grey."""
     if data[:8] == _PNG_MAGIC:
         return _png_problem(data)
+    # A whole JPEG file has the end marker, FFD9, behind its last scan, FFDA.
     if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         return "cannot decode image (truncated)"
     if data[:2] == b"#?":
@@ -274,6 +275,7 @@ def _image_problem(data: bytes) -> str | None:
 
 def _png_problem(data: bytes) -> str | None:
     """Return a problem of the chunks (length, type, content, CRC) up to IEND. (PNG specification, section 5)"""
+    # 33 bytes are the signature and the chunk IHDR.
     if data[12:16] != b"IHDR" or len(data) < 33:
         return "cannot decode image (corrupt or truncated)"
     at = 8

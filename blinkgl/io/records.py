@@ -27,6 +27,7 @@ MAX_NAME_BYTES = 1024
 def open_regular(path: str | os.PathLike) -> int:
     """Return a file descriptor for reading. Raises OSError; AssetError for anything but a regular file: a pipe could
     block forever, a device has no end. A link at the end of the path is followed only to such a file."""
+    # O_NONBLOCK, because opening a pipe that nobody writes to would wait.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)

@@ -122,11 +122,14 @@ class BagReader:
 def _rows(data: memoryview | bytes, ros2: bool) -> tuple[np.ndarray, tuple[int, int]]:
     """Return the rows of an EventArray, and (height, width). The header is ROS 1's sequence number, time and name of a
     frame; in ROS 2 without the number, and with numbers on multiples of four bytes after a mark of four."""
+    # ROS 1: sequence number and time; ROS 2: the mark and the time.
     at = 12
+    # The frame's name: its length, then so many bytes.
     at += 4 + int.from_bytes(data[at : at + 4], "little")
     if ros2:
         if bytes(data[:2]) != b"\0\1":
             raise ValueError("not little-endian CDR")
+        # Alignment counts from behind the mark, whose length is a multiple of four itself.
         at += -at % 4
     height, width, count = np.frombuffer(data, "<u4", 3, at).tolist()
     at += 12
@@ -149,6 +152,7 @@ def event_array(events: Events, height: int, width: int) -> tuple[str, bytes]:
 
 
 def _timed(rows: np.ndarray, where: str, first: int) -> Events:
+    # Rounded to the nearest microsecond.
     t = rows["s"].astype(np.int64) * 1_000_000 + (rows["ns"].astype(np.int64) + 500) // 1000
     return events_of(rows["x"], rows["y"], t, rows["p"], where, first)
 

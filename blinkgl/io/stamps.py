@@ -132,6 +132,7 @@ def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[
         # One odd line among numbers is named by its line, so the first column stays the time.
         return numeric[:1] if numeric and not is_number(rows[0][0]) else [0]
     first = [Fraction(row[numeric[0]]) for row in rows]
+    # Numbers that count 0, 1, 2, … beside another column of numbers are no times.
     counts = len(first) > 2 and first[0] in (0, 1) and all(b - a == 1 for a, b in pairwise(first))
     return [numeric[1] if counts else numeric[0]]
 

@@ -30,6 +30,7 @@ _ANIMATED = {".gif", ".webp", ".png", ".apng"}
 _TIFF = {".tif", ".tiff"}
 _UNSTATED_MS = 100
 """Delay of an animation's frame that states none: what browsers show."""
+# The tag of the orientation in EXIF and TIFF.
 _ORIENTATION = 274
 
 
@@ -81,6 +82,7 @@ class Stills:
             data = _bytes(self.path)
             image = decode_image(data, self.path)
             if image.ndim == 3:
+                # OpenCV's order of channels is BGR.
                 image = image[..., [2, 1, 0, 3][: image.shape[2]]]
             yield upright(image, _orientation(data, self.path))
 
@@ -116,6 +118,7 @@ def open_stills(path: Path) -> Stills:
         return _tiff(path)
     if suffix in _ANIMATED:
         head = _bytes(path, 4096 if suffix in (".png", ".apng") else 64)
+        # acTL is a chunk of animated PNG files; bit 1 of a WebP file's flags says that it is animated.
         animated = suffix == ".gif" or b"acTL" in head or (head[8:16] == b"WEBPVP8X" and head[20] & 2)
         if animated:
             return _animated(path)
@@ -137,6 +140,7 @@ def _png(path: Path, head: bytes) -> Stills:
     stills, bits = Stills(path), 0
     for _, kind, body in png_chunks(head):
         if kind == b"IHDR":
+            # The bit depth comes after width and height, four bytes each.
             bits = body[8]
         elif kind == b"cICP" and len(body) == 4:
             from blinkgl.io.video import TRANSFERS
@@ -144,6 +148,7 @@ def _png(path: Path, head: bytes) -> Stills:
             stills.transfer = TRANSFERS.get(body[1])
             break
         elif kind == b"gAMA" and len(body) == 4:
+            # gAMA holds 100,000 times the exponent of encoding.
             exponent = 1e5 / max(int.from_bytes(body, "big"), 1)
             stills.transfer = "linear" if abs(exponent - 1) < 0.01 else None if abs(exponent - 2.2) < 0.02 else exponent
         elif kind == b"sRGB":
@@ -215,6 +220,7 @@ def _tiff_colours(image: np.ndarray, page: Any) -> np.ndarray:
     if page.axes == "SYX":
         image = np.moveaxis(image, 0, -1)
     if page.photometric == 3 and page.colormap is not None:  # a palette
+        # A TIFF palette has 16 bits, 257 times a code of 8 bits.
         return np.moveaxis(page.colormap, 0, -1)[image] // 257
     if page.photometric == 0 and image.dtype.kind in "ub":  # white is zero
         bits = page.bitspersample if isinstance(page.bitspersample, int) else 8

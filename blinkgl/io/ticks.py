@@ -45,6 +45,7 @@ def _constant(steps: Sequence[int], tick: Fraction, rates: Sequence[Fraction]) -
         off = [step - k / (rate * tick) for k, step in enumerate(steps)]
         if max(off) - min(off) <= 2 * _HALF:  # the first stamp was rounded, too
             return rate
+    # Each stamp bounds the time between frames; a constant rate lies within all of these bounds.
     low = max((step - _HALF) * tick / k for k, step in enumerate(steps) if k)
     high = min((step + _HALF) * tick / k for k, step in enumerate(steps) if k)
     return _roundest(1 / high, 1 / low) if 0 < low <= high else None
@@ -53,6 +54,7 @@ def _constant(steps: Sequence[int], tick: Fraction, rates: Sequence[Fraction]) -
 def _roundest(low: Fraction, high: Fraction) -> Fraction:
     """Return the number of the fewest decimal digits in [low, high], both positive."""
     middle = (low + high) / 2
+    # One place above the first significant digit, from which the loop goes down place by place.
     digit = Fraction(10) ** (math.floor(math.log10(middle)) + 1)
     for _ in range(20):
         digit /= 10

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds, unit_of
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
@@ -132,6 +132,7 @@ def read_trajectory(
         T = np.linalg.inv(T)
     axes = declared.axes or _OWN_AXES.get(form or "", "opencv")
     if axes != "opencv":
+        # The world's axes stay; only the body's change, so the matrix stands on the right.
         T[:, :3, :3] = T[:, :3, :3] @ _TO_OPENCV[axes]
         if declared.axes is None:
             said.append(f"{path.name}: {form}'s axes ({axes}) turned to OpenCV's (axes: opencv if they are already)")
@@ -247,6 +248,7 @@ def _matrices(path: Path, given: np.ndarray, lines: list[int]) -> tuple[np.ndarr
     """Return the positions and rotations of (N, 3 or 4, 4) matrices. Raises AssetError: not rigid."""
     R = given[:, :3, :3]
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    # Rows of length 1 at right angles may also be a reflection, whose determinant is -1.
     wrong = (off > 0.01) | (np.linalg.det(R) < 0) if len(R) else np.zeros(0, bool)
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -275,6 +277,7 @@ def _colmap(path: Path, text: str, declared: PoseFile) -> _Table:
     names = [fields[9] if len(fields) > 9 else str(number) for number, fields in rows]
     order = [names.index(p.as_posix()) for p in natural_order(map(Path, names))]
     lines = [rows[k][0] for k in order]
+    # SciPy's quaternions have w last.
     rotations = _rotations(numbers[order][:, [1, 2, 3, 0]], lines, path)
     return _Table(None, numbers[order][:, 4:], rotations, lines)
 
@@ -327,6 +330,7 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
         if unit.line is not None:
             notes.append(f"{path.name}: {unit.line.replace('--time-unit', 'time_unit:')}")
         values = nanoseconds(texts, unit)
+        # The difference of any two times below 2^62 fits into an int64.
         if max(map(abs, values)) >= 2**62:
             value = f"{texts[-1]} {unit.name}"
             raise AssetError(
@@ -381,7 +385,7 @@ def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarra
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     lines = ["# timestamp[s] tx ty tz qx qy qz qw"]
     for t, p, q in zip(np.asarray(t_ns).tolist(), poses[:, :3, 3].tolist(), quaternions.tolist()):
+        # Floor division of a negative time would round its seconds down.
         sign, t = ("-", -t) if t < 0 else ("", t)
         lines.append(f"{sign}{t // 1_000_000_000}.{t % 1_000_000_000:09d} " + " ".join(f"{v:.12g}" for v in (*p, *q)))
-    with atomic_file(path) as temporary, output_errors(path):
-        Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(path, "\n".join(lines) + "\n")

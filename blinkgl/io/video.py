@@ -41,6 +41,7 @@ the network for any file name, are not accepted."""
 TRANSFERS = {16: "pq", 18: "hlg", 8: "linear", 4: 2.2, 5: 2.8}
 """Curves of ITU-T H.273, by their number, that codes are decoded with; all others count as sRGB, which a display's
 curve for BT.709 and BT.601 is closer to than their camera's."""
+# FFmpeg's numbers of pixel ranges; below, that of a YUV matrix that is not specified.
 _RANGES = {1: "limited", 2: "full"}
 _UNSPECIFIED = 2
 _PACKED = {
@@ -176,6 +177,7 @@ class VideoReader:
         self._by_levels = self._grey or frame.format.is_rgb or frame.format.name == "pal8"
         self.levels = None
         if self._by_levels and (self._range or (stated if self._grey else None)) == "limited":
+            # Black and white of 8 bits, 16 and 235, shifted to the frame's number of bits.
             self.levels = tuple(code << self._bits - 8 for code in (16, 235))
         elif self._by_levels and 8 < self._bits < 16 and not self._alpha:
             self.levels = 0, 2**self._bits - 1
@@ -247,6 +249,7 @@ class VideoReader:
                 rgb = np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
                 return np.rint(rgb * (65535.0 / (2**bits - 1))).astype(np.uint16) if self._alpha and bits > 8 else rgb
             limited = (self._range or _RANGES.get(int(frame.color_range), "limited")) == "limited"
+            # The yuvj formats are of full range by definition.
             limited = limited and not (name.startswith("yuvj") and self._range is None)
             rgb = rgb_from_yuv((planes[0], planes[1], planes[2]), bits, int(frame.colorspace), limited)
             if not self._alpha:
@@ -346,6 +349,7 @@ def _orientation(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
     upright: x' = a x + c y, y' = b x + d y of its display matrix (ISO 14496-12, 8.3.2)."""
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":
+            # The matrix has nine 32-bit numbers, row by row: a b u, c d v, x y w.
             a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
             if abs(b) > abs(a):
                 return True, c < 0, b < 0
@@ -356,6 +360,7 @@ def _orientation(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
 def _plane(plane: av.video.plane.VideoPlane, bits: int) -> np.ndarray:
     """Return a plane's samples, (H, W) uint8 or uint16."""
     dtype = np.dtype(np.uint8) if bits <= 8 else np.dtype("<u2")
+    # Rows are padded to line_size bytes.
     rows = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)
     return rows[: plane.height, : plane.width]
 
@@ -424,5 +429,6 @@ def _because(reason: str | None) -> str:
 def _gist(error: BaseException) -> str:
     """Return FFmpeg's own reason, without errno, file and addresses."""
     log = getattr(error, "log", None)
+    # PyAV's log is (level, name, text).
     text = log[2] if log else getattr(error, "strerror", None) or str(error)
     return " ".join(re.sub(r" @ 0x[0-9a-f]+", "", text).split())[:200]

@@ -33,6 +33,7 @@ def rgb_from_yuv(
     top = 255 if bits == 8 else 65535
     y, u, v = planes
     out = np.empty((*y.shape, 3), np.uint8 if bits == 8 else np.uint16)
+    # Factors: luma, Cr in red, Cb in green, Cr in green, Cb in blue; then black, the middle of chroma, and white.
     factors = np.array(
         [
             top / span,
@@ -58,6 +59,7 @@ def _convert(y, u, v, halved_rows, halved_columns, factors, out):
         below = row // 2 if halved_rows else row
         for column in range(y.shape[1]):
             right = column // 2 if halved_columns else column
+            # Whole numbers are cut off below, so half a code rounds to the nearest.
             light = (np.float32(y[row, column]) - low) * luma + half
             cb, cr = np.float32(u[below, right]) - middle, np.float32(v[below, right]) - middle
             out[row, column, 0] = min(max(light + r_v * cr, np.float32(0)), top)

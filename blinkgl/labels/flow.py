@@ -41,6 +41,8 @@ class FlowTo(Label):
         tree["flow"] = [*tree.get("flow", ()), self.towards]
 
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        # Matrices are subtracted in float64, of clip space the rows x, y and w, so that a still scene has
+        # exactly no flow.
         return {f"difference_{self.towards}": (shot.ends[self.towards].mvp - shot.moment.mvp)[:, [0, 1, 3]]}
 
     def finish(self, drawn: Drawn) -> Flow:

@@ -31,6 +31,7 @@ class Flows:
     def over(self, seconds: float) -> Flow:
         """Return the flow over this interval, to the nearest microsecond. Raises KeyError: it is not among them."""
         k = int(np.argmin(np.abs(self.interval_ns - seconds * 1e9))) if len(self.interval_ns) else -1
+        # 500 ns are half a microsecond.
         if k < 0 or abs(self.interval_ns[k] - seconds * 1e9) > 500:
             there = ", ".join(f"{ns * 1e-9:.9g}" for ns in self.interval_ns)
             raise KeyError(f"no flow over {seconds} s; there is flow over {there or 'none'} s")

@@ -47,6 +47,7 @@ class Normals(Label):
         normal = frame.normal @ scene.camera_path.pose(frame.t_ns)[:3, :3]
         ray = scene.camera.rays(frame.xy.reshape(-1, 2)).reshape(normal.shape)
         ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        # A smoothed normal may point away from the camera, so its part along the ray is limited to -1e-4.
         normal = normal - np.maximum((normal * ray).sum(axis=-1, keepdims=True) + 1e-4, 0.0) * ray
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         return np.where(frame.hit[..., None], normal, 0.0)
@@ -106,6 +107,7 @@ class Velocity(Label):
     judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
 
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        # The rows x, y and w of clip space.
         return {"rate": shot.moment.rates.mvp[:, [0, 1, 3]]}
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
@@ -142,6 +144,7 @@ class SceneFlow(Label):
 
     def finish(self, drawn: Drawn) -> np.ndarray:
         raw = drawn.raw(self.name)
+        # The fourth component says whether something is hit.
         return np.where(raw[..., 3:] > 0, raw[..., :3], np.float32(0))
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:

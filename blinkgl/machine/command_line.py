@@ -7,6 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping
+from typing import Annotated
 
 import typer
 
@@ -14,7 +15,37 @@ from blinkgl.errors import BlinkGLError, ConfigError, printable
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.plugins import load_plugins
 from blinkgl.machine.terminal import never_fail_to_print
+from blinkgl.version import __version__
+
+
+def _print_version(context: typer.Context, wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{context.info_name} {__version__}")
+        raise typer.Exit
+
+
+def _global_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error; may also follow the command.")
+    ] = False,
+    plugin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="Python file that registers parts of yours; before the command."),
+    ] = None,
+) -> None:
+    load_plugins(plugin or ())
+
+
+def new_app(name: str, about: str) -> typer.Typer:
+    """Return a command without commands, with the options that every command line has. about : its help."""
+    app = typer.Typer(name=name, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.callback(help=about)(_global_options)
+    return app
 
 
 def run_app(

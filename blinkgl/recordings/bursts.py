@@ -40,11 +40,13 @@ def frame_bursts(events: Events, interval_us: float) -> np.ndarray:
     high = (count > TIMES * usual + LEAST) & pure
     # A burst's flanks: bins beside it that are higher than usual.
     wide = binary_dilation(high)
+    # Rises and falls alternate: the begin and the end of each run of bins.
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wide, [False]]).astype(np.int8)))
     spans = begin + BIN_US * edges.reshape(-1, 2).astype(np.int64)
     middle = spans.mean(axis=1)
     apart = np.abs(middle[:, None] - middle[None]) / interval_us
     frames = np.round(apart)
+    # Bursts of the camera's frames recur after the time of one to four frames.
     partner = (frames >= 1) & (frames <= MOST_FRAMES) & (np.abs(apart - frames) <= NEAR * frames)
     return spans[partner.sum(axis=1) >= LEAST_OTHERS]
 

@@ -167,6 +167,7 @@ def clip_of_frames(
     path = _path(grey, clock, reading, facts)
     still = np.abs(change).max(axis=0) < STILL
     mean = np.mean(logs, axis=0)
+    # Seven quantiles divide the brightness into eighths.
     light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
     tiles = Tiles(size, len(path), most, seed)
     return Clip(
@@ -321,6 +322,7 @@ def _one_gain(grey: list[np.ndarray], clock_us: np.ndarray, used: np.ndarray, ev
         middle = float(np.median(ratio))
         if float(np.median(np.abs(ratio - middle))) > max(ALIKE, 0.7 * abs(middle)):  # no common factor
             middle = 0.0
+        # said: the contrast that the events stand for at most, in the direction of the change.
         said = np.sign(middle) * float((on - off)[used].mean()) * LARGEST_THRESHOLD
         changed = always or (abs(middle) > LEAP and said < abs(middle) / 2)
         gains.append(gains[-1] + (middle if changed else 0.0))
@@ -331,6 +333,7 @@ def _without_leaps_at_the_ends(gains: np.ndarray) -> slice:
     """Return the frames between the first and the last interval without a leap: a camera's first exposures, before it
     has adapted, do not change dark and bright parts by one factor."""
     steady = np.flatnonzero(np.abs(np.diff(np.log(gains))) <= LEAP)
+    # Intervals become frames, of which there is one more.
     return slice(int(steady[0]), int(steady[-1]) + 2) if len(steady) >= 2 else slice(None)
 
 
@@ -367,6 +370,7 @@ class Tiles:
         here = (y < rows * TILE_PX) & (x < columns * TILE_PX)
         here[here] = self._place[y[here] // TILE_PX, x[here] // TILE_PX] >= 0
         here &= used[events.y, events.x]
+        # Tiles are stacked, so y counts on from tile to tile.
         tile = self._place[y[here] // TILE_PX, x[here] // TILE_PX]
         return Events(
             (x[here] % TILE_PX).astype(np.uint16), (tile * TILE_PX + y[here] % TILE_PX).astype(np.uint16),

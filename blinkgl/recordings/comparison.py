@@ -70,6 +70,7 @@ class RecordingSide:
         if not self.iei.sum():
             return float("nan")
         i = int(np.searchsorted(np.cumsum(self.iei), self.iei.sum() / 2))
+        # The geometric middle of the bin, as bins are equal on a logarithmic scale.
         return float(np.sqrt(IEI_EDGES_US[i] * IEI_EDGES_US[i + 1]))
 
 
@@ -405,6 +406,7 @@ def _frame_intervals(
         before = None
         for k, (frame, _, name) in enumerate(source):
             if lo <= k <= hi:
+                # The offset is in 8-bit codes, so the luminance is scaled to them.
                 log = np.log(found.decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
                 if before is not None:
                     yield log - before

@@ -41,6 +41,7 @@ _BLOCK_PX = 8
 _QUANTILE, _OF_CHI_SQUARED = 0.2, 0.85
 """Part of the blocks of one brightness that are taken to hold noise alone, and the 20 % quantile of the mean square of
 64 normal numbers: blocks in which something moves lie above."""
+# The second difference along y of that along x, which is 0 for any f(x) + g(y). Its squares add up to 36.
 _MASK = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _WHITE, _LEAST_WHITE = 0.6, 0.1
 """Of the variance at all scales, what there is at the finest if changes are white, and the part of the blocks in which
@@ -100,6 +101,7 @@ def estimated(looks: Sequence[_Look], code: Callable[[float], float]) -> tuple[F
     light, square, kurtosis = (np.concatenate([look[k] for look in looks]) for k in range(3))
     if len(light) < 2 * _LEAST_BLOCKS:
         return None, None
+    # Classes of brightness with about equally many blocks.
     edges = np.quantile(light, np.linspace(0, 1, max(min(_BINS, len(light) // _LEAST_BLOCKS), 2) + 1))
     kind = np.clip(np.searchsorted(edges, light, side="right") - 1, 0, len(edges) - 2)
     kinds = np.unique(kind)
@@ -133,6 +135,7 @@ def looked_at(a: np.ndarray, b: np.ndarray) -> _Look | None:
         image[:height, :width], (width // _BLOCK_PX, height // _BLOCK_PX), interpolation=cv2.INTER_AREA
     ).ravel()
     light = mean((a + b) / 2)
+    # A code at either end of its range is clipped, so its noise is too small.
     ends = (np.minimum(a, b) <= 0) | (np.maximum(a, b) >= 1)
     inside = (mean(ends.astype(np.float32)) == 0) & (light < _BRIGHT)
     if not inside.any():
@@ -189,6 +192,7 @@ def _lower_line(level: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
     for _ in range(20):
         w = trust * weight
         line, _ = nnls(columns * w[:, None], variance / scale * w)
+        # Points above the line weigh a fifth, so it settles below most of them.
         trust = np.where(variance / scale > columns @ line, 0.2, 1.0)
     return float(line[0] * scale), float(line[1] * scale)
 
@@ -285,6 +289,7 @@ class DenoisedLight:
     def _part(self, shape: tuple[int, ...]) -> tuple[slice, slice]:
         """Return the part of the picture that the next look is at: each in turn, so that large pictures cost no
         more."""
+        # As many parts as cover a side, the quotient rounded up; neighbours overlap.
         starts = [
             np.linspace(0, max(0, side - most), -(-side // most)).astype(int) for side, most in zip(shape, _PART_PX)
         ]

@@ -94,6 +94,7 @@ def _judged(x: np.ndarray, label: np.ndarray, window: np.ndarray, window_us: flo
     if len(x) > MOST_PATCHES:
         keep = np.random.default_rng(0).permutation(len(x))[:MOST_PATCHES]
         x, label, window = x[keep], label[keep], window[keep]
+    # Folds are stretches of time, so that no window is both trained on and tested.
     fold = window * FOLDS // WINDOWS
     found, gains = [], np.zeros(x.shape[1])
     for k in range(FOLDS):
@@ -118,15 +119,19 @@ def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.nda
     cuts = [np.unique(np.quantile(x[:, f], np.arange(1, _BINS) / _BINS)) for f in range(count)]
     code = lambda data: np.stack([np.searchsorted(cuts[f], data[:, f], side="right") for f in range(count)], 1)
     own, there = code(x), code(other)
+    # The codes of all features in one range of numbers, so that one count makes all histograms.
     flat = (own + np.arange(count) * _BINS).ravel()
     score, result, gained = np.zeros(len(x)), np.zeros(len(other)), np.zeros(count)
     for _ in range(_ROUNDS):
         chance = 1 / (1 + np.exp(-score))
+        # The gradient and the curvature of the logistic loss.
         pull, weight = label - chance, chance * (1 - chance)
         add = lambda v: np.bincount(flat, np.repeat(v, count), count * _BINS).reshape(count, _BINS).cumsum(axis=1)
         g, h = add(pull), add(weight)
         rest_g, rest_h = g[:, -1:] - g, h[:, -1:] - h
+        # By how much a Newton step in either part of a cut lowers the loss; the 1 regularises.
         gain = g**2 / (h + 1) + rest_g**2 / (rest_h + 1)
+        # A cut behind the last bin divides nothing.
         gain[:, -1] = 0
         f, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
         gained[f] += max(float(gain[f, b] - g[f, -1] ** 2 / (h[f, -1] + 1)), 0.0)

@@ -34,6 +34,7 @@ _EXACT, _PER_DECADE = 64, 12
 """Counts up to the first are separate; larger ones are in bins, this many per decade."""
 _GRID = np.linspace(np.log(1e-7), np.log(1e6), 480)
 """Logarithms of expected counts over which laws of rates are summed."""
+# Number of steps between shares of answered events of 0 and 1 for which tables are made.
 _SHARES = 20
 _TEN = float(np.log(10.0))
 
@@ -235,12 +236,14 @@ def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: floa
     order = np.lexsort((events.t[pairs], pixel[pairs]))
     t, p = events.t[pairs][order].reshape(-1, 2), events.p[pairs][order].reshape(-1, 2)
     opposite = p[:, 0] != p[:, 1]
+    # At least a microsecond, the resolution of the times.
     gap = np.maximum((t[:, 1] - t[:, 0]) * 1e-6, 1e-6)[opposite]
     if len(gap) < 20:
         return 0.03, 0.5, float((events.p > 0).mean())
     grid = np.linspace(np.log(1e-6), np.log(seconds), 400)
 
     def loss(at: np.ndarray) -> float:
+        # at: the logarithms of the median and the spread, and the logit of the share of pairs by chance.
         median, spread, chance = at[0], np.exp(at[1]), expit(at[2])
         pdf = lambda x: np.exp(-0.5 * ((x - median) / spread) ** 2) / spread
         whole = np.trapezoid(pdf(grid) * (1 - np.exp(grid) / seconds), grid)
@@ -276,8 +279,10 @@ def _preferences(
 
     start = np.array([np.log((on.sum() + 1) / ((n - on).sum() + 1)), 0.0])
     best = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 400}).x
+    # The inverse of the curvature of the negative log-likelihood is the covariance.
     deviation = np.sqrt(np.clip(np.diag(np.linalg.pinv(_curvature(loss, best))), 0.0, None))
     share, spread = float(expit(best[0])), float(np.exp(best[1]))
+    # d(expit) = share (1 - share) d(logit), d(exp) = spread d(log): from the search's numbers to the parameters.
     return (
         {"hot_on_share": share, "hot_on_spread": 0.0 if spread < 0.05 else spread},
         {"hot_on_share": share * (1 - share) * float(deviation[0]), "hot_on_spread": spread * float(deviation[1])},
@@ -352,6 +357,7 @@ class _Counts:
         # Of m events m / (1 + q) are noise, and the others answers to it, at most one to each.
         few = poisson.pmf(k[None, :], mean[:, None] / (1 + q))
         if q > 0:
+            # Of n noise events, a row, k - n are answered, which makes k events, a column.
             few = few @ binom.pmf(k[None, :] - k[:, None], k[:, None], q)
         asleep = mean * self._dead / self._seconds
         # A normal law does for more than _EXACT events. Noise with its answers comes in ones and twos, so the
@@ -387,6 +393,7 @@ class _Counts:
         ended."""
 
         def read(at: np.ndarray) -> dict[str, float]:
+            # The simplex moves in unbounded numbers: logarithms of rates, logits of shares; a spread is 0 to 3 decades.
             values = {"rate_hz": np.exp(min(at[0], 700.0)), "spread_decades": 3 * expit(at[1])}
             if hot:
                 values |= {
@@ -423,6 +430,7 @@ class _Counts:
         least, best = min(ends, key=lambda end: end[0])
         values, step = read(best), {}
         deviations = np.sqrt(np.clip(np.diag(np.linalg.pinv(_curvature(loss, best))), 0.0, None))
+        # Half of the difference between one standard deviation up and down, in the parameters' own units.
         for d in np.diag(deviations):
             apart = read(best + d), read(best - d)
             step |= {key: abs(apart[0][key] - apart[1][key]) / 2 for key in values if apart[0][key] != apart[1][key]}
@@ -444,6 +452,7 @@ def _curvature(loss: Callable[[np.ndarray], float], at: np.ndarray, step: float 
     for i in range(n):
         for j in range(i + 1):
             a, b = unit[i], unit[j]
+            # For i = j these are differences over twice the step, so the divisor is the same.
             found[i, j] = loss(at + a + b) - loss(at + a - b) - loss(at - a + b) + loss(at - a - b)
             found[j, i] = found[i, j]
     return found / (4 * step**2)

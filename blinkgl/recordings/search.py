@@ -94,8 +94,10 @@ class Search:
         """Return the logarithms of the parameters at the end of the best of several descents: a few steps from more
         points, then all steps from those that led lowest."""
         ends = self._ends(keys)
+        # Sobol points cover the range more evenly than random ones; the defaults are tried before them.
         tried = qmc.scale(qmc.Sobol(len(keys), seed=self._seed).random(TRIED), *ends.T)
         tried = np.vstack([np.clip(self._defaults(keys), ends[:, 0], ends[:, 1]), tried])
+        # How many evaluations there may be, for the progress only.
         self._planned = len(tried) + starts * 20 * (len(keys) + 2)
         ordered = tried[np.argsort([_loss(self._difference(keys, at)) for at in tried])]
         self.target.beside(self._sums(keys, ordered[0]), floor="expected")
@@ -169,7 +171,9 @@ class Search:
         t = self.target
         weights = self._robust()
         count = len(t.values)
+        # Without the rows behind the numbers, which are the prior's.
         j = (self._jacobian * weights[:, None])[:count]
+        # pull: the change of the parameters for a change of each number, as a Gauss-Newton step gives it.
         pull = np.linalg.solve(j.T @ j + self._prior(), j.T * weights[:count])
         moved = (t.jackknife - t.jackknife.mean(axis=0)) * (t.weight / t.error) @ pull.T
         groups = len(t.jackknife)
@@ -179,6 +183,7 @@ class Search:
         known = t.chance > LEAST_CHANCE * t.error
         off = self._residual[:count][known] / t.weight[known] * t.error[known] / t.chance[known]
         misfit = max(1.0, float(np.sqrt(np.mean(off**2)))) if known.any() else 1.0
+        # d(exp v) = exp(v) dv: from the logarithms to the parameters' own units.
         return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self.keys, self.place, spread)}
 
     def _spread(self) -> np.ndarray:
@@ -187,12 +192,14 @@ class Search:
 
     def _robust(self) -> np.ndarray:
         """Return square roots of the loss's weights of the residuals."""
+        # The loss 2 (sqrt(1 + r^2) - 1) has the derivative (1 + r^2)^-1/2 by r^2.
         return (1 + self._residual**2) ** -0.25
 
     def _prior(self) -> np.ndarray:
         """Return the information on the logarithms from typical cameras; where only the ends of a range are known, a
         normal law of the same width."""
         ends = self._ends(self.keys)
+        # The variance of a uniform law is a twelfth of the square of its width.
         wide = 12 / np.diff(ends, axis=1)[:, 0] ** 2
         _, scale = self._usual(self.keys)
         return np.diag(np.where(scale > 0, scale**2, wide))
@@ -242,7 +249,9 @@ class Search:
         """Return derivatives by steps of ``STEP``, or wider ones where that has hardly any effect."""
         columns = []
         for i, (low, high) in enumerate(self._ends(keys)):
+            # The wider step is taken only where the first one moves the residuals by less than 1 in all.
             for width in (STEP, 8 * STEP):
+                # Backwards where a step forwards would leave the range.
                 step = width if at[i] + width <= high else -width
                 there = at.copy()
                 there[i] = min(max(at[i] + step, low), high)
@@ -263,6 +272,7 @@ class Search:
         for i in vague:
             others, held = [key for key in keys if key != keys[i]], self._set
             (low, high), tried = self._ends([keys[i]])[0], []
+            # Without the held parameter's column and the row of its prior, which comes after those of the numbers.
             slopes = np.delete(np.delete(self._jacobian, i, axis=1), numbers + i, axis=0)
             for place in np.linspace(low, high, _PLACES + 2)[1:-1]:
                 self._set = {**held, keys[i]: float(np.exp(place))}
@@ -294,6 +304,7 @@ class Search:
             ftol=_LITTLE,
             max_nfev=steps,
         )
+        # scipy's cost is half of the loss.
         return 2 * float(found.cost), found.x
 
 

@@ -253,11 +253,13 @@ def stepped(
 
     def shown() -> Iterator[EventFrame]:
         for luminance, t_ns in stream:
+            # Holds the frame that the emulator has taken last, for its step.
             seen[:] = [luminance]
             yield EventFrame(t_ns, luminance)
 
     for t_ns, events in emulate(shown(), camera):
         report.add(t_ns, events, camera)
+        # An interpolated frame lies before the given frame that has been read last.
         yield Step(t_ns, events, seen[0], given.decode, t_ns == given.t_ns)
 
 

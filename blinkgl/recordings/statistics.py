@@ -137,6 +137,7 @@ def _looks(
     count, told = patches(events, size, span_us)
     full = count >= LEAST_IN_PATCH if full is None else full
     side = TILE_PX // 2
+    # The group of the tile in which each patch lies, as in ``groups``.
     rows, columns = (np.arange(n) * SIDE_PX // side for n in full.shape[1:])
     group = np.broadcast_to((rows[:, None] * 7 + columns * 3) % GROUPS, full.shape)[full]
     values = told[full].astype(np.float64)
@@ -148,6 +149,7 @@ def groups(size: tuple[int, int]) -> np.ndarray:
     """Return the group of every pixel, (H*W,) int64: tiles scattered over the image, neither rows nor columns."""
     y, x = np.divmod(np.arange(size[0] * size[1]), size[1])
     side = TILE_PX // 2
+    # 7 and 3 have no factor in common with 16, so a row or a column of tiles passes through all groups.
     return ((y // side) * 7 + (x // side) * 3) % GROUPS
 
 
@@ -157,6 +159,7 @@ def _by(group: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _histogram(counts: np.ndarray, group: np.ndarray) -> np.ndarray:
     bins = np.searchsorted(COUNTS, counts, side="right") - 1
+    # A histogram over groups and bins in one: the number of a cell is group * bins + bin.
     flat = np.bincount((group * len(COUNTS) + bins).ravel(), minlength=GROUPS * len(COUNTS))
     return flat.reshape(GROUPS, len(COUNTS)).astype(np.float64)
 
@@ -181,6 +184,7 @@ def _collect(where, t, p, edges, bursts, group, total, isi):
             burst += 1
         now = t[i] - edges[0]
         if last[j] >= 0 and last[j] + edges[0] >= quiet_since:
+            # 1e-9, because the logarithm of a power of ten may be rounded down.
             b = min(int(ISI_PER_DECADE * np.log10(max(now - last[j], 1)) + 1e-9), ISI_BINS - 1)
             isi[group[j], int(before[j] != p[i]), b] += 1
         last[j], before[j] = now, p[i]
@@ -336,6 +340,7 @@ def numbers(
         add("rate", np.log((rates.sum(axis=0) + 1) / seconds.sum()))
         add("total", np.log((rates.sum() + 1) / seconds.sum()))
         add("light", np.log((lights + 4) / (s.seconds.sum() * pixels[0])))
+        # The last entry of a cumulative distribution is always 1.
         add("count", (np.cumsum(counts) / max(counts.sum(), 1))[:-1])
         norm = np.sqrt(products[1] * products[2])
         add("polarity", products[0] / norm if norm > 0 else 0.0)

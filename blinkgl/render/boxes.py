@@ -182,6 +182,7 @@ def extents(ids: np.ndarray, count: int) -> np.ndarray:
     """Return (count, 5) int64: for every id below ``count`` the first and last column and row of its pixels, as x0, y0,
     x1, y1, and their number."""
     out = np.zeros((count, 5), np.int64)
+    # Ids without pixels keep a first column and row beyond the picture.
     out[:, 0], out[:, 1] = ids.shape[1], ids.shape[0]
     for y in range(ids.shape[0]):
         for x in range(ids.shape[1]):

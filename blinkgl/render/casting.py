@@ -183,6 +183,7 @@ def nearest(
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
     relative = [_relative_pose(camera_pose, obj.path.pose(t_ns)) for obj, _ in scene_parts(scene)]
     axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
+    # The camera's centre in each object's axes, -R^T t.
     origins = np.array([-m[:3, :3].T @ m[:3, 3] for m in relative]).reshape(-1, 3)
     n = len(rays)
     far = np.full(n, np.inf) if far is None else far
@@ -287,6 +288,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
         # A lens may not see the point at its new place.
         valid &= np.isfinite(flow).all(axis=1)
         there = hits.xy + flow
+        # Pixel centres are at whole numbers, so the image reaches half a pixel beyond the outer ones.
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 
     # the ray aims at the moved point itself: through xy + flow it would have that sum's rounding
@@ -303,6 +305,7 @@ def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
     # The motion of the shape plus that of the pose.
     own = replace(hits, local=local_at(scene, hits, t_ns) - hits.local)
     carried = applied(scene, hits, lambda obj: _pose_change(obj, hits.t_ns, t_ns))
+    # A difference of positions is a vector: the pose rotates it and does not shift it.
     changed = applied(scene, own, lambda obj: np.c_[obj.path.pose(t_ns)[:3, :3], np.zeros(3)])
     return (carried + changed) @ scene.camera_path.pose(hits.t_ns)[:3, :3]
 
@@ -328,6 +331,7 @@ def is_seen(
     skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
     # The ray stops a little before the point, so that its own surface does not hide it.
     far = moved[rows, 2] * (1.0 - VISIBILITY_SLACK)
+    # Rays are (X, Y) / Z, so that the ray's parameter is the depth.
     blocker, _, _ = nearest(scene, t_ns, moved[rows, :2] / moved[rows, 2:], far=far, skip=skip)
     hidden_by[rows] = blocker[:, :2]
     return candidate & (hidden_by[:, 0] < 0), hidden_by
@@ -364,6 +368,7 @@ def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.n
         on = np.flatnonzero(rows & (hits.part == p))
         if len(on) and (side := part.side(t_ns)):
             m = relative_pose_at(scene, obj, t_ns)
+            # The camera's centre in the object's axes, -R^T t.
             eye = -m[:3, :3].T @ m[:3, 3]
             a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
             # The eye is on the drawn side of the triangle's plane.

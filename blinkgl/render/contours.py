@@ -63,7 +63,9 @@ class _Pool:
         # Running sums, so that numbers count on from contour to contour.
         self.starts = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.reshape(sizes, (-1, 3)), axis=0)])
         self.starts = self.starts.astype(np.int64)
+        # An empty part first, so that a pool without contours has arrays of the right shapes, too.
         empty = [(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty((0, 4)), np.empty((0, 4), np.int32))]
+        # An edge holds two places and two faces, which are renumbered; -1 stays for a face that it does not have.
         parts = empty + [
             (
                 c.rest,
@@ -103,6 +105,7 @@ class Lines:
         hidden ones included; valid until the next call."""
         bodies = np.array(list(dict.fromkeys(item.object_index for item in items)), np.int64)
         numbers = np.array([self._number(moment, body) for body in bodies.tolist()], np.int64)
+        # A pool's starts have one row more than it has contours; fewer mean that contours have been made since.
         if len(self._pool.starts) <= len(self._contours):
             self._pool = _Pool(self._contours)
         pool = self._pool
@@ -188,6 +191,7 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
         if edges[e, 3] >= 0:
             other = front[edges[e, 3]]
             if towards == other:
+                # Both faces are visible or neither is: no silhouette, so the edge is drawn only if it is sharp.
                 if sharp[e] == 0 or (culled and not towards):
                     continue
                 kind = sharp[e]
@@ -280,11 +284,13 @@ def _cross(lines, width, height, out, places):
         lx, ly, gain = -dy / length, dx / length, lines[n, 5] - lines[n, 2]
         # The pixel that it begins in, and where along it (0 to 1) the next column and the next row begin.
         x, y = int(np.floor(ax)), int(np.floor(ay))
+        # A line that begins on the border of two pixels begins in the one that it runs into.
         if ax == x and dx < 0:
             x -= 1
         if ay == y and dy < 0:
             y -= 1
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        # by_x, by_y: the fraction of the line from one column to the next, and from one row to the next.
         by_x, by_y = (1 / abs(dx) if dx != 0 else np.inf), (1 / abs(dy) if dy != 0 else np.inf)
         # Amanatides and Woo: walk from pixel to pixel across the nearer border.
         next_x = ((x + 1 - ax) if dx > 0 else (ax - x)) * by_x if dx != 0 else np.inf
@@ -334,6 +340,8 @@ def _by_pixel(crossings, places, width, counts, pixels, out):
         at = min(counts[place], _BUSIEST)
         pixels[begins[at], 3] = place
         begins[at] += 1
+    # Until here pixels[:, 3] holds the sorted places. Now the columns become x, y, first crossing and the one after the
+    # last, and ``counts`` the write positions.
     first = 0
     for k in range(found):
         place = pixels[k, 3]

@@ -193,6 +193,7 @@ class _Facets:
             flat = np.cross(b - a, c - a)
             flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
             cosine = np.einsum("fk,fck->fc", flat, mesh.normals[mesh.faces].astype(np.float64))
+            # A quantile, so that a few corners do not count; cosines below 0.1 would make the tangent large.
             angle = math.acos(min(1.0, max(0.1, float(np.quantile(cosine, 0.05)))))
             self._slopes[id(mesh)] = math.tan(angle)
         return self._slopes[id(mesh)]

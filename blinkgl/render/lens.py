@@ -47,7 +47,9 @@ def places_of(camera: CameraModel, flat: PinHole, width: int, height: int) -> Pl
     xy = np.stack([x, y], axis=-1)
     rays = fine.rays(xy)
     slopes = flat.jacobian(rays) @ fine.ray_jacobian(xy)
+    # d(place_i) / d(px_j) becomes the change of place for a pixel to the right, then that for a pixel downwards.
     across = np.ascontiguousarray(np.swapaxes(slopes, -1, -2), np.float32).reshape(height, width, 4)
+    # A projection counts from the first pixel's centre, places from the picture's corner half a pixel before it.
     return Places((flat.project(rays) + 0.5).astype(np.float32), across)
 
 
@@ -74,6 +76,7 @@ def steps_of(camera: CameraModel, finer: int) -> tuple[int, int]:
     pinhole picture ``finer`` times as fine, everywhere in the picture."""
     seen, size = seen_through(camera), (camera.width, camera.height)
     slopes = places_of(camera, seen, *size).slopes  # type: ignore[bad-argument-type]
+    # Lengths of the two slopes: components 0 and 2 are along x, 1 and 3 along y.
     lengths = np.hypot(slopes[..., ::2], slopes[..., 1::2]).max(axis=(0, 1)) * finer
     columns, rows = np.clip(np.ceil(lengths - _SPARED), 1, _MOST).astype(int)
     return int(columns), int(rows)
@@ -116,6 +119,7 @@ class Lens:
 
     @cached_property
     def _numbers(self) -> tuple[float, ...]:
+        # The shaders' arrays have up to five coefficients; those that a camera model lacks are 0.
         return (*self.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
 
     def set(self, uniforms: Uniforms, moment: Moment, unit: int) -> None:
@@ -124,6 +128,7 @@ class Lens:
             self.claims.use(unit)
             uniforms["lens_claims"].value = unit
         if "lens_plane" in uniforms:
+            # NDC x is P00 X/Z + P02, which is solved for X/Z: a scale and an offset for each axis.
             P = moment.view.projection
             uniforms["lens_plane"].value = 1 / P[0, 0], 1 / P[1, 1], -P[0, 2] / P[0, 0], -P[1, 2] / P[1, 1]
         if "lens_focal" in uniforms:

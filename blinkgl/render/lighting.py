@@ -78,6 +78,8 @@ class Lighting:
         if self.plain and not kind.whole:
             return shadows
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
+        # Degree of the ambient light in the normal: 3 stands for a quartic form, 2 for a quadratic one, 1 for
+        # a linear one.
         ambient = 3 if self._quartic is not None else 2 if self._quadric[:, :3, :3].any() else 1
         return (
             {"LIGHTS": 1}
@@ -100,6 +102,7 @@ class Lighting:
         index, channel = item.object_index, item.material.base_color
         for name, per_channel in _FIXED.items():
             if (uniform := uniforms.get(name)) is not None:
+                # A program of one channel gets one value, weighted by the colour of the surface.
                 one = per_channel and uniform.dimension == 1
                 key = (name, channel) if one else (name,)
                 if key not in self._bytes:
@@ -113,6 +116,8 @@ class Lighting:
             for one in (name, f"{name}_rate") if rates else (name,):
                 if (uniform := uniforms.get(one)) is not None:
                     values = placed[one][index]
+                    # The table's number is the length for one channel; arrays for three channels are three
+                    # times as long.
                     if per_channel and uniform.array_length == per_channel:
                         values = (self.channel(channel) @ values).astype(np.float32)
                     uniform.write(values.tobytes())
@@ -133,7 +138,9 @@ class Lighting:
         turn = np.zeros((len(R), 4, 4))
         turn[:, :3, :3], turn[:, 3, 3] = R, 1.0
         poses = np.array([lamp.path.pose(moment.t_ns) for lamp in self.lamps]).reshape(-1, 4, 4)
+        # A lamp shines along its -z axis, so column 2 of its pose points from a surface towards a sun.
         axes, away = poses[:, :3, 2], poses[None, self._suns :, :3, 3] - t[:, None]
+        # v @ R is R^T v: world directions in the axes of each object.
         own = axes @ R
         spots = slice(len(self.lamps) - self._spots, None)
         placed = {"sun_towards": own[:, : self._suns], "lamp_place": away @ R, "spot_axis": own[:, spots]}
@@ -143,6 +150,7 @@ class Lighting:
         if rates:
             dR, dt = moment.rates.T_world_obj[:, :3, :3], moment.rates.T_world_obj[:, :3, 3]
             changes = np.array([lamp.path.derivative(moment.t_ns) for lamp in self.lamps]).reshape(-1, 4, 4)
+            # The product rule: both the lamps and the objects may turn.
             own_rate = axes @ dR + changes[:, :3, 2] @ R
             turn_rate = np.zeros_like(turn)
             turn_rate[:, :3, :3] = dR
@@ -166,6 +174,7 @@ def _seen_turned(form: np.ndarray, turn: np.ndarray, rate: np.ndarray | None = N
     change, where the transform changes by ``rate`` per second."""
     if rate is None:
         return turn[:, None].swapaxes(2, 3) @ form @ turn[:, None]
+    # The product rule on M^T F M; its two terms are transposes of each other.
     half = turn[:, None].swapaxes(2, 3) @ form @ rate[:, None]
     return half + half.swapaxes(2, 3)
 
@@ -193,6 +202,7 @@ def _fourth(quartic: np.ndarray) -> np.ndarray:
 
 def _forms(quadric: np.ndarray) -> dict[str, np.ndarray]:
     """Return (..., 3, 4, 4) quadrics in the shader's form, (..., 3, 4 or 3)."""
+    # Of (n, 1) Q (n, 1): the linear terms and the constant.
     Q = quadric
     even = np.concatenate([2 * Q[..., :3, 3], Q[..., 3, 3:]], axis=-1)
     mixed = 2 * np.stack([Q[..., 0, 1], Q[..., 1, 2], Q[..., 2, 0]], axis=-1)  # of xy, yz, zx

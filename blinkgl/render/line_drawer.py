@@ -39,9 +39,11 @@ class LineDrawer:
         if not self._count:
             return
         if self._pixels is None or pixels.nbytes > self._pixels.size:
+            # The programs' vertex arrays hold the old buffer.
             self.forget()
             if self._pixels is not None:
                 self._pixels.release()
+            # Twice the present size, so that a growing number of lines rarely needs a new buffer.
             self._pixels = self.gl.ctx.buffer(reserve=2 * pixels.nbytes, dynamic=True)
         self._pixels.write(pixels)
         rows = -(-len(crossings) // ROW)

@@ -77,6 +77,7 @@ slope there."""
 def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) -> np.ndarray:
     """Return (n, 2) uint32 for bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z of a fragment as
     the bits of a float32, and the largest minus it. centre_z, radius : (n,) float64."""
+    # A bounding sphere may reach behind the near plane, but no fragment does.
     farthest, nearest = np.maximum(centre_z + radius, near), np.maximum(centre_z - radius, near)
     inverse = np.empty((len(centre_z), 2), np.float32)
     inverse[:, 0], inverse[:, 1] = 1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest
@@ -85,6 +86,7 @@ def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) ->
     return bits
 
 
+# x and y from [-1, 1] to [0, 1]; the depth is in [0, 1] already.
 _TEXTURE_FROM_CLIP = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 KEPT = 4
 """Moments in memory: a label uses its own time and those of its neighbours, which use it, too."""
@@ -146,6 +148,7 @@ class Moment:
     def through(self, view: View) -> Moment:
         """Return the same instant through another camera at the same place."""
         other = Moment(self.t_ns, view, self.T_world_cam, self.T_world_obj, self._stage)
+        # Values that depend on the camera's place, not on its view, are the same.
         other.__dict__.update({name: self.__dict__[name] for name in _OF_THE_PLACE if name in self.__dict__})
         return other
 
@@ -207,8 +210,10 @@ class Moment:
         stage = self._stage
         if not stage.items:
             return []
+        # All planes of the frustum contain the camera's centre, so n . c is the signed distance of a sphere's centre.
         inside = (self.centres @ self.view.frustum.T >= -stage.item_radius[:, None]).all(axis=1).tolist()
         nearest = self.centres[:, 2] - stage.item_radius
+        # lexsort sorts by its last key first: by layers, then by depth.
         order = np.lexsort((nearest, stage.item_layer))
         return [stage.items[i] for i in order if inside[i]]
 
@@ -259,6 +264,7 @@ class Bodies:
         if (found := kept.get(t_ns)) is not None:
             return found
         made = kept[t_ns] = start.copy()
+        # Rows of objects that do not move keep the values in ``start``.
         for i in self.moving:
             made[i] = of(self.paths[i])
         if len(kept) > KEPT:

@@ -187,6 +187,7 @@ class Painter:
         # State changes are expensive: culling is switched only where it differs.
         if side != self._side:
             (self.gl.ctx.enable if side else self.gl.ctx.disable)(moderngl.CULL_FACE)
+            # side < 0: the shape is mirrored at this moment, so its visible faces run the other way round.
             self.gl.ctx.cull_face = "front" if side < 0 else "back"
             self._side = side
         self.resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)

@@ -94,6 +94,7 @@ class Holes(NamedTuple):
 @kernel
 def _sort_stably(order, a, b, centre, axis, spare):
     """Sort order[a:b] by the centroids along an axis; equal ones keep their order. spare : room for b - a."""
+    # A merge sort from below: sorted runs of 1, 2, 4, … entries are merged in pairs.
     width = 1
     while width < b - a:
         for low in range(a, b, 2 * width):
@@ -274,9 +275,12 @@ def _triangle(tri, o, kx, ky, kz, sx, sy, sz):
     v = ax * cy - ay * cx
     w = bx * ay - by * ax
     det = u + v + w
+    # Areas of both signs: the ray passes outside an edge. Zero belongs to both signs, so no ray slips between two
+    # triangles that share an edge.
     if det == 0.0 or ((u < 0.0 or v < 0.0 or w < 0.0) and (u > 0.0 or v > 0.0 or w > 0.0)):
         return np.inf, 0.0, 0.0, 0.0, False
     u, v, w = u / det, v / det, w / det
+    # The interpolated z of the sheared corners; sz = 1 / d[kz] makes it the ray's parameter.
     return sz * (u * az + v * bz + w * cz), u, v, w, det > 0.0
 
 

@@ -158,6 +158,7 @@ class SceneResources:
                 for name, n in (("in_tangent", 4), ("in_tint", 3))
                 if name in program
             ]
+            # The last 4 is the size of an index in bytes.
             self._vaos[key] = self.ctx.vertex_array(program, streams, indices, 4)
         return self._vaos[key]
 

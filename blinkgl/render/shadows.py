@@ -52,6 +52,7 @@ class Parallel(NamedTuple):
             [
                 [1 / self.half_x, 0, 0, 0],
                 [0, 1 / self.half_y, 0, 0],
+                # Reversed depth, 1 - Z / depth.
                 [0, 0, -1 / self.depth, 1.0],
                 [0, 0, 0, 1.0],
             ]
@@ -61,6 +62,7 @@ class Parallel(NamedTuple):
         """Return the texels that the convex hull of (n, 3) points can touch, as a camera model does."""
         x = (points[:, 0] / self.half_x + 1) * self.size / 2
         y = (points[:, 1] / self.half_y + 1) * self.size / 2
+        # One texel of margin on each side for rounding; the upper ends are exclusive.
         x0, x1 = max(0, math.floor(x.min()) - 1), min(self.size, math.ceil(x.max()) + 2)
         y0, y1 = max(0, math.floor(y.min()) - 1), min(self.size, math.ceil(y.max()) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
@@ -116,6 +118,7 @@ def _swept(scene: Scene, items: Sequence[DrawItem]) -> np.ndarray:
         if not path.is_static:
             speed, turning = path.speed_bound(scene.t0_ns, scene.t1_ns)
             step = (scene.t1_ns - scene.t0_ns) * 1e-9 / (_TIMES - 1)
+            # Between two sampled times a sphere moves by at most half a step at its largest speed from the nearer one.
             room += 0.5 * step * (speed + turning * float(np.linalg.norm(item.centre)))
         spheres.append(np.column_stack([centres, np.full(len(centres), room)]))
     return np.concatenate(spheres) if spheres else np.zeros((0, 4))
@@ -126,8 +129,10 @@ def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[V
     T = pose @ CV_FROM_LAMP
     if box is None:
         return View.of(PinHole.centred(size, size, 1 / _texel_of_cone(lamp, size), near=_NEAR)), T
+    # The box is widened by _SPARE texels on every side of the map.
     x, y, z = (h * size / (size - 2 * _SPARE) for h in box.half)
     camera = Parallel(size, x, y, 2 * z)
+    # The camera of the map stands on the side of the box that faces the lamp.
     T[:3, 3] = np.asarray(box.centre) - z * T[:3, 2]
     # No sphere is outside these planes, which go through one point: every casting item is drawn.
     return View(camera, camera.clip_from_cam(), np.zeros((1, 3))), T
@@ -144,6 +149,7 @@ def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, floa
 
 def _texel_of_cone(lamp: Lamp, size: int) -> float:
     """Return the width of a texel of a spot light's map at a depth of 1."""
+    # A cone of 90 degrees has no flat picture, so 1.5 rad is the widest.
     return math.tan(min(lamp.outer, 1.5)) / (size / 2 - _SPARE)
 
 

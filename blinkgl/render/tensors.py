@@ -24,6 +24,7 @@ from blinkgl.errors import GLError
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
 
+# GL_TEXTURE_2D.
 _TEXTURE_2D = 0x0DE1
 _CONTEXTS: dict[int, Any] = {}  # torch's (primary) contexts by GPU, kept for the life of the process
 
@@ -124,6 +125,7 @@ class TextureReader:
         flags = self._driver.CUgraphicsRegisterFlags.CU_GRAPHICS_REGISTER_FLAGS_READ_ONLY
         self._resource = self._here("cuGraphicsGLRegisterImage", texture.glo, _TEXTURE_2D, flags)
         seen, wanted = self._copied().cpu(), self._torch.from_numpy(self._target.read(self._i))
+        # As bytes, because NaN differs from itself.
         if not self._torch.equal(seen.view(self._torch.uint8), wanted.view(self._torch.uint8)):
             self.release()
             raise NoInteropError("CUDA reads other numbers than OpenGL")
@@ -148,6 +150,7 @@ class TextureReader:
         copy.srcMemoryType = self._driver.CUmemorytype.CU_MEMORYTYPE_ARRAY
         copy.dstMemoryType = self._driver.CUmemorytype.CU_MEMORYTYPE_DEVICE
         copy.dstDevice = made.data_ptr()
+        # Rows follow each other without gaps: the pitch is the length of a row.
         copy.WidthInBytes = copy.dstPitch = target.width * pixel.components * pixel.numpy.itemsize
         copy.Height = target.height
         stream = self._driver.CUstream(stream)

@@ -103,6 +103,7 @@ _ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary"
 def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray, Hits]:
     """Return (N, 3) queries and the hits of a regular grid of whole pixels at the first time."""
     width, height = scene.camera.width, scene.camera.height
+    # Columns and rows in the picture's proportions; the second division gives columns what rounding took from rows.
     columns = min(width, max(1, round(np.sqrt(points * width / height))))
     rows = min(height, max(1, points // columns))
     columns = min(width, max(1, points // rows))
@@ -111,6 +112,7 @@ def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray,
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     hits = casting.cast(scene, times[0], xy)
     hits = replace(hits, **{name: getattr(hits, name)[hits.hit] for name in _ARRAYS})
+    # A query is (number of the time, y, x).
     return np.column_stack([np.zeros(len(hits.xy)), hits.xy[:, ::-1]]), hits
 
 
@@ -126,6 +128,7 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
         a, b, c = np.moveaxis(casting.vertices_at(mesh, times[0])[mesh.faces], 1, 0)
         area.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
         which.append(np.column_stack([np.full(len(a), p), np.arange(len(a))]).astype(np.int32))
+    # ends: running sums of the triangles' areas, in which a uniform number finds its triangle.
     places_, ends = np.concatenate(which), np.cumsum(np.concatenate(area))
     kept: list[Tracks] = []
     left = points
@@ -154,6 +157,7 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
         )
         tracks = _followed(scene, hits, times, np.zeros((draws, 3)))
         rows = np.flatnonzero(~tracks.occluded.all(axis=1))[:left]
+        # argmin finds the first False: the first time at which the point is visible.
         first = np.argmin(tracks.occluded[rows], axis=1)
         at = tracks.target_points[rows, first]
         kept.append(_rows(tracks, rows, np.column_stack([first, at[:, 1], at[:, 0]])))

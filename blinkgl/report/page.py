@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from blinkgl.errors import OutputError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.report.charts import histogram, number, png, render, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
 from blinkgl.sequence_files.index import write_index
@@ -32,8 +32,7 @@ def write_report(
     found = collect(root, examples=examples)
     if own:
         write_index(root)
-    with atomic_file(out) as path, output_errors(path):
-        path.write_text(build_report(found), encoding="utf-8")
+    write_whole(out, build_report(found))
     return out
 
 

@@ -41,6 +41,7 @@ def lamp_pose(position: ArrayLike = (0.0, 0.0, 0.0), shines: ArrayLike = (0.0, 0
     """Return T_world_lamp, (4, 4), of a lamp at ``position`` that shines in the direction (3,), of any length."""
     z = -np.asarray(shines, np.float64)
     z = z / np.linalg.norm(z)
+    # Any axis that is not nearly parallel to z.
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
     T = np.eye(4)
@@ -215,12 +216,14 @@ LUMENS_PER_WATT = 683.0
 
 def lamp_of_gltf(light: Mapping[str, Any], path: PosePath, gain: float) -> Lamp:
     """Return the lamp of an entry of KHR_lights_punctual: lux of a directional light, candela of others."""
+    # Photometric units over 683 are radiometric ones; over pi they are the radiance of a white surface.
     strength = _scaled(light["color"], gain * light["intensity"] / (LUMENS_PER_WATT * math.pi))
     if light["type"] == "directional":
         return Lamp("sun", strength, path)
     reach = light["range"] or math.inf
     if light["type"] == "point":
         return Lamp("point", strength, path, reach)
+    # The extension's angles are from the axis to the edge, as a lamp's are.
     return Lamp("spot", strength, path, reach, light["spot"]["innerConeAngle"], light["spot"]["outerConeAngle"])
 
 
@@ -233,6 +236,7 @@ def random_lamps(
         kind = config.kinds[int(rng.integers(len(config.kinds)))]
         low, high = np.log(config.sun_strength if kind == "sun" else config.strength)
         hue, saturation = rng.uniform(0, 2 * math.pi), rng.uniform(0, config.saturation)
+        # Three cosines a third of a turn apart: a colour of this hue.
         color = 0.5 + 0.5 * np.cos(hue + np.array([0.0, 2.0, 4.0]) * math.pi / 3)
         color = 1 - saturation * (1 - color / color.max())
         strength = _scaled(color, np.exp(rng.uniform(low, high)))
@@ -241,6 +245,7 @@ def random_lamps(
         elevation, azimuth, angle = rng.uniform(25, 80), rng.uniform(-180, 180), rng.uniform(*config.angle)
         if kind == "sun":
             pose = lamp_pose(shines=-np.asarray(direction_of(elevation, azimuth)))
+            # 0.53 degrees is the sun's diameter as seen from the earth.
             lamps.append(Lamp("sun", strength, StaticPath(pose), size=math.radians(0.53)))
         elif kind == "point":
             lamps.append(Lamp("point", strength, StaticPath(lamp_pose(place))))

@@ -22,7 +22,9 @@ from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath
 from blinkgl.scene.motion.pose_path import PosePath
 
+# Half of the time over which velocities are differenced.
 _HALF_NS = 20_000
+# Spacing of the times at which the velocity is searched for jumps, and the largest number of them.
 _LOOK_NS = 1_000_000
 _MOST_LOOKS = 200_000
 
@@ -65,6 +67,7 @@ def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.
         _refuse_jumps(body, t0_ns, t1_ns)
     n, dt = len(times), 1 / config.rate
     white, walk = rng.normal(size=(2, n, 3)), rng.normal(size=(2, n, 3))
+    # No time has passed before the first measurement, so its bias has not walked.
     walk[:, 0] = 0
     # + 0.0: without a walk there are no negative zeros, which are other bytes.
     bias_w = config.gyroscope_random_walk * np.sqrt(dt) * np.cumsum(walk[0], 0) + 0.0
@@ -87,6 +90,7 @@ def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.nd
     if body.is_static:
         return np.zeros((len(times), 3)), R_body_world @ -gravity
     turning = R_body_world @ np.array([body.derivative(t)[:3, :3] for t in times])
+    # R^T R' is the skew matrix of the body rate, but for rounding; its entries 21, 02 and 10 are x, y and z.
     twist = 0.5 * (turning - turning.swapaxes(1, 2))
     second = np.array([_second(body, t)[:3, 3] for t in times])
     rate = np.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]], axis=1)
@@ -102,6 +106,7 @@ def _second(path: PosePath, t_ns: int) -> np.ndarray:
         return np.zeros((4, 4))
     if t_ns - h < path.t0_ns or t_ns + h > path.t1_ns:
         sign = 1 if t_ns - h < path.t0_ns else -1
+        # The one-sided difference of second order.
         a, b, c = (path.derivative(t_ns + sign * k * h) for k in (0, 1, 2))
         return sign * (-3 * a + 4 * b - c) / (2 * seconds)
     return (path.derivative(t_ns + h) - path.derivative(t_ns - h)) / (2 * seconds)
@@ -116,6 +121,7 @@ def _refuse_jumps(path: PosePath, t0_ns: int, t1_ns: int) -> None:
     second = np.array([_second(path, t)[:3] for t in times])
     if len(first) < 2:
         return
+    # The change of velocity that the accelerations at both ends explain, by the trapezoidal rule.
     said = 0.5e-9 * step * (second[1:] + second[:-1])
     left = np.abs(first[1:] - first[:-1] - said).max(axis=(1, 2))
     # a smooth curve leaves a third-order remainder; a jump does not

@@ -76,6 +76,7 @@ class Panels:
         down slowly, so that a passing object does not fade the rest and colours do not flicker."""
         if not self._has_flow:
             return
+        # Every fourth pixel in x and y is enough for a percentile.
         speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
         speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
         if speed.size:

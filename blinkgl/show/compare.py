@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from blinkgl.io.atomic import atomic_file
+from blinkgl.io.atomic import write_whole
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.comparison import BLUR_PX, compare
 from blinkgl.recordings.comparison_plot import plot
@@ -36,8 +36,7 @@ def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:
     for note in result.notes:
         say(console, note)
     if out is not None:
-        with atomic_file(os.path.join(out, "compare.json")) as path:
-            path.write_text(json.dumps(result.to_dict(), indent=1) + "\n", encoding="utf-8")
+        write_whole(os.path.join(out, "compare.json"), json.dumps(result.to_dict(), indent=1) + "\n")
         plot(result, os.path.join(out, "compare.png"))
         say(console, f"written to {out}: compare.json, compare.png")
     return 0

@@ -264,6 +264,7 @@ class Batch(ABC):
         length = np.where(started, times - before, 1)
 
         def given(values: np.ndarray) -> Any:
+            # One number where all environments agree, which spares a value for each pixel.
             alike = (values == values[0]).all()
             return int(values[0]) if alike else torch.from_numpy(values.copy()).to(self.device, non_blocking=True)
 
@@ -375,9 +376,11 @@ def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tenso
     lower = place.to(torch.int64).clamp(0, last)
     weight = (place - lower).to(torch.float32)
     inside = (events.t >= start) & (events.t <= end)
+    # Events outside the span add 0.
     sign = torch.where(events.p > 0, 1.0, -1.0) * inside
     # Both shares of an event are adjacent: a cell then adds them in the order of events, as the numba loop does.
     first, second = _cells(events, lower, bins), _cells(events, (lower + 1).clamp(max=last), bins)
+    # In the last bin the second share is 0, so its clamped cell does not matter.
     shares = torch.stack((sign * (1.0 - weight), torch.where(lower < last, sign * weight, 0.0)), 1)
     grid = torch.zeros(envs * bins * height * width, device=events.t.device)
     grid.index_add_(0, torch.stack((first, second), 1).view(-1), shares.view(-1))
@@ -409,4 +412,5 @@ def time_surface(latest: Tensor, t_us: Any, tau_us: float) -> Tensor:
 
     latest : of :func:`latest_times`.   t_us : now, one or (environments,).   Source: Lagorce et al., TPAMI 2017."""
     now = t_us.view(-1, 1, 1, 1) if isinstance(t_us, Tensor) else t_us
+    # NEVER_US is so long ago that the exponential is 0.
     return torch.exp((latest - now).to(torch.float64) / tau_us).to(torch.float32)

@@ -126,6 +126,7 @@ class TensorEsim(Batch):
         self._last_ns = zeros(torch.int64, self._refractory_ns > 0) + NEVER_NS
         # Of the first half.
         self._now, self._beyond = zeros(torch.int32), zeros(torch.int32)
+        # For one piece: a row for the light and two for the logarithm's intermediate values.
         self._scratch = torch.empty((3, len(self._now[self._chunks()[0]])), device=self.device)
         self._state = ("_log", "_upper", "_lower", "_fired", "_last_ns")
 
@@ -188,6 +189,7 @@ class TensorEsim(Batch):
         extremes = []
         for piece in self._chunks():
             now, beyond = self._now[piece], self._beyond[piece]
+            # The least and the largest bit pattern tell whether an intensity is invalid, see _refuse.
             extremes.append(torch.stack(torch.aminmax(flat[piece].view(torch.int32))))
             light, first, second = self._scratch[:, : len(now)]
             log_q25_(torch.add(flat[piece], self.config.log_eps, out=light), now, first, second)

@@ -66,8 +66,8 @@ class Step(NamedTuple):
 
 
 def add_curves(r: Rows, v: Step, has: Parts) -> None:
-    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak change linearly.
     """Compute c, rise, fall, k and end of the rows' signals, from the interval's start (s = 0, e = e^(-k s) = 1)."""
+    # z(s) = c + rise s + fall e^(-k s), as in v2e_model.curve_of; noise and leak change linearly.
     dx = r["x1"] - r["x0"]
     base, drift = r["x0"] + r["noise"] + r["leak"] * v.since_0, r["shift"] + r["leak"] * v.dt
     r["rise"], r["s"], r["e"] = drift + dx, torch.zeros_like(dx), torch.ones_like(dx)
@@ -122,6 +122,7 @@ def _turn(s: Tensor, low: Tensor, high: Tensor, r: Rows) -> tuple[Tensor, Tensor
     f = sign * (r["c"] + r["rise"] * s + e - r["target"])
     slope = sign * (r["rise"] - k * e)
     following = s - f / slope
+    # A bracket has f < 0 at its low end and f >= 0 at its high end.
     low, high = torch.where(f < 0, s, low), torch.where(f < 0, high, s)
     newton = (slope > 0) & (low <= following) & (following <= high)
     following = torch.where(newton, following, (low + high) * 0.5)
@@ -137,6 +138,7 @@ def _meet(r: Rows) -> None:
     low, e_low, target, sign = (r[name] for name in ("s", "e", "target", "sign"))
     f_low, f_high = sign * (c + rise * low + fall * e_low - target), sign * (end - target)
     # The inverse cubic Hermite interpolant of z guesses; its slopes are 1 / z' at both ends.
+    # At s = 1 the term fall e^(-k s) is end - c - rise.
     v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = 1.0 - low, f_high - f_low
     # u: where the chord meets the level.
@@ -166,6 +168,7 @@ def _meet(r: Rows) -> None:
 
 
 def _meet_lines(r: Rows) -> None:
+    # Without a low-pass the signal is the line c + rise s.
     s = (r["target"] - r["c"]) / r["rise"]
     # 0 / 0 is NaN where the signal is on the level; the comparison then selects s.
     s = torch.where(s > r["s"], s, r["s"])

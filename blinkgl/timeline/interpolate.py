@@ -89,6 +89,7 @@ def watched(frames: Iterable[Timed], moved_px: list[float]) -> Iterator[Timed]:
             speed = np.hypot(*np.moveaxis(dense.forward(last, dense.codes(frame)), -1, 0))
             moved_px.append(float(np.percentile(speed, 99)))
         following = number + 1
+        # Only a frame before one of those at which a pair ends has to be kept.
         last = dense.codes(frame).copy() if 16 % following == 0 or following % 16 == 0 else None
         yield frame, t
 
@@ -191,4 +192,5 @@ def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Return 1 where going there and back returns, 0.01 elsewhere."""
     # Forward and back again should end where it began.
     miss = np.hypot(*np.moveaxis(flow + back, -1, 0))
+    # Not 0, so that the weights of a pixel that neither frame sees still have a sum.
     return np.where(miss <= 1 + 0.05 * np.hypot(flow[..., 0], flow[..., 1]), np.float32(1), np.float32(0.01))

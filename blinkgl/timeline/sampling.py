@@ -23,6 +23,7 @@ refused, with 1,497 paces for 1,465 frames; of steps as long as the pace at thei
 
 def uniform_times(fps: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
     """Yield t0 + k / fps, each rounded to the nanosecond (errors do not accumulate), then t1."""
+    # An exact fraction: only the rounding of each time to the nanosecond is left.
     step = NS_PER_S / Fraction(fps).limit_denominator(1_000_000)
     yield t0_ns
     last, k = t0_ns, 1
@@ -72,6 +73,7 @@ def bounded_times(
         while ends and ends[0] <= t:
             ends.popleft()
         # No step crosses a stop or the end.
+        # 2 v - v_before: the pace at the step's end if it rises by as much as over the last step.
         expected = max(v, 2 * v - v_before)
         step = min(_step(_PROPOSED, expected, min_step_ns, max_step_ns), (ends[0] if ends else t1_ns) - t)
         while True:

@@ -64,10 +64,10 @@ def ranked(values: np.ndarray, percent: float) -> Ranked:
     values = values.ravel()
     values = values[(values >= SLOWEST) & np.isfinite(values)]
     if not len(values):
-        # The k-th smallest and the one above it, without sorting all.
         return STILL
     k, share = place(len(values), percent)
     above = min(k + 1, len(values) - 1)
+    # The k-th smallest and the one above it, without sorting all.
     values = np.partition(values, (k, above, len(values) - 1))
     return Ranked(len(values), between(values[k], values[above], share), float(values[-1]))
 
@@ -82,9 +82,9 @@ def place(count: int, percent: float) -> tuple[int, float]:
 
 
 def between(below: np.float32, above: np.float32, share: float) -> float:
-    # NumPy interpolates from the nearer neighbour, which rounds otherwise than from below.
     """Return a value between two in single precision, rounded as NumPy's percentile (from the nearer neighbour)."""
     apart = above - below
+    # NumPy interpolates from the nearer neighbour, which rounds otherwise than from below.
     if share < 0.5:
         return float(below + apart * np.float32(share))
     return float(above - apart * np.float32(1.0 - share))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import BlinkGLError, printable
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.viewer.server import LocalServer
 from blinkgl.viewer.stage import FOV, LAYERS, Stage
 from blinkgl.viewer.views import Picture, SequenceView
@@ -272,8 +272,7 @@ def save(folder: Path, out: Path) -> None:
             pictures = {s.name: s.pictures(t_us, window_us) for s in sequence.sensors}
             stage.show(t_us, SPACE_WINDOWS * window_us, pictures)
             film.insert_sleep(SAVED_S / SAVED_STEPS)
-        with atomic_file(out) as path, output_errors(out):
-            path.write_text(film.as_html(), encoding="utf-8")
+        write_whole(out, film.as_html())
     finally:
         server.stop()
         sequence.close()

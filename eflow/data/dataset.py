@@ -61,16 +61,17 @@ class Mixture:
         for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
             counts[i] += 1  # largest remainders: the counts add up to the total
         self.counts = [int(c) for c in counts]
-        self._cache: tuple[int, list[Key]] | None = None
+        self._cache: tuple[int, list[Key]] = (-1, [])
+        self._last: tuple[tuple[int, int], np.ndarray] = ((-1, -1), np.empty(0, np.int64))
 
     def epoch(self, epoch: int) -> list[Key]:
         """Return the samples of one epoch, in order."""
-        if self._cache is None or self._cache[0] != epoch:
+        if self._cache[0] != epoch:
             picks = []
             for source, (size, count) in enumerate(zip(self.sizes, self.counts, strict=True)):
                 for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
                     pass_, place = divmod(n, size)
-                    picks.append((source, n if self.endless[source] else self._shuffled(source, pass_, size, place)))
+                    picks.append((source, n if self.endless[source] else int(self._order(source, pass_)[place])))
             order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(
                 len(picks)
             )
@@ -101,14 +102,11 @@ class Mixture:
         epoch, position = divmod(n, self.epoch_length)
         return self.epoch(epoch)[position]
 
-    def _shuffled(self, source: int, pass_: int, size: int, place: int) -> int:
-        return int(self._permutation(source, pass_, size)[place])
-
-    def _permutation(self, source: int, pass_: int, size: int) -> np.ndarray:
-        wanted = (source, pass_)
-        if getattr(self, "_last", (None,))[0] != wanted:
+    def _order(self, source: int, pass_: int) -> np.ndarray:
+        """Return the order of the samples of a source in one pass over it."""
+        if self._last[0] != (source, pass_):
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(1, source, pass_)))
-            self._last = (wanted, rng.permutation(size))
+            self._last = ((source, pass_), rng.permutation(self.sizes[source]))
         return self._last[1]
 
 
@@ -222,6 +220,11 @@ class FlowDataset(Dataset):
             if self.crop is not None:
                 out = cropped(out, self.crop, rng, s.name)
         return {**out, "name": s.name, "scene": s.scene} | ({"raw": s} if self.raw else {})
+
+
+def evenly(of: int, count: int) -> list[int]:
+    """Return ``count`` integers from 0 to ``of`` - 1 (at most all of them), evenly spaced, both ends included."""
+    return [int(k) for k in np.linspace(0, of - 1, min(count, of)).round()]
 
 
 def is_endless(source: Source) -> bool:

@@ -220,8 +220,7 @@ class _MvsecSequence:
             margin *= 4
         events = events_of_rows(rows, str(self.path), i, self.t0_s)
         check_events(events, str(self.path), i, height=HEIGHT, width=WIDTH)
-        e = events.window(t0, t1)
-        return Window(e.x, e.y, e.t, e.p, t0, t1)
+        return Window.of(events, t0, t1)
 
     def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[np.ndarray, np.ndarray]:
         """Return flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`. truth : of

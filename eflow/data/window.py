@@ -26,6 +26,12 @@ class Window:
     t0: int
     t1: int
 
+    @classmethod
+    def of(cls, events: Events, t0: int, t1: int) -> Window:
+        """Return the window [t0, t1) µs of a stream."""
+        e = events.window(t0, t1)
+        return cls(e.x, e.y, e.t, e.p, t0, t1)
+
     def __len__(self) -> int:
         return len(self.t)
 
@@ -198,8 +204,8 @@ def raw_sample(s: WindowSample) -> RawSample:
     """Return a rendered sample as a RawSample."""
     t, span = s.t_us, s.span_us
     return RawSample(
-        _of(s.old, t - span, t),
-        _of(s.new, t, t + span),
+        Window(s.old.x, s.old.y, s.old.t, s.old.p, t - span, t),
+        Window(s.new.x, s.new.y, s.new.t, s.new.p, t, t + span),
         s.height,
         s.width,
         name=s.name,
@@ -209,7 +215,3 @@ def raw_sample(s: WindowSample) -> RawSample:
         backward=s.backward,
         backward_valid=s.backward_valid,
     )
-
-
-def _of(e: Events, t0: int, t1: int) -> Window:
-    return Window(e.x, e.y, e.t, e.p, t0, t1)

@@ -1,5 +1,5 @@
-// Light on a surface, for the event pass, its rate and the colour pass (the float64 reference:
-// tools/shader_debugger/reference.py, received()). Without LIGHTS it is the white sun and sky (blinkgl/scene/types.py: Light):
+// Light on a surface, for the event pass, its rate and the colour pass (the float64 reference: received() in
+// tools/shader_debugger/appearance.py). Without LIGHTS it is the white sun and sky (blinkgl/scene/types.py: Light):
 //   E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_up)
 // where, with SHADOWS, the sun is multiplied by its visible fraction (shadows.glsl).
 // n, s and up in the object's own frame, so that normals need no matrix.

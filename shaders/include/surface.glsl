@@ -1,5 +1,5 @@
-// Radiance of a surface that is more than matt (docs/materials.md; the float64 reference: tools/shader_debugger/reference.py,
-// radiated()). Included after light.glsl.
+// Radiance of a surface that is more than matt (docs/materials.md; the float64 reference: radiated() in
+// tools/shader_debugger/appearance.py). Included after light.glsl.
 //
 //   BUMPED      a normal map
 //   GLOSSY      metal and roughness: GGX, height-correlated Smith, Schlick; energy of multiple reflections is added

@@ -21,7 +21,7 @@ from blinkgl.types.events import Events  # noqa: E402
 from eflow import checkpoint as ckpt, infer, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
-from eflow.pictures import BAR, FlowVideo  # noqa: E402
+from eflow.pictures import BAR, flow_video  # noqa: E402
 from flow_data import SPAN, blinkflow_set, blinkgl_set, dsec_set, moving_events, mvsec_set  # noqa: E402
 
 
@@ -84,7 +84,7 @@ def test_a_video_of_the_flow(network, tmp_path, capsys):
     assert len(frames) == 5 and frames[0].shape[:2] == (2 * (130 + BAR), 2 * (2 * 145 + 4))
     assert run(["predict", network, str(tmp_path / "e.h5"), "--video", str(video)]) == 2
     assert "output file exists" in capsys.readouterr().err
-    with pytest.raises(ZeroDivisionError), FlowVideo(tmp_path / "half.mp4", 130, 145, 10) as half:
+    with pytest.raises(ZeroDivisionError), flow_video(tmp_path / "half.mp4", 130, 145, 10) as half:
         half.add("", np.zeros((130, 145, 3), np.uint8), np.ones((130, 145, 2), np.float32))
         1 / 0  # noqa: B018
     assert sorted(p.name for p in tmp_path.iterdir()) == ["e.h5", "flow.mp4"]

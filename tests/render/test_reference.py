@@ -14,7 +14,6 @@ from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Texture
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.tools.shader_debugger import appearance, reference
-from blinkgl.tools.shader_debugger.reference_probe import probe
 from exhaustive import nearest_exhaustive
 from render_scenes import (
     LEVEL,
@@ -257,8 +256,8 @@ def test_behind_the_camera_at_the_other_time():
     y, x = np.mgrid[0 : world.camera.height, 0 : world.camera.width].astype(float)
     r = np.stack([x - world.camera.cx, y - world.camera.cy], 2)
     np.testing.assert_allclose(frame.forward.flow[~on_fence], (r * 0.8)[~on_fence], atol=1e-11)
-    says = probe(world, 0, world.camera.cx, world.camera.cy, SECOND)
-    assert says.object_name == "fence" and not says.valid and "behind the camera" in says.why
+    y, x = np.argwhere(on_fence)[0]
+    assert "behind the camera" in reference.why(world, frame, "forward", x, y)
 
 
 def test_in_front_of_the_near_plane_is_not_seen():
@@ -347,10 +346,9 @@ def test_occluded_by_a_moving_card_and_by_the_image_border():
     np.testing.assert_array_equal(frame.forward.outside[on_wall], outside[on_wall])
     assert not frame.forward.occluded[~on_wall].any()
     px, py = np.argwhere(under & on_wall)[0][::-1]
-    says = probe(world, 0, px, py, SECOND)
-    assert says.occluded and says.valid and says.why.startswith("hidden at t' by card")
+    assert reference.why(world, frame, "forward", px, py).startswith("hidden at t' by card")
     px, py = np.argwhere(outside & on_wall & ~under)[0][::-1]
-    assert "outside the image" in probe(world, 0, px, py, SECOND).why
+    assert "outside the image" in reference.why(world, frame, "forward", px, py)
 
 
 # ------------------------------------------------------------------------------------------------- helpers

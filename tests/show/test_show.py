@@ -9,7 +9,7 @@ import pytest
 import typer
 from rich.table import Table
 
-from blinkgl import cli
+from blinkgl import __version__, cli
 from blinkgl.machine.terminal import plain_column, plain_console, say
 
 COMMANDS = sorted(
@@ -28,7 +28,7 @@ def test_every_command_has_its_module(name):
 
 def test_the_package_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "blinkgl", "--version"], capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout == f"blinkgl {cli.__version__}\n"
+    assert done.returncode == 0 and done.stdout == f"blinkgl {__version__}\n"
 
 
 # --- Words in square brackets arrive: Rich takes them for markup wherever it is allowed to.

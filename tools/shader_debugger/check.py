@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -116,7 +116,7 @@ class Result:
             "seconds": self.seconds,
             "programs": self.programs,
             "errors": [
-                f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example}
+                asdict(f.diagnostic) | {"program": f.program, "variants": f.count, "example": f.example}
                 for f in self.errors
             ],
         }

@@ -30,16 +30,12 @@ Json = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 DIFFERENT = 1  # exit status of `diff` above the tolerance, and of `check` with an error
 
 
-def _subject(config, seed, sequence, overrides):
-    from blinkgl.tools.shader_debugger.session import open_subject
+def _opened(config, seed, sequence, overrides, time):
+    """Return the subject, and the moment in it."""
+    from blinkgl.tools.shader_debugger.session import moment, open_subject
 
-    return open_subject(config, seed=seed, sequence=sequence, overrides=overrides or [])
-
-
-def _when(subject, time):
-    from blinkgl.tools.shader_debugger.session import moment
-
-    return moment(subject, time)
+    subject = open_subject(config, seed=seed, sequence=sequence, overrides=overrides or [])
+    return subject, moment(subject, time)
 
 
 @app.command()
@@ -56,8 +52,8 @@ def passes(
     """Write every buffer at one time as a labelled PNG and .npy, and a contact sheet."""
     from blinkgl.tools.shader_debugger.commands import write_passes
 
-    subject = _subject(config, seed, sequence, overrides)
-    paths = write_passes(subject, _when(subject, time), out, names, shaders)
+    subject, when = _opened(config, seed, sequence, overrides, time)
+    paths = write_passes(subject, when, out, names, shaders)
     typer.echo(f"{len(paths)} files in {out}; look at {paths[-1]}")
 
 
@@ -76,8 +72,8 @@ def probe(
     occluded."""
     from blinkgl.tools.shader_debugger.commands import run_probe
 
-    subject = _subject(config, seed, sequence, overrides)
-    typer.echo(run_probe(subject, _when(subject, time), pixel, shaders, json))
+    subject, when = _opened(config, seed, sequence, overrides, time)
+    typer.echo(run_probe(subject, when, pixel, shaders, json))
 
 
 @app.command()
@@ -103,8 +99,8 @@ def diff(
     """Compare whole images with the float64 reference. Exit status 1 when a buffer exceeds its tolerance."""
     from blinkgl.tools.shader_debugger import commands
 
-    subject = _subject(config, seed, sequence, overrides)
-    found, reports = commands.run_diff(subject, _when(subject, time), names, tolerance or [], shaders, out)
+    subject, when = _opened(config, seed, sequence, overrides, time)
+    found, reports = commands.run_diff(subject, when, names, tolerance or [], shaders, out)
     typer.echo(commands.diff_json(found, reports) if json else commands.diff_text(found, reports))
     # Exit status for scripts: 0 means that all compared buffers agree.
     if not found["passed"]:
@@ -165,5 +161,5 @@ def serve(
     Ctrl-C ends it."""
     from blinkgl.tools.shader_debugger.server import serve as run_server
 
-    subject = _subject(config, seed, sequence, overrides)
-    run_server(subject, _when(subject, time), shaders, host, port)
+    subject, when = _opened(config, seed, sequence, overrides, time)
+    run_server(subject, when, shaders, host, port)

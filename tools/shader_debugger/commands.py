@@ -9,7 +9,7 @@ import numpy as np
 
 from blinkgl.errors import OutputError
 from blinkgl.io import pictures
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.io.images import encode_npy
 from blinkgl.tools.shader_debugger.compare import (
     BufferReport,
@@ -18,7 +18,7 @@ from blinkgl.tools.shader_debugger.compare import (
     parse_tolerances,
     verdict,
 )
-from blinkgl.tools.shader_debugger.filters import TWINNED, twinned_of
+from blinkgl.tools.shader_debugger.filters import FILTERED, filtered_names
 from blinkgl.tools.shader_debugger.moments import (
     MAPS,
     PASSES,
@@ -55,7 +55,7 @@ def write_passes(
         gpu = GpuMoment(renderer, when)
         for name in names:
             info, array = PASSES[name], gpu[name]
-            _save(folder / f"{name}.npy", array)
+            write_whole(folder / f"{name}.npy", encode_npy(array))
             rgb, legend = pictures.picture(info.kind, array, hit=_meaningful(gpu, info))
             picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
             paths += [folder / f"{name}.npy", folder / f"{name}.png"]
@@ -70,7 +70,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", *TWINNED)  # the background has values, too
+    everywhere = info.name in ("luminance", *FILTERED)  # the background has values, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1
@@ -78,11 +78,6 @@ def _meaningful(moment, info) -> np.ndarray | None:
             else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
         )
     return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
-
-
-def _save(path: Path, array: np.ndarray) -> None:
-    with atomic_file(path) as temporary, output_errors(path):
-        temporary.write_bytes(encode_npy(array))
 
 
 def _folder(out: str) -> Path:
@@ -114,7 +109,7 @@ def run_diff(
     NAME_error.npy there. Returns the result of :func:`verdict.verdict`, and the reports."""
     # Names are checked before drawing.
     if names:
-        there = buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
+        there = buffers_of(subject.scene, filtered_names(subject.config, subject.scene))
         names = [check_pass(name, [known for known in QUANTITIES if known in there]) for name in names]
     with open_renderer(subject, shaders) as renderer:
         comparison = Comparison(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps))
@@ -127,7 +122,7 @@ def run_diff(
 
         folder = _folder(out)
         for report in reports:
-            _save(folder / f"{report.quantity.name}_error.npy", report.errors)
+            write_whole(folder / f"{report.quantity.name}_error.npy", encode_npy(report.errors))
         title = (
             f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
             f"{when.t_ns * 1e-9:.6g} s"

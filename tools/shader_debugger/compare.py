@@ -10,12 +10,12 @@ edge) only ids and masks are graded. Pictures made from other pictures (:mod:`fi
 Order: the buffers are graded in the order in which a pass computes them: the surface's place (local position, depth,
 id), the texture lookups there (coordinates, level, albedo), the light, and their product. Each lookup is the pass's
 own, shown by a variant of its own source (``include/lookup.glsl``). A result that depends on an earlier step is graded
-with the GPU's value of that step: the albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and
-level, the result against the GPU's own albedo times its own light. So the first buffer that fails contains the fault;
-the verdict names it, object by object.
+with the GPU's value of that step: the albedo against a reference of mip-mapped sampling at the GPU's own coordinates
+and level, the result against the GPU's own albedo times its own light. So the first buffer that fails contains the
+fault; the verdict names it, object by object.
 
-The reference has no mip maps, hence the twin, and a loose tolerance: OpenGL does not define how drivers make them. With
-anisotropic filtering (``render.anisotropy`` > 1) level and albedo are not graded.
+The frame of the reference has no mip maps, hence :mod:`mipmaps`, and a loose tolerance: OpenGL does not define how
+drivers make them. With anisotropic filtering (``render.anisotropy`` > 1) level and albedo are not graded.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import lamps_of, shadowing
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger import appearance, reference
-from blinkgl.tools.shader_debugger.filters import TWINNED
+from blinkgl.tools.shader_debugger.filters import FILTERED
 from blinkgl.tools.shader_debugger.lamps import share_range
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.moments import (
@@ -167,15 +167,14 @@ class Comparison:
             self.band |= reference.silhouette_band(flat.instance, flat.depth, jump=NEVER)
             # No buffer has the triangle that a lens's ray met on the GPU; away from the sides both met the same one.
             self._same_label = (seen.bary.min(axis=-1) > SIDE) | ~seen.hit
-        things = [thing for thing, _ in casting.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
         self.objects = [
             name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
             for name, thing in zip(names, ref.scene.objects)
         ] + [NOTHING]
-        # Objects may have several parts, and a name may occur twice.
-        index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
-        self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
+        # In the order of casting.scene_parts; the last is that of part -1.
+        of_parts = [i for i, thing in enumerate(ref.scene.objects) for _ in thing.parts]
+        self._object_of_part = np.array([*of_parts, len(names)], np.intp)
 
     def owner(self, name: str) -> np.ndarray:
         """Return the (H, W) number of the object to which a pixel's error in buffer ``name`` is assigned: the one that
@@ -215,12 +214,6 @@ class Comparison:
         arrives = (each * np.moveaxis(shares, 0, -1)).sum(axis=-1)
         return np.where(total > 0, arrives / np.maximum(total, 1e-30), 1.0)
 
-    def map_band(self, name: str) -> np.ndarray:
-        """Return (texels, texels) bool: silhouettes of a shadow map."""
-        depth = self.ref[name]
-        with np.errstate(divide="ignore"):
-            return reference.silhouette_band(depth > 0, 1.0 / depth, jump=MAP_JUMP)
-
     def names(self) -> list[str]:
         """Return every buffer that can be graded here."""
         left_out = self.left_out()
@@ -233,17 +226,17 @@ class Comparison:
 
     @cached_property
     def _there(self) -> list[str]:
-        there = buffers_of(self.ref.seen, self.gpu.renderer.twinned)
+        there = buffers_of(self.ref.seen, self.gpu.renderer.filtered)
         return [name for name in QUANTITIES if name in there]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (GPU, the values to grade it against); equal shapes."""
         gpu, ref = self.gpu, self.ref
         of, what = lookup_of(name)
-        if name in TWINNED:
-            return gpu[name], gpu[f"{name}_twin"]
+        if name in FILTERED:
+            return gpu[name], gpu[f"{name}_reference"]
         if what == "albedo":
-            return gpu[name], self.twin(of)
+            return gpu[name], self.reference_albedo(of)
         if what == "shadow" and self.shares is not None:
             low, high = (self._seen_past(shares) for shares in self.shares)
             return gpu[name], np.clip(gpu[name], low, high)
@@ -268,7 +261,7 @@ class Comparison:
             return np.where(ref.frame.hit, in_fog[..., 0], ref[name])
         return np.where(ref.frame.hit[..., None], in_fog, ref[name])
 
-    def twin(self, of: str) -> np.ndarray:
+    def reference_albedo(self, of: str) -> np.ndarray:
         """Return the (H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates and level; 0
         where it drew nothing."""
         gpu, frame = self.gpu, self.ref.frame
@@ -302,8 +295,10 @@ class Comparison:
     def graded(self, name: str) -> np.ndarray:
         """Return (H, W) bool: pixels at which a buffer is graded."""
         if name in MAPS:
-            return ~self.map_band(name)
-        if name in TWINNED:
+            depth = self.ref[name]
+            with np.errstate(divide="ignore"):
+                return ~reference.silhouette_band(depth > 0, 1.0 / depth, jump=MAP_JUMP)
+        if name in FILTERED:
             return np.ones_like(self.band)
         graded = ~self.band
         if QUANTITIES[name].same_triangle:

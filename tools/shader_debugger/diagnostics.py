@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from blinkgl.gl.shader import ShaderError, ShaderSource, made_includes, messages
@@ -28,9 +28,6 @@ class Diagnostic:
     @property
     def where(self) -> str:
         return ":".join([self.file, *(str(n) for n in (self.line, self.column) if n)])
-
-    def as_dict(self) -> dict:
-        return asdict(self)
 
 
 def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: Any) -> list[Diagnostic]:
@@ -91,11 +88,8 @@ def _declaration(source: ShaderSource, name: str) -> tuple[str, int, int] | None
 
 def excerpt(folder: Any, file: str, line: int, column: int = 0, around: int = 2) -> str:
     """Return the lines around ``line`` of a file in the shader folder, with a caret under ``column``."""
-    path = folder
-    for part in file.split("/"):
-        path = path / part
     try:
-        lines = path.read_text(encoding="utf-8").split("\n")
+        lines = folder.joinpath(*file.split("/")).read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError):
         # Includes generated from the tables of labels and shapes are in no file.
         lines = made_includes().get(file.removeprefix("include/"), "").split("\n")

@@ -1,4 +1,4 @@
-"""Pictures that a program makes from another picture, and their float64 twins from the same picture: silhouettes by
+"""Pictures that a program makes from another picture, and their float64 references from the same one: silhouettes by
 area (``edges.glsl``), and the picture of a lens (``gather.glsl``)."""
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Slow twin of shaders/edges.glsl, a pixel at a time in float64; see there for what is done and why.
+# Slow reference of shaders/edges.glsl, a pixel at a time in float64; see there for what is done and why.
 #
 # picture, depths = frames of the pass that `edges` filters, read back pixels, crossings = Lines().in_pixels(moment,
 # items, width, height) filtered(picture, depths, pixels, crossings, 1 / focal, what the program wrote)
@@ -280,11 +280,11 @@ def _turn(turn: float, on_left: bool) -> float:
 
 EDGED = ("luminance_edges", "colour_edges")
 LENSED = ("luminance_lens", "colour_lens")
-TWINNED = EDGED + LENSED
+FILTERED = EDGED + LENSED
 
 
-def twinned_of(config: SequenceConfig, scene: Scene) -> tuple[str, ...]:
-    """Return those of :data:`TWINNED` that a generation run draws: with ``edges2`` on a finer grid, of which this uses
+def filtered_names(config: SequenceConfig, scene: Scene) -> tuple[str, ...]:
+    """Return those of :data:`FILTERED` that a generation run draws: with ``edges2`` on a finer grid, of which this uses
     the image's own pixels."""
     # A lens's flat picture is filtered before the lens reads it, as without one.
     drawn = (config.render.antialiasing, config.render.image_antialiasing)
@@ -310,22 +310,19 @@ def pass_of(renderer: Renderer, what: str, samples: Samples = Samples()) -> Pass
 
 def _parts(renderer: Renderer, name: str) -> tuple[str, Pass, Pass]:
     """Return (what the picture is of, the pass that draws it before, the pass that makes ``name`` from it)."""
-    what = name.partition("_")[0]
-    if name in LENSED:
-        of = pass_of(renderer, what)
-        return what, of, Gather(of, renderer.scene.camera, True)
-    of = pass_of(renderer, what, samples_of("edges"))
-    return what, of, Edged(of)
+    what, of_lens = name.partition("_")[0], name in LENSED
+    of = pass_of(renderer, what, Samples() if of_lens else samples_of("edges"))
+    return what, of, Gather(of, renderer.scene.camera, True) if of_lens else Edged(of)
 
 
 def drawn(renderer: Renderer, name: str, t_ns: int) -> np.ndarray:
     """Return the program's result, (H, W) or (H, W, 3) float32; behind a lens ``edges`` makes a flat picture. name : of
-    :data:`TWINNED`, here and below."""
+    :data:`FILTERED`, here and below."""
     what, _, pass_ = _parts(renderer, name)
     return renderer.draw(pass_, t_ns).read(what)
 
 
-def twin_of(renderer: Renderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+def reference_of(renderer: Renderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (the picture that the program reads, float32; its expected result, float64)."""
     written = drawn(renderer, name, t_ns)
     what, of, _ = _parts(renderer, name)

@@ -10,6 +10,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison, verdict
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.filters import TWINNED, twinned_of
+from blinkgl.tools.shader_debugger.filters import FILTERED, filtered_names
 from blinkgl.tools.shader_debugger.moments import (
     PASSES,
     GpuMoment,
@@ -65,10 +66,6 @@ def _choice(what: str, known: tuple[str, ...], default: str | None) -> Reader:
     return read
 
 
-def _pass(key: str, text: str) -> str:
-    return check_pass(text, where=key)
-
-
 def _pass_and_source(key: str, text: str) -> tuple[str, str]:
     name, _, source = text.partition(":")
     if source not in SOURCES:
@@ -103,10 +100,6 @@ def _count(key: str, text: str) -> int:
     return int(text) if text else -1
 
 
-def _text(key: str, text: str) -> str:
-    return text  # session.check_pixel parses both together
-
-
 _VIEW: dict[str, Reader] = {
     "t": _seconds,
     "component": _choice("no such component", COMPONENTS, "auto"),
@@ -117,9 +110,14 @@ _VIEW: dict[str, Reader] = {
 
 ROUTES: dict[str, dict[str, Reader]] = {
     "/state": {},
-    "/image": {"pass": _pass, "source": _choice("unknown source", SOURCES, "gpu"), **_VIEW},
+    "/image": {
+        "pass": lambda key, text: check_pass(text, where=key),
+        "source": _choice("unknown source", SOURCES, "gpu"),
+        **_VIEW,
+    },
     "/difference": {"a": _pass_and_source, "b": _pass_and_source, **_VIEW},
-    "/probe": {"x": _text, "y": _text, "t": _seconds},
+    # session.check_pixel parses x and y together.
+    "/probe": {"x": lambda _, text: text, "y": lambda _, text: text, "t": _seconds},
     "/verdict": {"t": _seconds},
     "/wait": {"version": _count},
 }
@@ -201,19 +199,18 @@ class Inspector:
 
     # ---- moments -----------------------------------------------------------------------------------------------
 
-    def _draw_all(self, when: When) -> GpuMoment:
+    def _draw_all(self, when: When) -> None:
         made = GpuMoment(self.renderer, when)
         # Programs are compiled at the first drawing: draw with all, so that an error is shown now.
         for name in self._buffers():
             made[name]
-        return made
 
     def _buffers(self):
-        return buffers_of(self.subject.scene, twinned_of(self.subject.config, self.subject.scene))
+        return buffers_of(self.subject.scene, filtered_names(self.subject.config, self.subject.scene))
 
     def _array(self, when: When, name: str, source: str) -> np.ndarray:
-        if name in TWINNED:  # its reference is computed from the GPU's own picture
-            return self.gpu(when)[name if source == "gpu" else f"{name}_twin"]
+        if name in FILTERED:  # its reference is computed from the GPU's own picture
+            return self.gpu(when)[name if source == "gpu" else f"{name}_reference"]
         return (self.gpu(when) if source == "gpu" else self.reference(when))[name]
 
     def _when(self, seconds: float | None) -> When:
@@ -239,14 +236,11 @@ class Inspector:
             "interval": config.time.interval_ns * 1e-9,
             "maps": pictures.MAPS,
             "folder": str(self.folder),
-            "passes": [
-                {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
-                for p in self._buffers().values()
-            ],
+            "passes": [asdict(info) for info in self._buffers().values()],
         }
 
     def shaders(self) -> dict:
-        return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
+        return {"generation": self.generation, "errors": [asdict(d) | {"where": d.where} for d in self.errors]}
 
     def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
         """Return PNG and legend of one buffer. q : the result of :func:`questions.read_query`, here and below."""

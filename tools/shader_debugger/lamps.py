@@ -1,4 +1,4 @@
-"""Shadow maps in float64, the pixels where a map may be wrong because of its texels, and a twin of soft shadows."""
+"""Shadow maps in float64, the pixels where a map may be wrong because of its texels; the reference of soft shadows."""
 
 from __future__ import annotations
 
@@ -92,13 +92,9 @@ def lit_points(scene: Scene, frame: reference.ReferenceFrame) -> tuple[np.ndarra
     """Return the (n,) numbers of the pixels with a lit surface, their (n, 3) points, world axes, and (n, 2) part and
     triangle."""
     hits = frame.hits()
-    points = np.full((len(hits.hit), 3), np.nan)
-    for p, (thing, part) in enumerate(casting.scene_parts(scene)):
-        rows = hits.part == p
-        if rows.any() and not part.material.unlit:
-            pose = thing.path.pose(frame.t_ns)
-            points[rows] = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
-    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    points = casting.applied(scene, hits, lambda thing: thing.path.pose(frame.t_ns))
+    unlit = [p for p, (_, part) in enumerate(casting.scene_parts(scene)) if part.material.unlit]
+    rows = np.flatnonzero(hits.hit & ~np.isin(hits.part, unlit))
     return rows, points[rows], np.column_stack([hits.part[rows], hits.triangle[rows]])
 
 
@@ -117,7 +113,7 @@ def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Slow float64 twin of the soft shadows of shaders/include/shadows.glsl, which explains the method.
+# Slow float64 reference of the soft shadows of shaders/include/shadows.glsl, which explains the method.
 #
 # It reads the GPU's own shadow map, which is graded separately.
 

@@ -1,7 +1,7 @@
-"""A CPU twin of mip-mapped texture sampling, for grading the albedo where a pixel covers several texels.
+"""A reference of mip-mapped texture sampling on the CPU, for grading the albedo where a pixel covers several texels.
 
 The float64 reference samples textures at full resolution: mip maps are the GPU's method of anti-aliasing, not a part of
-the scene. OpenGL does not define how drivers make them. So the tolerance is loose for this twin (each level half the
+the scene. OpenGL does not define how drivers make them. So the tolerance is loose for it (each level half the
 last one, resampled bilinearly, which is the 2 x 2 mean where the size is even; then trilinear sampling, OpenGL 4.6
 section 8.14.3): it finds wrong coordinates, a wrong texture or a wrong level, not rounding.
 """

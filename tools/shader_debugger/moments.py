@@ -20,7 +20,7 @@ from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.lights import MAX_SHADOWS, lamps_of, shadowing
 from blinkgl.scene.types import Part, Scene, SceneObject
 from blinkgl.tools.shader_debugger import appearance, reference
-from blinkgl.tools.shader_debugger.filters import TWINNED, drawn, places_of, twin_of
+from blinkgl.tools.shader_debugger.filters import FILTERED, drawn, places_of, reference_of
 from blinkgl.tools.shader_debugger.lamps import map_of, near_an_edge
 from blinkgl.tools.shader_debugger.mipmaps import levels, mipmapped_albedo, needles
 from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
@@ -140,10 +140,10 @@ def _of_label(label: Label, view: View) -> Pass:
 PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
 
 
-def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
+def buffers_of(scene: Scene, filtered: tuple[str, ...] = ()) -> dict[str, Pass]:
     """Return the :data:`PASSES` that a scene has: without shadows no shadow maps, and so on.
 
-    twinned : names of :data:`filters.TWINNED` to include."""
+    filtered : names of :data:`filters.FILTERED` to include."""
     # A lamp has no map if no body casts a shadow.
     maps = len(shadowing(scene.light)) if appearance.casts(scene) else 0
     materials = [part.material for _, part in casting.scene_parts(scene) if not part.material.unlit]
@@ -157,7 +157,7 @@ def buffers_of(scene: Scene, twinned: tuple[str, ...] = ()) -> dict[str, Pass]:
         for name, info in PASSES.items()
         if there.get(lookup_of(name)[1], True)
         and name not in MAPS[maps:]
-        and (name not in TWINNED or name in twinned)
+        and (name not in FILTERED or name in filtered)
         and ((found := view_of(name)) is None or found[0].can_be_of(scene))
     }
 
@@ -201,7 +201,7 @@ class GpuMoment(_Lazy):
     Besides those of :data:`PASSES`: part (H, W) int32, -1 where nothing is hit; window (H, W, 4), gl_FragCoord;
     next_depth_forward and next_depth_backward (H, W), the depth at t' that the flow program returns; luminance_count
     and colour_count (H, W), the number of texture look-ups at the pixel; colour_light_rgb (H, W, 3), its light in
-    colour; NAME_plain and NAME_twin for the names of :data:`filters.TWINNED`.
+    colour; NAME_plain and NAME_reference for the names of :data:`filters.FILTERED`.
 
     With a lens, labels are in the pixels of the lens. Buffers drawn as a flat picture are sampled at the flat pixel
     that each pixel of the lens shows.
@@ -221,15 +221,21 @@ class GpuMoment(_Lazy):
             return {name: draw.velocity(when.t_ns).read()}
         # ``edges`` writes a flat picture, a lens pass the pixels of the lens.
         own = draw.at_pixels if name.partition("_")[2].startswith("edges") else np.asarray
-        if name in TWINNED:
+        if name in FILTERED:
             return {name: own(drawn(draw, name, when.t_ns))}
-        if (of := name.removesuffix("_plain").removesuffix("_twin")) in TWINNED:
-            plain, twin = twin_of(draw, of, when.t_ns)
-            return {f"{of}_plain": own(plain), f"{of}_twin": own(twin)}
+        if (of := name.removesuffix("_plain").removesuffix("_reference")) in FILTERED:
+            plain, true = reference_of(draw, of, when.t_ns)
+            return {f"{of}_plain": own(plain), f"{of}_reference": own(true)}
         if name in MAPS:
             return {name: draw.shadow_map(MAPS.index(name), when.t_ns)}
         if name in ("triangle", "part", "local", "window"):
-            return self._inspect()
+            out = draw.inspect(when.t_ns)
+            return {
+                "triangle": out["TRIANGLE"],
+                "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
+                "local": out["LOCAL"][..., :3],
+                "window": out["WINDOW"],
+            }
         if name.endswith(("_count", "_light_rgb")) or lookup_of(name)[0]:
             of = name.partition("_")[0]
             shown = draw.lookups(of, when.t_ns)
@@ -239,15 +245,6 @@ class GpuMoment(_Lazy):
             raw = draw.raw(when.t_ns, f"flow_{way}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
             return {name: raw[f"flow_{way}"][..., 2]}
         return self._labels()
-
-    def _inspect(self):
-        out = self.renderer.inspect(self.when.t_ns)
-        return {
-            "triangle": out["TRIANGLE"],
-            "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
-            "local": out["LOCAL"][..., :3],
-            "window": out["WINDOW"],
-        }
 
     def _labels(self):
         when = self.when
@@ -312,12 +309,9 @@ class ReferenceMoment(_Lazy):
             return {name: getattr(frame, name.removesuffix("_level0"))}
         if name in MAPS:
             return {name: map_of(self.scene, self.when.t_ns, self.maps[MAPS.index(name)])[0]}
-        if name == "triangle":
-            return {name: frame.triangle + 1}
-        if name == "part":
-            return {name: frame.part}
-        if name == "local":
-            return {name: np.where(frame.hit[..., None], frame.local, 0.0)}
+        if name in ("triangle", "part", "local"):
+            local = np.where(frame.hit[..., None], frame.local, 0.0)
+            return {"triangle": frame.triangle + 1, "part": frame.part, "local": local}
         if name == "velocity_pass":
             return {name: self["velocity"] if self._places is None else self._velocity_drawn()}
         of, what = lookup_of(name)

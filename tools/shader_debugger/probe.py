@@ -3,17 +3,20 @@ if it is invalid or occluded."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from trimesh.triangles import points_to_barycentric
 
 from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
+from blinkgl.scene.types import Scene
+from blinkgl.tools.shader_debugger import reference
 from blinkgl.tools.shader_debugger.compare import Comparison
-from blinkgl.tools.shader_debugger.filters import TWINNED
+from blinkgl.tools.shader_debugger.filters import FILTERED
 from blinkgl.tools.shader_debugger.lamps import place_in
 from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, GpuMoment, ReferenceMoment, buffers_of
 from blinkgl.tools.shader_debugger.quantities import QUANTITIES
-from blinkgl.tools.shader_debugger.reference_probe import probe as reference_probe
 
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
@@ -39,10 +42,9 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
     comparison = comparison or Comparison(gpu, ref)
     scene, when = ref.seen, gpu.when
     parts = casting.scene_parts(scene)
-    seen = {way: reference_probe(scene, when.t_ns, x, y, getattr(when, f"{way}_ns")) for way in ("forward", "backward")}
     drawn, true = int(gpu["part"][y, x]), int(ref["part"][y, x])
     # Behind a lens: the pixel of the flat picture that it reads; later results are of the lens's own ray.
-    hit = reference_probe(ref.scene, when.t_ns, *ref.frame.xy[y, x])
+    point = _hit(ref.frame, x, y)
     return {
         "pixel": [x, y],
         "t_s": when.t_ns * 1e-9,
@@ -50,21 +52,45 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "band": bool(comparison.band[y, x]),
         "buffers": [
             _row(name, gpu, ref, comparison, x, y)
-            for name in buffers_of(scene, gpu.renderer.twinned)
+            for name in buffers_of(scene, gpu.renderer.filtered)
             if name not in ("triangle", "local", *MAPS)
         ],  # told below
         "surface": {
             "gpu": _surface(
                 parts, drawn, int(gpu["triangle"][y, x]) - 1, _barycentric(parts, drawn, gpu, x, y, when.t_ns)
             ),
-            "reference": _surface(parts, true, hit.triangle, hit.bary)
-            | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
+            "reference": _surface(parts, true, int(point.triangle[0]), point.bary[0]) | _seen_side(ref, point),
         },
-        "positions": _positions(gpu, ref, x, y, hit, seen) if true >= 0 or drawn >= 0 else [],
+        "positions": _positions(gpu, ref, x, y, point) if true >= 0 or drawn >= 0 else [],
         "why": {
-            way: {"reference": seen[way].why, "gpu": _gpu_reason(gpu, way, x, y)} for way in ("forward", "backward")
+            way: {"reference": reference.why(scene, ref.labels, way, x, y), "gpu": _gpu_reason(gpu, way, x, y)}
+            for way in ("forward", "backward")
         },
     }
+
+
+def _hit(frame: reference.ReferenceFrame, x: int, y: int) -> casting.Hits:
+    """Return what a frame sees at one pixel."""
+    k = y * frame.hit.shape[1] + x
+    return casting.Hits(**{name: v if name == "t_ns" else v[k : k + 1] for name, v in vars(frame.hits()).items()})
+
+
+def _seen_side(ref: ReferenceMoment, point: casting.Hits) -> dict:
+    """Return whether a surface is seen from the front, and the corners of its triangle; empty where nothing is hit."""
+    if not point.hit[0]:
+        return {}
+    mesh = casting.scene_parts(ref.scene)[point.part[0]][1].mesh
+    corners = casting.vertices_at(mesh, point.t_ns)[mesh.faces[point.triangle[0]]]
+    return {"front": bool(point.front[0]), "corners": _plain(corners)}
+
+
+def _placed(scene: Scene, point: casting.Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """Return the position of a hit point at a time, in the axes of the world and of the camera."""
+    if not point.hit[0]:
+        return None, None
+    moved = replace(point, local=casting.local_at(scene, point, t_ns))
+    world = casting.applied(scene, moved, lambda thing: thing.path.pose(t_ns))
+    return world[0], casting.applied(scene, moved, lambda thing: casting.relative_pose_at(scene, thing, t_ns))[0]
 
 
 def _plain(values):
@@ -72,27 +98,23 @@ def _plain(values):
 
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
-    g, r = (side[y, x] for side in (comparison.pair(name) if name in TWINNED else (gpu[name], ref[name])))
+    g, r = (side[y, x] for side in (comparison.pair(name) if name in FILTERED else (gpu[name], ref[name])))
+    info = PASSES[name]
+    exact = info.kind in ("mask", "ids")
+    apart = None if exact else ulps(g, r)
+    distance = float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if apart else 0.0
     row = {
         "name": name,
-        "title": PASSES[name].title,
-        "unit": PASSES[name].unit,
+        "title": info.title,
+        "unit": info.unit,
         "gpu": g.tolist(),
         "reference": r.tolist(),
-        "error": None,
-        "error_unit": "",
-        "ulps": None,
+        "error": float(g != r) if exact else distance,
+        "error_unit": "mismatch" if exact else info.unit,
+        "ulps": apart,
         "ok": None,
         "note": "",
     }
-    if PASSES[name].kind in ("mask", "ids"):
-        row |= {"error": float(g != r), "error_unit": "mismatch"}
-    else:
-        row["ulps"] = ulps(g, r)
-        row |= {
-            "error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
-            "error_unit": PASSES[name].unit,
-        }
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
@@ -138,7 +160,7 @@ def _barycentric(parts, p, gpu, x, y, t_ns):
     return shares if np.isfinite(shares).all() else None
 
 
-def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
+def _positions(gpu, ref, x, y, point) -> list[dict]:
     """Return the positions. The GPU's clip position is the one it used: gl_FragCoord at t; at t' the position and depth
     that its flow implies."""
     scene, when = ref.scene, gpu.when
@@ -159,34 +181,35 @@ def _positions(gpu, ref, x, y, point, seen) -> list[dict]:
         pose = thing.path.pose(t_ns)
         return pose[:3, :3] @ local + pose[:3, 3]
 
-    add("local", local, point.local)
-    add("world, t", world(when.t_ns), point.world)
-    add("camera, t", None, point.camera)
+    true_world, true_camera = _placed(scene, point, when.t_ns)
+    add("local", local, point.local[0] if point.hit[0] else None)
+    add("world, t", world(when.t_ns), true_world)
+    add("camera, t", None, true_camera)
     window = gpu["window"][y, x].astype(np.float64)
     # gl_FragCoord contains all of the GPU's clip position: w is 1 / Z there.
     ndc = window[:2] / size * 2 - 1
     clip = np.array([*ndc, window[2], 1.0]) / window[3] if window[3] else None
-    add("clip, t", clip, P @ [*point.camera, 1.0] if point.hit else None)
+    add("clip, t", clip, None if true_camera is None else P @ [*true_camera, 1.0])
     for way, label in (("forward", "t' forward"), ("backward", "t' backward")):
-        later = seen[way]
-        t_ns = getattr(when, f"{way}_ns")
-        add(f"world, {label}", world(t_ns), later.world_to)
-        add(f"camera, {label}", None, later.camera_to)
+        t_ns, flow = getattr(when, f"{way}_ns"), getattr(ref.labels, way)
+        later_world, later_camera = _placed(ref.seen, _hit(ref.labels, x, y), t_ns)
+        add(f"world, {label}", world(t_ns), later_world)
+        add(f"camera, {label}", None, later_camera)
         w = float(gpu[f"next_depth_{way}"][y, x])
         there = ndc + gpu[f"flow_{way}"][y, x] * 2 / size
         add(
             f"clip, {label}",
             [there[0] * w, there[1] * w, scene.camera.near, w] if p >= 0 and scene is ref.seen else None,
-            P @ [*later.camera_to, 1.0] if later.camera_to is not None else None,
+            None if later_camera is None else P @ [*later_camera, 1.0],
         )
         add(
             f"pixel, {label}",
             [x, y] + gpu[f"flow_{way}"][y, x].astype(np.float64) if gpu[f"valid_{way}"][y, x] else None,
-            later.xy_to,
+            [x, y] + flow.flow[y, x] if flow.valid[y, x] else None,
         )
     for k, one in enumerate(ref.maps):
         here = {}
-        for side, moment, at in (("gpu", gpu, world(when.t_ns)), ("reference", ref, point.world)):
+        for side, moment, at in (("gpu", gpu, world(when.t_ns)), ("reference", ref, true_world)):
             there = None if at is None else place_in(one, when.t_ns, at)
             if there is not None:
                 x_map, y_map = (int(np.clip(v, 0, one.texels - 1)) for v in there[:2])
@@ -243,11 +266,10 @@ def as_text(found: dict) -> str:
     lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]
     for row in found["buffers"]:
         mark = {True: "", False: "!!", None: ""}[row["ok"]]
-        error = "" if row["error"] is None else f"{row['error']:.3g}"
         count = "" if row["ulps"] is None else f"{row['ulps']:.3g}"
         lines.append(
-            f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} "
-            f"{count:>9}  {row['error_unit']}"
+            f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} "
+            f"{row['error']:>10.3g} {count:>9}  {row['error_unit']}"
         )
         if row["note"]:
             lines.append(f"{'':24}{row['note']}")

@@ -82,10 +82,6 @@ def _of_the_picture(g, r, gpu, ref):
     return length(g.astype(np.float64) - r) / np.maximum(max(size.mean(), 1e-12), size)
 
 
-def _per_interval(g, r, gpu, ref):
-    return motion_per_interval(g, r, gpu.when.interval_s)
-
-
 def _misplaced(g, r, gpu, ref):
     """Return (H, W) px from each pixel's centre to the drawn point by the true poses, or, if larger, from that point to
     the plane of the drawn triangle at that time; inf where it is not visible. It does not use the ray caster, so that a
@@ -108,7 +104,9 @@ def _misplaced(g, r, gpu, ref):
     return out
 
 
-_TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
+_MIPMAPPED = (
+    "against a reference of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
+)
 _SHADING = "against the GPU's own albedo times its own light, and what it adds"
 _MAPPED = "not graded where a map says how a surface shines, which the reference has without mip maps"
 LOG2 = 1.0 - (1.0 + math.log(math.log(2.0))) / math.log(2.0) + 1e-3
@@ -116,12 +114,12 @@ LOG2 = 1.0 - (1.0 + math.log(math.log(2.0))) / math.log(2.0) + 1e-3
 takes it: the largest of log2(1 + f) - f; and a thousandth for float32."""
 _LEVEL = "outside of what OpenGL 4.6, section 8.14.1, allows"
 _EDGES = (
-    "soft ones against a float64 twin on the GPU's own map (lamps.py); hard ones against rays, not near an edge "
+    "soft ones against a float64 reference on the GPU's own map (lamps.py); hard ones against rays, not near an edge "
     "nor where light grazes: there a map is off by its texels"
 )
 _MAP = "off its silhouettes"
 _GATHERED = "at all pixels, against the float64 mean of the GPU's own flat picture over each pixel of the lens"
-_FILTERED = "at all pixels, against a float64 twin on the GPU's own unfiltered picture and depths (filters.py)"
+_FILTERED = "at all pixels, against a float64 reference on the GPU's own unfiltered picture and depths (filters.py)"
 
 
 def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
@@ -130,7 +128,7 @@ def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
         Quantity(f"{name}_uv", "px of shifted texture", MISPLACED, _pixels_of_texture, fit=2.0),
         Quantity(f"{name}_level", "levels", LOG2, _beyond_the_range, note=_LEVEL, fit=1.0),
         # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
-        Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
+        Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_MIPMAPPED, fit=1.0),
         Quantity(f"{name}_direct", "1", 1e-4, _relative, note=_MAPPED),
         Quantity(f"{name}_shadow", "light", 1e-3, _of_the_lamps, note=_EDGES),
         Quantity(f"{name}_around", "1", 1e-4, _relative, note=_MAPPED),
@@ -164,7 +162,12 @@ _SHADED = (
         Quantity(name, "of the pixel or mean", 2e-3, _of_the_picture, same_triangle=False, note=_GATHERED)
         for name in LENSED
     ),
-    Quantity("velocity_pass", "px per label interval", 0.01, _per_interval),
+    Quantity(
+        "velocity_pass",
+        "px per label interval",
+        0.01,
+        lambda g, r, gpu, ref: motion_per_interval(g, r, gpu.when.interval_s),
+    ),
 )
 
 

@@ -9,44 +9,31 @@ the GPU with it. Rays, hits and flow are in :mod:`blinkgl.render.casting`, light
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
-from blinkgl.render.casting import Flow, Hits, cast, flow_to, moved_in_space, velocity
+from blinkgl.render.casting import Flow, Hits, cast, flow_to, moved_in_space, scene_parts, velocity
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.appearance import surface
+from blinkgl.tools.shader_debugger.appearance import Surface, surface
 
 
 @dataclass(frozen=True, eq=False)
-class ReferenceFrame:
+class ReferenceFrame(Surface, Hits):
     """All buffers of one image; (H, W, ...) float64 unless said otherwise. See :class:`Hits`, :class:`Flow` and
     :class:`~blinkgl.tools.shader_debugger.appearance.Surface` for the fields. velocity : (H, W, 2) px/s at t, nan where
     nothing is hit.
     forward, backward : flow to the requested times, else None."""
 
-    t_ns: int
-    hit: np.ndarray
-    depth: np.ndarray
-    instance: np.ndarray
-    part: np.ndarray
-    triangle: np.ndarray
-    bary: np.ndarray
-    local: np.ndarray
-    normal: np.ndarray
-    uv: np.ndarray
-    albedo: np.ndarray
-    colour: np.ndarray
-    luminance: np.ndarray
     velocity: np.ndarray
     forward: Flow | None
     backward: Flow | None
-    front: np.ndarray
-    xy: np.ndarray
 
     def hits(self) -> Hits:
         """Return the hits at the pixel centres, row by row."""
-        flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in _HIT_IMAGES}
+        images = (name for name in Hits.__dataclass_fields__ if name != "t_ns")
+        flat = {name: (a := getattr(self, name)).reshape(self.hit.size, *a.shape[2:]) for name in images}
         return Hits(t_ns=self.t_ns, **flat)
 
     def scene_flow(self, scene: Scene) -> np.ndarray:
@@ -72,29 +59,37 @@ def render(
     hits = cast(scene, t_ns, None if xy is None else xy.reshape(-1, 2))
     looks = surface(scene, hits)
 
-    def image(values):
-        return values.reshape(*shape, *values.shape[1:])
+    def images(values: Any) -> dict[str, Any]:
+        return {k: v if k == "t_ns" else v.reshape(*shape, *v.shape[1:]) for k, v in vars(values).items()}
 
-    def flow(to_ns):
-        if to_ns is None:
-            return None
-        result = flow_to(scene, hits, to_ns)
-        return Flow(result.t_ns, *(image(getattr(result, name)) for name in _FLOW_IMAGES))
+    def flow(to_ns: int | None) -> Flow | None:
+        return None if to_ns is None else Flow(**images(flow_to(scene, hits, to_ns)))
 
-    from_hits = {name: image(getattr(hits, name)) for name in _HIT_IMAGES}
-    from_looks = {name: image(getattr(looks, name)) for name in ("normal", "uv", "albedo", "colour", "luminance")}
     return ReferenceFrame(
-        t_ns=int(t_ns),
-        **from_hits,
-        **from_looks,
-        velocity=image(velocity(scene, hits)),
+        **images(hits),
+        **images(looks),
+        velocity=velocity(scene, hits).reshape(*shape, 2),
         forward=flow(forward_ns),
         backward=flow(backward_ns),
     )
 
 
-_HIT_IMAGES = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
-_FLOW_IMAGES = ("flow", "valid", "occluded", "outside", "depth", "hidden_by")
+def why(scene: Scene, frame: ReferenceFrame, way: str, x: int, y: int) -> str:
+    """Return one line that says why the point at a pixel is invalid or occluded at the end of its flow ``way``,
+    "forward" or "backward"; "" where it is visible at both times."""
+    flow = getattr(frame, way)
+    depth, (part, triangle) = flow.depth[y, x], flow.hidden_by[y, x]
+    if not frame.hit[y, x]:
+        return "nothing hit"
+    if not flow.valid[y, x]:
+        return f"behind the camera at t' (Z' = {depth:.6g})"
+    if flow.outside[y, x]:
+        return "outside the image at t' (x' = {:.3f}, y' = {:.3f})".format(*(frame.xy[y, x] + flow.flow[y, x]))
+    if depth < scene.camera.near:
+        return f"in front of the near plane at t' (Z' = {depth:.6g} < {scene.camera.near:g})"
+    if part >= 0:
+        return f"hidden at t' by {scene_parts(scene)[part][0].name}, triangle {triangle}"
+    return "seen from its culled back at t'" if flow.occluded[y, x] else ""
 
 
 def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: float = 0.02) -> np.ndarray:
@@ -107,19 +102,8 @@ def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: fl
     # Second differences of 1/Z vanish on a plane; along x and along y in turn.
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.nan_to_num(1.0 / np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    band = np.zeros(ids.shape, bool)
+    band = (ndimage.maximum_filter(ids, 3) != ids) | (ndimage.minimum_filter(ids, 3) != ids)
     for axis in (0, 1):
-        i, z, b = np.swapaxes(ids, 0, axis), np.swapaxes(inverse, 0, axis), np.swapaxes(band, 0, axis)
-        change = i[1:] != i[:-1]
-        b[1:] |= change
-        b[:-1] |= change
-        bend = np.abs(z[2:] - 2.0 * z[1:-1] + z[:-2]) > jump * np.maximum(np.maximum(z[2:], z[1:-1]), z[:-2])
-        b[1:-1] |= bend
-    # Diagonal neighbours.
-    diagonal = ids[1:, 1:] != ids[:-1, :-1]
-    other = ids[1:, :-1] != ids[:-1, 1:]
-    band[1:, 1:] |= diagonal
-    band[:-1, :-1] |= diagonal
-    band[1:, :-1] |= other
-    band[:-1, 1:] |= other
+        z, b = np.swapaxes(inverse, 0, axis), np.swapaxes(band, 0, axis)
+        b[1:-1] |= np.abs(z[2:] - 2.0 * z[1:-1] + z[:-2]) > jump * np.maximum(np.maximum(z[2:], z[1:-1]), z[:-2])
     return ndimage.binary_dilation(band, np.ones((3, 3)), iterations=width - 1) if width > 1 else band

@@ -13,12 +13,11 @@ import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from pathlib import Path
 from urllib.parse import urlsplit
 
 from blinkgl.errors import BlinkGLError, GLError
 from blinkgl.tools.shader_debugger.inspector import ROUTES, Inspector, Worker, read_query
-from blinkgl.tools.shader_debugger.session import Subject, When
+from blinkgl.tools.shader_debugger.session import Subject, When, open_folder
 
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -178,11 +177,6 @@ class DebugServer:
         host = self._server.bound
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
-    @property
-    def folder(self) -> Path:
-        """The folder of the shaders."""
-        return self._server.worker.inspector.folder
-
     def __enter__(self) -> DebugServer:
         return self
 
@@ -213,8 +207,7 @@ def _listen(host: str, port: int) -> _Server:
 def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int) -> None:
     """Serve until interrupted."""
     with DebugServer(subject, when, shaders, host, port) as server:
-        folder = server.folder
-        print(f"{server.url}  (Ctrl-C ends it; watching {folder})", flush=True)
+        print(f"{server.url}  (Ctrl-C ends it; watching {open_folder(shaders)})", flush=True)
         if host not in LOCAL:
             print("anybody who reaches this address can look: there is no password", flush=True)
         try:

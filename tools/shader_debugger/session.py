@@ -24,7 +24,7 @@ from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.filters import pass_of, places_of, twinned_of
+from blinkgl.tools.shader_debugger.filters import filtered_names, pass_of, places_of
 
 DEBUG_PROGRAM = "debug.glsl"
 
@@ -247,10 +247,10 @@ class DebugRenderer(Renderer):
     """The production renderer with additional passes. It always draws whole frames, because data kept from an earlier
     frame may come from other shaders.
 
-    twinned : pictures made from other pictures that are shown and compared, see :mod:`filters`.
+    filtered : pictures made from other pictures that are shown and compared, see :mod:`filters`.
     as_configured : whether pictures are those of a generation run."""
 
-    twinned: tuple[str, ...] = ()
+    filtered: tuple[str, ...] = ()
     as_configured = False
 
     def __init__(self, gl: GLContext, scene: Scene, config: Any):
@@ -344,5 +344,5 @@ def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured
         if not as_configured:
             config = config.model_copy(update={"antialiasing": "none", "image_antialiasing": "none"})
         with DebugRenderer(gl, subject.scene, config) as renderer:
-            renderer.twinned, renderer.as_configured = twinned_of(subject.config, subject.scene), as_configured
+            renderer.filtered, renderer.as_configured = filtered_names(subject.config, subject.scene), as_configured
             yield renderer

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
@@ -44,24 +44,23 @@ def run(
     check_cost(cost)
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
+    half_s = None if minutes is None else minutes * 30
     changes: dict[str, Any] = {
         "limit_us": round(limit_ms * 1000),
         "sequence": template.sequence(0).output.first_index if sequence is None else sequence,
+        "reference_set": tuple(reference_set or ()),
+        "clip_s": clip,
+        "rounds": rounds,
+        "rounds_s": half_s,
+        "reference_s": half_s,
     }
-    changes["reference_set"] = tuple(reference_set or ())
-    if clip is not None:
-        changes["clip_s"] = clip
-    if rounds is not None:
-        changes["rounds"] = rounds
-    if minutes is not None:
-        changes |= {"rounds_s": minutes * 30, "reference_s": minutes * 30}
     console = plain_console()
     result = trade(
         template,
         quick=quick,
         only=only,
         skip=skip,
-        options=replace(options, **changes),
+        options=replace(options, **{key: value for key, value in changes.items() if value is not None}),
         cost=f"{cost}_s",
         say=lambda text: say(console, text),
     )
@@ -80,18 +79,10 @@ def check_cost(cost: str) -> None:
 def show(result: dict, console: Console) -> None:
     """Print the front as a table, and how far the reference can be trusted."""
     console.width = max(console.width, 120)
-    table = Table(title="settings that no other one beats in cost and error, cheapest first", title_justify="left")
-    table.add_column("setting")
-    for name in (
-        "wall s/s",
-        "cpu s/s",
-        "frames/s",
-        "time µs 50/95 %",
-        "shift px 50/95 %",
-        "missed/extra",
-        "voxel grid",
-    ):
-        table.add_column(name, justify="right", no_wrap=True)
+    title = "settings that no other one beats in cost and error, cheapest first"
+    names = ("wall s/s", "cpu s/s", "frames/s", "time µs 50/95 %", "shift px 50/95 %", "missed/extra", "voxel grid")
+    columns = (Column(name, justify="right", no_wrap=True) for name in names)
+    table = Table("setting", *columns, title=title, title_justify="left")
     for r in sorted((r for r in result["settings"] if r["on_front"]), key=lambda r: r[result["cost"]]):
         table.add_row(
             r["name"],

@@ -272,7 +272,8 @@ class Bench:
             )
         # Labels and previews are not measured; noise, and a bus that delays events, would hide the errors of interest.
         self.emulator = emulator_of(base.events).noiseless(base.events)
-        tree = apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])])
+        sized = [] if SIZES[size] == 1 else ["camera=" + json.dumps(base.camera.scaled(SIZES[size]))]
+        tree = apply_overrides(template.tree, ["quality=null", *sized])  # the field of view stays
         self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)
         self._scenes: dict[str, Scene] = {}
         self.base = self.config(())
@@ -434,10 +435,3 @@ class Bench:
     def _affordable(self, levels: list[Level], scale: int, max_px: float, spent: float) -> bool:
         last = levels[-1]
         return spent + last.seconds * (scale / last.scale) ** 2 * last.max_px / max_px <= self.options.reference_s
-
-
-def _sized(config: SequenceConfig, factor: float) -> list[str]:
-    """Return overrides that shrink the image and keep its field of view."""
-    if factor == 1:
-        return []
-    return ["camera=" + json.dumps(config.camera.scaled(factor))]

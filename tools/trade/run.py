@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.errors import ConfigError
 from blinkgl.gl import create_context
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.atomic import write_whole
 from blinkgl.machine.bench import machine_line
-from blinkgl.tools.trade.measure import ENOUGH, QUICK, Bench, Level, Options
+from blinkgl.tools.trade.measure import ENOUGH, QUICK, Bench, Options
 from blinkgl.tools.trade.settings import SIZES, Setting, design, pareto_front
 
 COLUMNS = (
@@ -92,7 +93,18 @@ def trade(
             results = bench.measure(mine)
             levels = bench.judge(results, bench.speeds())
             rows += [{**r.to_dict(), "width": bench.width, "height": bench.height} for r in results]
-            sizes[size or "full"] = _judged_by(bench, levels)
+            sizes[size or "full"] = {
+                "width": bench.width,
+                "height": bench.height,
+                "judged_pixels": int(bench.mask.sum()),
+                "tiles": len(bench.tiles),
+                "t0_us": bench.t0_ns // 1000,
+                "t1_us": bench.t1_ns // 1000,
+                "clip_s": bench.duration_s,
+                "emulator": bench.emulator.model_dump(),
+                "levels": [level.to_dict() for level in levels],
+                "converged": levels[-1].converged,
+            }
         machine = machine_line(gl.renderer)
     main = rows[0]["size"]  # sizes are different data sets: the front uses only the largest
     best = {r["name"] for r in pareto_front([r for r in rows if r["size"] == main], cost, "voxel")}
@@ -119,39 +131,26 @@ def trade(
     }
 
 
-def _judged_by(bench: Bench, levels: list[Level]) -> dict[str, Any]:
-    """Return the reference of one size as plain data."""
-    return {
-        "width": bench.width,
-        "height": bench.height,
-        "judged_pixels": int(bench.mask.sum()),
-        "tiles": len(bench.tiles),
-        "t0_us": bench.t0_ns // 1000,
-        "t1_us": bench.t1_ns // 1000,
-        "clip_s": bench.duration_s,
-        "emulator": bench.emulator.model_dump(),
-        "levels": [level.to_dict() for level in levels],
-        "converged": levels[-1].converged,
-    }
-
-
 def write(result: dict, out: str | Path) -> list[Path]:
     """Write trade.json, trade.csv, pareto.png and trade.html to the folder ``out``. Raises OutputError."""
     from blinkgl.tools.trade.plot import page, pareto
 
-    out = Path(out)
-    paths = [out / name for name in ("trade.json", "trade.csv", "pareto.png", "trade.html")]
-    with atomic_file(paths[0]) as path, output_errors(paths[0]):
-        path.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
-    with atomic_file(paths[1]) as path, output_errors(paths[1]), path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-        rows.writeheader()
-        rows.writerows(result["settings"])
+    paths = write_tables(Path(out) / "trade", result, COLUMNS, result["settings"])
+    pages = [Path(out) / name for name in ("pareto.png", "trade.html")]
     picture = pareto(result)
-    with atomic_file(paths[2]) as path, output_errors(paths[2]):
-        path.write_bytes(picture)
-    with atomic_file(paths[3]) as path, output_errors(paths[3]):
-        path.write_text(page(result, picture), encoding="utf-8")
+    write_whole(pages[0], picture)
+    write_whole(pages[1], page(result, picture))
+    return [*paths, *pages]
+
+
+def write_tables(path: Path, result: dict, columns: tuple[str, ...], rows: Iterable[dict]) -> list[Path]:
+    """Write ``path``.json with the result, and ``path``.csv with the rows; return both paths. Raises OutputError."""
+    paths, table = [path.with_suffix(ending) for ending in (".json", ".csv")], io.StringIO(newline="")
+    write_whole(paths[0], json.dumps(plain(result), indent=1) + "\n")
+    written = csv.DictWriter(table, columns, extrasaction="ignore")
+    written.writeheader()
+    written.writerows(rows)
+    write_whole(paths[1], table.getvalue())
     return paths
 
 

@@ -9,7 +9,6 @@ A row, one setting in one scene, counts only where the reference has converged t
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import time
@@ -22,16 +21,13 @@ from typing import Any
 from blinkgl.config.quality import QUALITIES, load_quality
 from blinkgl.config.reader import apply_overrides
 from blinkgl.config.run import RunTemplate, load_run
-from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import BlinkGLError, ConfigError
-from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.tools.trade.measure import Density, Options
-from blinkgl.tools.trade.run import chosen, plain, trade
+from blinkgl.tools.trade.run import chosen, trade, write_tables
 from blinkgl.tools.trade.settings import Setting, excess, pareto_front, suite_design
 from blinkgl.tools.trade.words import convergence_line
 
 OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=480.0, rounds=3, rounds_s=240.0, labels=False)
-FILE = "suite.json"
 COLUMNS = (
     "scene",
     "name",
@@ -167,24 +163,20 @@ def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any]
 
 def preset_names(names: Iterable[str]) -> dict[str, str]:
     """Return quality -> name of its setting, for those among ``names``."""
-    wanted = {_meaning(_as_overrides(quality)): quality for quality in QUALITIES}
-    known = {s.name: s for s in suite_design()}
-    found = {
-        wanted[key]: name for name in names if name in known and (key := _meaning(known[name].overrides)) in wanted
-    }
-    return {quality: found[quality] for quality in QUALITIES if quality in found}
+    known = {s.name: meaning(s.overrides) for s in suite_design()}
+    found = [(name, known[name]) for name in names if name in known]
+    presets = {quality: meaning(f"{t}={json.dumps(v)}" for t, v in _tables(quality)) for quality in QUALITIES}
+    return {quality: name for quality, wanted in presets.items() for name, meant in found if meant == wanted}
 
 
-def _as_overrides(quality: str) -> tuple[str, ...]:
-    preset = load_quality(quality)
-    return tuple(f"{table}={json.dumps(preset[table])}" for table in ("timeline", "render"))
+def _tables(quality: str) -> list[tuple[str, Any]]:
+    return [(table, load_quality(quality)[table]) for table in ("timeline", "render")]
 
 
-def _meaning(overrides: Iterable[str]) -> str:
+def meaning(overrides: Iterable[str]) -> dict[str, Any]:
     """Return the timeline and render settings that overrides give, with every value filled in."""
-    tree = apply_overrides({"quality": None}, list(overrides))
-    config: SequenceConfig = RunTemplate(tree, Path()).sequence(0)
-    return json.dumps([config.timeline.model_dump(), config.render.model_dump()], sort_keys=True)
+    config = RunTemplate(apply_overrides({"quality": None}, list(overrides)), Path()).sequence(0)
+    return {"timeline": config.timeline.model_dump(), "render": config.render.model_dump()}
 
 
 def standing(scenes: dict[str, dict], cost: str) -> list[dict[str, Any]]:
@@ -226,14 +218,6 @@ def _mean(values: Iterable[float]) -> float:
 
 def write(result: dict[str, Any], out: Path) -> None:
     """Write suite.json and suite.csv. Raises OutputError."""
-    with atomic_file(out / FILE) as path, output_errors(out / FILE):
-        path.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
-    with (
-        atomic_file(out / "suite.csv") as path,
-        output_errors(out / "suite.csv"),
-        path.open("w", newline="", encoding="utf-8") as file,
-    ):
-        rows = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-        rows.writeheader()
-        for name, scene in result["scenes"].items():
-            rows.writerows({"scene": name, **row} for row in scene.get("settings", ()))
+    scenes = result["scenes"].items()
+    rows = ({"scene": name, **row} for name, scene in scenes for row in scene.get("settings", ()))
+    write_tables(out / "suite", result, COLUMNS, rows)

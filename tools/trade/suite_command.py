@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from blinkgl.errors import ConfigError
 from blinkgl.machine.terminal import plain_console, say
@@ -51,10 +51,11 @@ def run(
 def show(result: dict, console: Console) -> None:
     """Print all settings over all scenes, and the rows that do not count, with reasons."""
     console.width = max(console.width, 140)
-    table = Table(title="settings over all scenes (means are geometric), cheapest first", title_justify="left")
-    headings = ("setting", "counts in", "not beaten in", "beaten by", "cost", "voxel", "worst voxel", "worst in")
-    for name in headings:
-        table.add_column(name, justify="left" if name in ("setting", "worst in") else "right", no_wrap=True)
+    title = "settings over all scenes (means are geometric), cheapest first"
+    numbers = ("counts in", "not beaten in", "beaten by", "cost", "voxel", "worst voxel")
+    columns = (Column(name, justify="right", no_wrap=True) for name in numbers)
+    ends = (Column(name, no_wrap=True) for name in ("setting", "worst in"))
+    table = Table(next(ends), *columns, next(ends), title=title, title_justify="left")
     for r in sorted((r for r in result["standing"] if r["scenes"]), key=lambda r: r["cost"]):
         table.add_row(
             r["name"],

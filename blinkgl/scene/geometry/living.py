@@ -117,15 +117,18 @@ def fish(
     uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), s[:, None]), axis=2).reshape(-1, 2)
     # A wave that runs down the body, a little longer than it.
     wave = -2 * math.pi / (0.95 * length) * np.array([1.0, 0, 0])
+    # The frequency falls with the root of the length; 1.9 Hz belong to 0.3 m.
     frequency = 1.9 * tempo * math.sqrt(0.3 / length)
     beat = Beat(1 / frequency, -2 * math.pi * phase)
     swim = Waves(
         np.array([0, 1.0, 0]),
+        # The wave's amplitude grows from a tenth at the nose to the whole at the end of the tail.
         (np.array([-0.9 / length, 0, 0]), 0.55),
         ((wave, 0.0), (np.zeros(3), 0.0)),
         (0.085 * length, 0.0),
         (beat, beat),
     )
+    # A wave is 0.95 lengths long, and the fish advances by 0.7 of one in a beat.
     swim.locomotion, swim.speed = "level", 0.7 * 0.95 * length / (beat.period_ns * 1e-9)
     return (flat, _smooth_normals(flat, faces, area), uvs, faces), swim
 

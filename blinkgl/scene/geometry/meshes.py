@@ -106,6 +106,7 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
             value=vertices[first].tolist(),
             accepted="finite coordinates",
         )
+    # The running count less 1 is the new number of each vertex that is used.
     return vertices[used], (np.cumsum(used) - 1)[faces], used
 
 
@@ -131,6 +132,7 @@ def faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return (F,) bool. A sliver is compared with its own longest edge, so that small meshes are not dropped."""
     corners = vertices[faces]
     height, longest = _height_and_edge(corners)
+    # A shorter edge is within the rounding of the coordinates.
     floor = 1e-14 * max(float(np.abs(corners).max()), 1e-300)
     return (height > 1e-10 * longest) & (longest > floor)
 
@@ -141,6 +143,7 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     # Products of the smallest coordinates would underflow.
     edges = edges / np.where(longest > 0, longest, 1.0)[:, None, None]
+    # Twice the area over the longest edge: the smallest height.
     return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * longest, longest
 
 
@@ -223,11 +226,14 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> bool:
     """Return whether a welded mesh is closed and wound outwards: every directed edge occurs as often as its reverse (an
     oriented surface without a boundary, which also allows solids that touch along an edge), around no negative
     volume."""
+    # Faces that welding has collapsed to a line or a point do not count.
     alive = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
     welded, count = welded[alive], len(points)
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
+    # start * count + end is the number of a directed edge. The sorted lists agree where each has its reverse.
     if not len(welded) or not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
         return False
+    # The volume is the sum of signed tetrahedra from the middle of the points to each face.
     a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
     # A sheet of two coincident layers has no volume and counts as closed.
     noise = 1e-9 * float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) ** 3
@@ -255,6 +261,7 @@ def crease_normals(
     count = len(faces)
     a, b = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
     low, high = np.minimum(a, b), np.maximum(a, b)
+    # The sort makes equal edges neighbours; of more than two at one edge each is paired with the next.
     order = np.lexsort((high, low))
     same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
     first, second = order[:-1][same], order[1:][same]  # edge numbers 3*face + k
@@ -263,6 +270,7 @@ def crease_normals(
     else:
         smooth = (groups[first // 3] == groups[second // 3]) & (groups[first // 3] > 0)
     first, second = first[smooth], second[smooth]
+    # The corner at the other end of each edge, in the edge's own face.
     f_next, s_next = first - first % 3 + (first % 3 + 1) % 3, second - second % 3 + (second % 3 + 1) % 3
     # The edge's two ends: joined corners are those at the same welded point (faces may be wound either way).
     direct = a[first] == a[second]
@@ -270,6 +278,7 @@ def crease_normals(
     right = np.concatenate([np.where(direct, second, s_next), np.where(direct, s_next, second)])
     _, fan = _components(left, right, 3 * count)
     weighted = (unit[:, None, :] * angle[:, :, None]).reshape(-1, 3)
+    # Sums over the corners of each fan, given back to every corner of it.
     total = np.stack([np.bincount(fan, weights=weighted[:, i], minlength=fan.max() + 1) for i in range(3)], axis=1)[fan]
     length = np.linalg.norm(total, axis=1, keepdims=True)
     flat = np.repeat(unit, 3, axis=0)
@@ -332,6 +341,7 @@ def _from_corners(
         ],
         axis=1,
     )
+    # One structured value for each row, so that np.unique compares whole rows.
     whole = [("", np.int64)] * rows.shape[1]
     _, first, index = np.unique(np.ascontiguousarray(rows).view(whole).ravel(), return_index=True, return_inverse=True)
     # Vertices in order of first use: good for the vertex cache, and independent of np.unique's sort order.
@@ -358,6 +368,7 @@ def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
     determinant = float(np.linalg.det(linear))
     if not np.isfinite(determinant) or determinant == 0.0:
         raise AssetError("a transform flattens the mesh (determinant 0)", where=mesh.name or "mesh")
+    # n^T M^-1 is (M^-T n)^T: normals are transformed by the inverse transpose.
     normals = mesh.normals @ np.linalg.inv(linear)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     faces = mesh.faces if determinant > 0 else np.ascontiguousarray(mesh.faces[:, ::-1])
@@ -413,6 +424,7 @@ def subdivided(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
         if longest <= edge or 4 * len(mesh.faces) > max_faces:
             return mesh
+        # Each undirected edge gets one new vertex, however many faces share it.
         pairs = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
         edges, middle = np.unique(pairs, axis=0, return_inverse=True)
         halfway = lambda values, edges=edges: np.concatenate([values, values[edges].mean(axis=1, dtype=np.float64)])
@@ -421,6 +433,7 @@ def subdivided(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
         a, b, c = mesh.faces.T
         ab, bc, ca = (middle.reshape(-1, 3) + len(mesh.vertices)).T
         faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3).astype(np.int32)
+        # The normals of old vertices stay bitwise the same.
         normals[: len(mesh.vertices)] = mesh.normals
         mesh = replace(
             mesh,

@@ -47,6 +47,7 @@ def _fans(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     cross = np.cross(arms[:, :-1], arms[:, 1:])
     whole = cross.sum(axis=1)  # twice the area, along the normal (Newell)
     along = np.einsum("pnk,pk->pn", cross, whole)
+    # A little below 0 is allowed, because corners on a straight line give rounding errors of either sign.
     fits = (along >= -1e-9 * (whole**2).sum(axis=1, keepdims=True)).all(axis=1)
     # A triangle needs no choice, and coordinates that are no numbers are refused later.
     fits |= (rows.shape[1] == 3) | ~np.isfinite(whole).all(axis=1)
@@ -62,6 +63,7 @@ def _ears(points: np.ndarray) -> np.ndarray:
     seen = np.delete(flat, axis, axis=1) / (np.abs(flat).max() or 1.0)
     found = mapbox_earcut.triangulate_float64(seen, np.array([len(seen)], np.uint32)).reshape(-1, 3).astype(np.int64)
     a, b, c = (flat[found[:, k]] for k in range(3))
+    # Triangles have the winding that is seen along the axis, which may be opposite to the polygon's.
     behind = (np.cross(b - a, c - a) @ normal) < 0
     found[behind] = found[behind, ::-1]
     return found

@@ -208,6 +208,7 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     positions[pole, :2] = 0.0
     # A pole has a vertex for each segment, with the u of the segment's middle.
     uvs[pole, 0] += 0.5 / segments
+    # A triangle with two corners in a pole has no area.
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 
 
@@ -217,6 +218,7 @@ def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
     # A fan round the middle.
     positions = np.concatenate([[[0.0, 0.0, z]], rim])
+    # A lower cap is seen from below, where x is mirrored.
     side = 1.0 if up else -1.0
     uvs = np.stack([0.5 + 0.5 * side * positions[:, 0] / radius, 0.5 - 0.5 * positions[:, 1] / radius], axis=1)
     i = np.arange(segments)
@@ -256,6 +258,7 @@ def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Sur
     # Equal angles over an edge, not equal lengths.
     turn = np.tan(np.linspace(0, math.pi / 4, subdivisions + 1))
     edge = half - radius + radius * turn
+    # Without a flat part, a ball, both halves share the line in the middle.
     ticks = np.concatenate([-edge[::-1], edge]) if rounding < 0.5 else np.concatenate([-edge[:0:-1], edge])
     across, up = np.meshgrid(ticks, ticks)
     n, cells, sides = len(ticks) - 1, lattice(len(ticks) - 1, len(ticks) - 1), []

@@ -32,6 +32,7 @@ def _of_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     (u1, v1), (u2, v2) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
     # v points downwards.
     area = u2 * v1 - u1 * v2
+    # e2 v1 - e1 v2 is dp/du times the signed area.
     return (e2 * v1[:, None] - e1 * v2[:, None]) * np.sign(area)[:, None], area
 
 

@@ -64,6 +64,7 @@ class Animation:
     def tries(self, node: int, t0_ns: int, t1_ns: int, count: int = 32) -> list[np.ndarray]:
         """Return the node's transforms to the file's world at irregular times in [t0, t1], which no period meets."""
         if (t0_ns, t1_ns) not in self._tries:
+            # The fractional parts of multiples of the golden ratio lie evenly and never repeat.
             times = (t0_ns + round((0.618033988749895 * k % 1) * (t1_ns - t0_ns)) for k in range(count))
             self._tries[t0_ns, t1_ns] = [self.skeleton.at(t)[0] for t in times]
         return [world[self._places[node]] for world in self._tries[t0_ns, t1_ns]]
@@ -121,6 +122,7 @@ class Animation:
         place, playing = self._places[node], self._playing
         mine = [t for t in self.tracks if t.joint == place and t.path == "weights"]
         whole = self.document.morph_weights(node, max(len(positions), 1))
+        # Entry 1 of a cubic key is its value; 0 and 2 are tangents.
         values = [t.values[:, 1] if t.values.ndim == 3 else t.values for t in mine]
         used = np.flatnonzero(np.any([whole != 0, *(np.abs(v).max(axis=0) > 0 for v in values)], axis=0))
         if not len(used):
@@ -129,6 +131,7 @@ class Animation:
         def weights(t_ns: int) -> tuple[np.ndarray, np.ndarray]:
             time, speed = playing.at(t_ns)
             now, change = mine[-1].at(time) if mine else (whole, np.zeros(len(whole)))
+            # ``change`` is per second of the clip, which plays at ``speed``.
             return now[used], speed * change[used]
 
         moving = bool(mine) and not playing.is_static
@@ -234,6 +237,7 @@ def clip_names(document: gltf.Document) -> list[str]:
 def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, where: str, file: str) -> list[Track]:
     """Return tracks of another file's nodes on the nodes of the same names; those of missing nodes are left out and
     reported."""
+    # In reverse order, so that the first node of a name is kept.
     places = {node.name: place for place, node in reversed(list(enumerate(mine.nodes.values())))}
     names = [node.name for node in theirs.nodes.values()]
     matrices = {node.name for node in mine.nodes.values() if node.matrix is not None}

@@ -43,6 +43,7 @@ _LIGHT_ONLY = {
     "KHR_materials_anisotropy",
     "KHR_materials_dispersion",
 }
+# componentType is OpenGL's code of a type, from GL_BYTE to GL_FLOAT.
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer (all zeros): the file's size does not limit them
@@ -110,6 +111,7 @@ class Document:
     def _primitive(self, primitive: dict, mesh: int) -> RawMesh | None:
         """Return one primitive of a mesh; None: it has no visible surface."""
         mode, attributes = primitive.get("mode", 4), primitive["attributes"]
+        # 4, 5 and 6 are triangles, strips and fans; the modes below are points and lines.
         if mode not in (4, 5, 6):
             self.omissions.add("points and lines")
             return None
@@ -152,6 +154,7 @@ class Document:
         first, odd = np.arange(n), np.arange(n) % 2
         if mode == 5:  # every other triangle of a strip has two corners exchanged
             return np.stack([order[first], order[first + 1 + odd], order[first + 2 - odd]], axis=1)
+        # All triangles of a fan share the first vertex.
         return np.stack([order[first * 0], order[first + 1], order[first + 2]], axis=1)
 
     def _binding(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -228,6 +231,7 @@ class Document:
                     accepted=f"{len(joints)} MAT4",
                 )
             bind = self.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
+            # glTF stores matrices column by column.
             bind = bind.reshape(-1, 4, 4).swapaxes(1, 2)
         return [places[joint] for joint in joints], bind
 
@@ -320,6 +324,7 @@ class Document:
         else:
             values = np.zeros((count, width), dtype)
         if "sparse" in a:
+            # A sparse accessor replaces n of its values.
             where, what, n = a["sparse"]["indices"], a["sparse"]["values"], a["sparse"]["count"]
             kind = np.dtype(_DTYPES[where["componentType"]]).newbyteorder("<")
             at = self._view(where["bufferView"], where.get("byteOffset", 0), n, 1, kind, index)
@@ -329,6 +334,7 @@ class Document:
             values = values.copy()
             values[at.ravel().astype(np.int64)] = new
         if a.get("normalized") and values.dtype.kind in "iu":
+            # A normalised integer is divided by the largest of its type; the least signed one would be below -1.
             return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
         return values
 
@@ -337,10 +343,12 @@ class Document:
         data = self.buffers[index_of(v.get("buffer"), len(self.buffers), "buffer", self.where)]
         begin = v.get("byteOffset", 0)
         start, size = begin + offset, width * dtype.itemsize
+        # Without a stride the elements follow each other without gaps.
         stride = v.get("byteStride", 0) or size
         needed = start + (stride * (count - 1) + size if count else 0)
         if stride < size or needed > min(len(data), begin + v.get("byteLength", 0)):
             raise AssetError(f"the mesh is corrupt: accessor {accessor} reaches outside its buffer", where=self.where)
+        # An array with strides over the buffer, without a copy; the check above keeps it inside.
         return np.ndarray((count, width), dtype, data, start if count else 0, (stride, dtype.itemsize))
 
     # ---- animations
@@ -363,6 +371,7 @@ class Document:
             sampler = samplers[index_of(channel["sampler"], len(samplers), "animation sampler", self.where)]
             kind = sampler.get("interpolation", "LINEAR")
             width = 4 if path == "rotation" else self._target_count(node) if path == "weights" else 3
+            # A cubic key has three entries: in-tangent, value, out-tangent.
             per_key = 3 if kind == "CUBICSPLINE" else 1
             keys, given = (item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
             per_value = width if path == "weights" else 1  # weights are scalars, one after the other

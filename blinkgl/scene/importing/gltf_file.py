@@ -43,6 +43,7 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
                 raise AssetError("the file is truncated inside a chunk", where=where)
             chunks.setdefault(kind, data[position + 8 : position + 8 + size])
             position += 8 + size
+        # The kinds of chunks are the ASCII codes of "JSON" and "BIN\0".
         text, binary = chunks.get(0x4E4F534A, b""), chunks.get(0x004E4942, b"")
     else:
         text = data
@@ -70,6 +71,7 @@ def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
         compressed = next((e for e in buffer.get("extensions", {}) if e.endswith("_meshopt_compression")), None)
         if compressed and "uri" not in buffer:
             raise needs(compressed, str(path))
+        # Only the first buffer of a GLB may lack a URI: its content is the binary chunk.
         data = fetch(buffer["uri"] or "", path, "buffer") if "uri" in buffer else binary if number == 0 else b""
         if len(data) < buffer.get("byteLength", 0):
             raise AssetError(
@@ -187,6 +189,7 @@ class Node:
         if self.matrix is not None:
             return self.matrix
         T = np.eye(4)
+        # R diag(scale): the scale multiplies the columns.
         T[:3, :3] = Rotation.from_quat(self.rotation).as_matrix() * self.scale
         T[:3, 3] = self.translation
         return T
@@ -203,9 +206,11 @@ def nodes_of(tree: dict, where: str) -> dict[int, Node]:
         children = {c for n in raw for c in n.get("children", [])}
         roots = [i for i in range(len(raw)) if i not in children]
     nodes: dict[int, Node] = {}
+    # Depth first in the file's order; the end of the stack is next.
     stack = [(r, None, 0) for r in reversed(roots)]
     while stack:
         i, parent, depth = stack.pop()
+        # A node that is met twice has two parents or is its own ancestor.
         if i in nodes or depth > _MAX_DEPTH:
             raise AssetError(
                 "the nodes are no tree" if i in nodes else f"the nodes are nested more than {_MAX_DEPTH} deep",
@@ -213,6 +218,7 @@ def nodes_of(tree: dict, where: str) -> dict[int, Node]:
                 value=i,
             )
         n = raw[index_of(i, len(raw), "node", where)]
+        # The file has the matrix column by column.
         matrix = np.array(n["matrix"], float).reshape(4, 4).T if n.get("matrix") else None
         rest = [
             tuple(map(float, n.get(k, d)))

@@ -29,6 +29,7 @@ DRAWN = {
 }
 INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
 """Extensions without visible effect."""
+# OpenGL's codes: GL_CLAMP_TO_EDGE, GL_MIRRORED_REPEAT, and below GL_NEAREST.
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 
@@ -118,6 +119,7 @@ class Materials:
         alpha = self._texture(info["index"], "alpha") if info else None
         image = np.full((1, 1), 255, np.uint8) if alpha is None else alpha.image
         cutoff = float(m.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
+        # The least and the greatest opacity anywhere on the surface.
         least, most = (factor * float(v) / 255 for v in (image.min(), image.max()))
         # Half-transparent surfaces are not drawn: partly opaque ones are cut out, fully opaque ones are drawn.
         if mode == "BLEND":
@@ -167,6 +169,7 @@ class Materials:
         """Return a texture. kind : "colour"; "numbers", as they are stored; "alpha", (h, w), None where the image is
         opaque."""
         texture = item(self.tree, "textures", index, self.where)
+        # EXT_texture_webp gives an image of its own, before which the texture's is only a fallback.
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         if source is None:
             names = ", ".join(texture.get("extensions", {})) or "without an image"
@@ -197,6 +200,7 @@ def _texture_transform(transform: dict | None) -> np.ndarray | None:
         float(transform.get("rotation", 0)),
     )
     c, s = np.cos(r), np.sin(r)
+    # Translation times rotation times scale, in the order that KHR_texture_transform defines.
     return (
         np.array([[1, 0, ox], [0, 1, oy], [0, 0, 1]])
         @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])

@@ -126,6 +126,7 @@ class Primitive(_Part):
     attributes: dict[str, Index]
     indices: Index = None
     material: Index = None
+    # 4: separate triangles.
     mode: Annotated[int, Field(ge=0, le=6)] = 4
     targets: list[dict[str, Index]] = []
     extensions: Extensions = {}
@@ -177,6 +178,7 @@ class Image(_Part):
 
 class Sampler(_Part):
     magFilter: int = None
+    # OpenGL's codes; 10497 is GL_REPEAT, the default of the specification.
     wrapS: int = 10497
     wrapT: int = 10497
 

@@ -31,6 +31,7 @@ _NOT_DRAWN = {"p": "points and lines", "l": "points and lines"}
 _NOT_DRAWN |= dict.fromkeys(("curv", "curv2", "surf"), "curves and curved surfaces")
 _MAPS = dict.fromkeys(("map_bump", "bump", "norm"), "normal maps") | {"map_ke": "emissive light"}
 _MAPS |= dict.fromkeys(("map_ks", "map_pr", "map_pm"), "shine (drawn matt)") | {"map_d": "transparency (drawn opaque)"}
+# A '#' begins a comment only at the start of a line or after a blank, since names of files may contain one.
 _COMMENT = re.compile(r"(?:^|\s)#")
 _FLOAT = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OPTION = re.compile(
@@ -69,10 +70,14 @@ def read_obj(
     materials and textures outside the file's folder."""
     where = str(path)
     said = _statements(data, where, omissions)
+    # Four numbers a face, as _statements appends them; ``sizes`` are the corners of each face.
     lines, sizes, surfaces, smoothing = np.array(said.faces).reshape(-1, 4).T
+    # Each distinct v/vt/vn is parsed once; ``used`` repeats them for the corners of all faces.
     index = np.array(said.distinct).reshape(-1, 3)[np.array(said.used, np.int64)]
     tables = [_rows(*table, width) for table, width in zip(said.tables.values(), (6, 2, 3), strict=True)]
     for k, table in enumerate(tables):
+        # k is 0 for positions, 1 for texture coordinates, 2 for normals. A table of length 1 has only the NaN row that
+        # _rows appends, which index -1 selects.
         if k and len(table) == 1 and (index[:, k] >= 0).any():
             log.append(
                 f"{path.stem}: faces have {('texture coordinates', 'normals')[k - 1]} of which the file has none"
@@ -88,6 +93,7 @@ def read_obj(
         materials = [found[name][0] for name in said.materials]
         scale, offset = (np.array([one[k] for one in found.values()])[np.repeat(surfaces, sizes)] for k in (1, 2))
         uvs = uvs * scale + offset
+        # Colours are three numbers after x, y and z; they are used only where every vertex has them.
         if set(said.tables["v"][1]) == {6}:
             colours = linear_from_srgb(np.clip(np.nan_to_num(vertices[index[:, 0], 3:]), 0, 1))
     surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
@@ -98,6 +104,7 @@ def read_obj(
 def _rows(values: array, counts: array, width: int) -> np.ndarray:
     """Return (n + 1, width) numbers, 0 where a row has fewer; the last row, of corners without any, is NaN."""
     numbers, have = np.array(values), np.array(counts, np.int64)
+    # starts: index in ``numbers`` of the first number of each row.
     rows, starts = np.zeros((len(have) + 1, width)), np.cumsum(have) - have
     for k in range(width):
         rows[:-1][have > k, k] = numbers[starts[have > k] + k]
@@ -110,6 +117,7 @@ def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
+        # Older exporters write no UTF-8; Latin-1 decodes any byte.
         text = data.decode("latin-1")
     begun = ""
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
@@ -132,6 +140,7 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
             values.extend(row)
             counts.append(len(row))
         elif key in ("f", "fo"):
+            # ``fo`` is an older form of ``f``.
             words = (_COMMENT.split(rest)[0] if "#" in rest else rest).split()
             for word in words:
                 if (number := known.get(word)) is None:
@@ -145,6 +154,7 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
         elif key == "usemtl":
             material = rest
         elif key == "s":
+            # "s off" switches smoothing off, as "s 0" does; anything else that is no number counts as off, too.
             smoothing, said.grouped = int(rest) if re.fullmatch(r"\d{1,9}", rest) else 0, True
         elif key == "mtllib":
             said.libraries.append((rest, line))
@@ -181,7 +191,9 @@ def _corner(word: str, tables: dict[str, tuple[array, array]], where: str) -> li
             continue
         if not re.fullmatch(r"-?\d+", part):
             raise AssetError("a face is corrupt", where=where, value=word[:40], accepted="v, v/vt, v//vn, v/vt/vn")
+        # A word of so many digits may exceed int64; 0 is no index and is refused below.
         index = int(part) if len(part) < 18 else 0
+        # A negative index counts back from the last row before this line.
         out[k] = index - 1 if index > 0 else len(table) + index
         if index == 0 or out[k] < 0:
             raise _beyond(part, len(table), where)
@@ -230,6 +242,7 @@ def _surface(path: Path, name: str, entries: dict[str, _Entry], max_texture, omi
     numbers = {}
     for key in (key for key in ("d", "tr") if key in entries):
         rest, file, line = entries[key]
+        # With -halo the opacity depends on the viewing angle; its factor is taken as a plain opacity.
         numbers[key] = _numbers(rest.removeprefix("-halo"), 1, file, line)[0]
     # Tr is 1 - d by some exporters and d by others: it hides nothing.
     opacity, scale, offset = numbers.get("d", 0.5 if 0 < numbers.get("tr", 1) < 1 else 1), np.ones(2), np.zeros(2)
@@ -240,9 +253,11 @@ def _surface(path: Path, name: str, entries: dict[str, _Entry], max_texture, omi
     material = Material(base_color=_colour(*entries.get("kd", ("1", "", 0)), omissions))
     if "map_kd" in entries:
         (rest, file, line), settings = entries["map_kd"], {}
+        # Options stand before the name of the file; each one found is cut off the front.
         while option := _OPTION.match(rest):
             key, *settings[key.lower()] = option[0].split()
             rest = rest[option.end() :]
+        # -s is the scale and -o the offset; what they leave out keeps its default.
         for key, values in (("-s", scale), ("-o", offset)):
             values[:] = [*map(float, settings.pop(key, ())), *values][:2]
         wrap: tuple[Wrap, Wrap] = ("clamp", "clamp") if settings.pop("-clamp", []) == ["on"] else REPEAT
@@ -251,6 +266,7 @@ def _surface(path: Path, name: str, entries: dict[str, _Entry], max_texture, omi
         inner = os.path.relpath(os.path.dirname(file), path.parent)
         if (image := beside(path.parent, inner, rest, f"{file}, line {line}", omissions)) is not None:
             material = replace(material, texture=texture_of(image, max_texture), wrap=wrap)
+            # A grey other than white: three equal numbers that are not 1.
             if len(set(material.base_color)) == 1 != material.base_color[0]:
                 # Exporters write a grey that no one chose beside a texture; a colour is a choice.
                 log.append(f"{path.stem}: the grey Kd of '{name}' does not darken its texture")

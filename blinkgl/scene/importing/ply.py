@@ -61,6 +61,7 @@ def read_ply(
             materials.append(None if file is None else Material(texture=texture_of(file, max_texture)))
         number = face.get("texnumber", np.zeros(len(sizes)))
         if len(materials) > 1 and isinstance(number, np.ndarray):
+            # A face's number counts textures from 0, and -1 is none; material 0 is for faces without a texture.
             given.surfaces = np.clip(np.nan_to_num(number), -1, len(materials) - 2).astype(np.int64) + 1
     return raw_meshes(given, materials, max_faces, where, log)
 
@@ -139,8 +140,10 @@ class _Body:
     def values(self, at: np.ndarray, kind: str) -> np.ndarray:
         """Return the values at (n,) places; numbers of a text that a type does not hold become its largest."""
         if self.order:
+            # The bytes of each value in a row, read as its type.
             return self.items[at[:, None] + np.arange(self.width(kind))].view(self.order + kind).ravel().astype(kind)
         limits = np.iinfo(kind if kind[0] != "f" else "i4")
+        # The numbers of a text are float64, which holds whole numbers up to 2^53 exactly.
         least, most = max(limits.min, -(2**53)), min(limits.max, 2**53)
         found = self.items[at]
         return found if kind[0] == "f" else np.clip(np.nan_to_num(found, nan=most), least, most).astype(kind)
@@ -148,6 +151,8 @@ class _Body:
     def columns(self, count: int, properties: list[tuple[str, str | None, str]], name: str, where: str) -> dict:
         """Return the columns of the next element: (name, type of a list's length or None, type) of each property."""
         truncated = AssetError(f"the mesh is truncated: not all of {count} {name} elements are there", where=where)
+        # widths: items of a value, or of a list's length. inner: items of a list's entry, 0 where the property
+        # is no list.
         widths = [self.width(length or kind) for _, length, kind in properties]
         inner = [self.width(kind) if length else 0 for _, length, kind in properties]
         at, end, begins = self.at, len(self.items), None
@@ -169,6 +174,7 @@ class _Body:
                 if at > end:
                     raise truncated
                 if inner[k]:
+                    # The value itself where a length takes one item: a byte, or a number of a text.
                     given = self.items[at - 1]
                     if self.order and width > 1:  # one byte, the usual length of a length, is read without an array
                         given = self.values(starts[k, row : row + 1], properties[k][1] or "")[0]
@@ -183,6 +189,7 @@ class _Body:
             if length is None:
                 found[key] = self.values(starts[k], kind)
                 continue
+            # within: the place of each value in its own list, 0, 1, …
             within = np.arange(lengths[k].sum()) - np.repeat(np.cumsum(lengths[k]) - lengths[k], lengths[k])
             places = np.repeat(starts[k] + widths[k], lengths[k]) + within * inner[k]
             found[key] = lengths[k], self.values(places, kind)

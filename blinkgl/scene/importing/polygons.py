@@ -72,9 +72,11 @@ def raw_meshes(
     behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0
     for array in (triangles, at, normals):
         array[behind] = array[behind, ::-1]
+    # v upwards becomes v downwards.
     uvs = np.full((len(given.places), 2), np.nan) if given.uvs is None else given.uvs * [1, -1] + [0, 1]
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
     kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
+    # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
     order, raws = np.argsort(kind, kind="stable"), []
     for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():
         (number, bare), corners, tint = divmod(int(kind[chosen[0]]), 2), triangles[chosen].ravel(), None

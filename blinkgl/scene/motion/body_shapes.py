@@ -135,6 +135,7 @@ def _given_back(ratio: float, steps: float) -> float:
     w, total, phases = math.pi / steps, 0.0, 16
     for phase in range(phases):
         # The phase is the position within a step at which the surface is met.
+        # In units of a step's time and of the speed of arrival: one step moves the body by v.
         depth, v = (phase + 0.5) / phases, 1.0
         while depth > 0.0:
             v += min(-(w * w * depth + 2.0 * ratio * w * v), 0.0)

@@ -275,6 +275,7 @@ class _Search:
             separation = self._distance(a, b, Ta, Tb)
             if separation <= tol:
                 return t, max(separation, 0.0)
+            # Half of the tolerance is kept back, so that the next test still finds the bodies apart.
             room, nearer = separation - 0.5 * tol, _body_speed
         later = self._later(a, b, t, room, nearer)
         # A body that crosses the remaining distance within a nanosecond has no later time to test.
@@ -349,6 +350,7 @@ def _body_speed(body: _Body, ta: int, tb: int) -> float:
 
 
 def _centre_speed(body: _Body, ta: int, tb: int) -> float:
+    # Rotation moves the centre of the bounding ball by its arm, and a ball does not notice its own rotation.
     v, w = body.path.speed_bound(ta, tb)
     return v + w * body.arm
 
@@ -366,6 +368,7 @@ def _speed_along(normal: np.ndarray):
 
 def _heights(planes: np.ndarray, body: _Body, T: np.ndarray) -> np.ndarray:
     """Return the (P,) heights of the body's lowest point over each plane."""
+    # The planes' normals in the body's axes, so that the hull needs no transformation.
     local = planes[:, :3] @ T[:3, :3]
     return (local @ body.hull.T).min(axis=1) + planes[:, :3] @ T[:3, 3] - planes[:, 3] - body.pad
 
@@ -396,12 +399,14 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
         return None
     # Outermost vertices on both sides: faces that face inwards (a sky box) fail the first test.
     offset = used @ planes[:, :3].T - planes[:, 3]
+    # Rounding errors grow with the coordinates, which may be far from the origin.
     slack = 1e-9 * max(extent, float(np.abs(used).max()))
     if offset.max() > slack:
         return None
     # Planes are moved out to the outermost vertex, so that rounding leaves none outside.
     planes[:, 3] += np.maximum(offset.max(axis=0), 0.0)
     if offset.min() >= -slack:
+        # No vertex lies below any plane either: the mesh is flat and has a second side.
         opposite = -planes
         opposite[:, 3] -= offset.min(axis=0)
         planes = np.vstack([planes, opposite])

@@ -47,6 +47,7 @@ class ArcLengthCurve:
         ends, middles = self._at, (self._at[1:] + self._at[:-1]) / 2
         at_ends, at_middles = (np.linalg.norm(self._curve(u, 1), axis=1) for u in (ends, middles))
         pieces = (at_ends[:-1] + 4 * at_middles + at_ends[1:]) * np.diff(ends) / 6
+        # Length as a function of the parameter. As a spline it has the derivative that Newton's method needs.
         self._length = CubicSpline(ends, np.r_[0.0, np.cumsum(pieces)])
         self._lengths = np.r_[0.0, np.cumsum(pieces)]
         self.length = float(self._lengths[-1])
@@ -61,6 +62,7 @@ class ArcLengthCurve:
             u = np.clip(u - (self._length(u) - within) / np.maximum(self._length(u, 1), 1e-12), 0, self._at[-1])
         directions = self._curve(u, 1)
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-300)
+        # Beyond the ends of an open curve the body continues along the tangent.
         return self._curve(u) + (0 if self.closed else (s - within)[:, None] * directions), directions
 
 
@@ -97,6 +99,7 @@ def path_along_curve(
         turns = Rotation.from_rotvec(heading[:, None] * [0.0, 0.0, 1.0])
     else:
         cameras = np.stack([look_rotation(direction) for direction in ahead])
+        # Camera axes are right, down, ahead; the body's are ahead, left, up.
         turns = Rotation.from_matrix(np.stack([cameras[:, :, 2], -cameras[:, :, 0], -cameras[:, :, 1]], axis=2))
     return KeyframePath(times, places, turns)
 
@@ -115,6 +118,7 @@ def random_path_along_curve(
     otherwise the body's x axis follows the slope. It is static where there is no free space."""
     config = ObjectMotion(waypoints=_LEGS + 1, smoothness=_SMOOTHNESS)
     points = waypoints(rng, t0_ns, t1_ns, config, space, radius, start_pose[:3, 3], speed, flat)[1]
+    # A waypoint without a free direction repeats the one before, but neighbours on a curve must differ.
     apart = np.r_[True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3 * radius]
     if apart.sum() < 2:
         return StaticPath(start_pose, t0_ns, t1_ns)

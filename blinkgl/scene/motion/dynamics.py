@@ -262,6 +262,8 @@ class _World:
         model, data = self.model, self.data
         # Steps up to t1; a rounding error adds none.
         count = math.ceil((self.t1_ns - self.t0_ns) * 1e-9 * self.settings.rate - 1e-6)
+        # A moving body has seven numbers in qpos (position, quaternion w x y z) and six in qvel (velocity in world
+        # axes, angular velocity in its own).
         qpos, qvel = np.empty((_CHUNK + 2, model.nq)), np.empty((_CHUNK + 2, model.nv))
         pushed = self._pushed(0)
         for body in self.dynamic:
@@ -335,6 +337,7 @@ class _World:
         at the top of its flight."""
         policies = self.mujoco.mjtSleepPolicy
         for body in self.dynamic:
+            # Angular velocities times the radius are velocities of the surface, so that one limit serves both.
             v = qvel[:, 6 * body.at : 6 * body.at + 6] * np.repeat([1.0, body.radius], 3)
             slow = float(np.abs(v).max()) < self.model.opt.sleep_tolerance
             self.model.tree_sleep_policy[body.at] = int(policies.mjSLEEP_ALLOWED if slow else policies.mjSLEEP_NEVER)
@@ -350,6 +353,7 @@ class _World:
                 return
             for body, other, depth, away in deep:
                 if depth > _LIFT * min(body.radius, other.radius):
+                    # Too deep to be lifted. This break skips the ``else`` and so ends both loops.
                     break
                 # If both can move, each moves half; a fixed body or a pusher cannot move.
                 share = 0.5 if other.role == "dynamic" else 1.0
@@ -372,6 +376,7 @@ class _World:
             names = [model.geom(int(g)).name.split()[0] for g in pair]
             # Names are "body shape"; a side of the region has no number.
             one, other = (self.bodies[int(name)] if name.isdigit() else self._side for name in names)
+            # The first row of a contact's frame is its normal, from the first geometry to the second.
             for body, met, away in ((one, other, -frame[:3]), (other, one, frame[:3])):
                 if body.role == "dynamic":
                     yield body, met, -float(distance), away
@@ -433,6 +438,7 @@ class _Record:
         v, w = mean[:, :3], mean[:, 3:]
         # Quaternions drift from unit length by rounding.
         q = q / np.linalg.norm(q, axis=1, keepdims=True)
+        # The engine's quaternions are w x y z, scipy's are x y z w.
         R = Rotation.from_quat(q[:, [1, 2, 3, 0]])
         # The path is of the object's origin, the engine's of the centre of mass.
         p = p - R.apply(body.centre)

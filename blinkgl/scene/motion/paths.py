@@ -264,6 +264,7 @@ class PausedPath:
 
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         (a, before), (b, after) = self._clock(int(ta_ns)), self._clock(int(tb_ns))
+        # Both ends lie in the stop: the path's clock stands over the whole interval.
         return (0.0, 0.0) if a == b and before == after == 0 else self.path.speed_bound(a, b)
 
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
@@ -307,6 +308,8 @@ class AffinePath:
         sizes, axes = np.linalg.eigh(R.T @ matrix[:3, :3])
         twist = R.T @ rate[:3, :3]
         W = axes.T @ (twist - twist.T) @ axes
+        # Entry ij is divided by s_i + s_j; where that is zero the nearest rotation is not unique, and its rate is
+        # taken as 0.
         sums = sizes[:, None] + sizes
         D[:3, :3] = R @ axes @ np.divide(W, sums, out=np.zeros((3, 3)), where=np.abs(sums) > 1e-300) @ axes.T
         D[:3, 3] = rate[:3, 3]
@@ -321,6 +324,7 @@ class AffinePath:
             tb_ns = min(tb_ns, ta_ns + self._span_ns)
         rates = [self.derivative(int(t)) for t in np.linspace(ta_ns, tb_ns, _SPEED_SAMPLES)]
         speed = max(float(np.linalg.norm(D[:3, 3])) for D in rates)
+        # The matrix of a rotation's rate has sqrt(2) times the norm of the angular velocity.
         return 1.25 * speed, 1.25 * max(float(np.linalg.norm(D[:3, :3])) for D in rates) / math.sqrt(2)
 
 
@@ -330,6 +334,7 @@ _SPEED_SAMPLES = 256
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
     """Return the rotation nearest to a (3, 3) matrix (polar decomposition)."""
     u, _, vt = np.linalg.svd(linear)
+    # The sign on the smallest singular value makes the result a rotation, never a reflection.
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 

@@ -282,6 +282,7 @@ def approach_bound(
         ua = (max(ta, knots[i]) - knots[i]) * 1e-9
         ub = (min(tb, knots[i + 1]) - knots[i]) * 1e-9
         for r in range(3):
+            # The normal in key frame i's axes, which are those of the rotation vector.
             local[r] = rot[i, 0, r] * normal[0] + rot[i, 1, r] * normal[1] + rot[i, 2, r] * normal[2]
         # Coefficients along the normal and across it.
         for k in range(4):
@@ -291,6 +292,7 @@ def approach_bound(
                 across[k, r] = cr[i, k, r] - dot * local[r]
         phi, rate = _cubic_bound(cr[i], ua, ub), _quadratic_bound(cr[i], ua, ub)
         rate_n = _quadratic_bound(across, ua, ub)
+        # X of the docstring, and the bound of |n x w|.
         x = phi * rate_n + _cubic_bound(across, ua, ub) * rate
         tilt = min(rate_n + 0.5 * x + phi * x / 6.0, rate)
         best = max(best, _quadratic_bound(along, ua, ub) + reach * tilt)

@@ -66,6 +66,7 @@ class FreeSpace:
             low[2] = min(max(low[2], self.ground_z + radius), self.high[2])
         out = np.maximum(np.maximum(low - points, points - self.high), 0.0).max(axis=1)
         if len(self.radii):
+            # gap: between the body's sphere and each obstacle's, negative where they overlap.
             gap = np.linalg.norm(points[:, None] - self.centres, axis=2) - self.radii - radius
             if skip is not None:
                 gap[:, skip] = 0.0
@@ -83,9 +84,11 @@ class FreeSpace:
             return True
         limit = self.radii + radius
         leg = b - a
+        # along: the place on the leg, 0 to 1, that is nearest to each obstacle's centre.
         along = np.clip((self.centres - a) @ leg / max(leg @ leg, 1e-300), 0.0, 1.0)
         nearest = np.linalg.norm(a + along[:, None] * leg - self.centres, axis=1)
         at_a = np.linalg.norm(a - self.centres, axis=1)
+        # Clear of the obstacle all along, or already in it at ``a`` and never nearer to its centre than there.
         return bool(np.all((nearest >= limit) | ((at_a < limit) & (nearest >= at_a * (1 - 1e-12)))))
 
 
@@ -113,6 +116,7 @@ def random_path(
         return StaticPath(start, t0_ns, t1_ns)
     times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=on_ground)
     times, positions = _refined(times, positions, rate)
+    # Row 2 of the rotation is the world's vertical in the body's axes.
     turns = _random_turns(rng, config, rate, times, start[:3, :3].T[:, 2] if on_ground else None)
     path = KeyframePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
     return _pausing(rng, config, path, t0_ns, t1_ns)
@@ -154,6 +158,7 @@ def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
     """Return the camera's initial direction, (3,) unit; None: any, and nothing is drawn."""
     if config.heading == "any":
         return None
+    # Columns of a camera's pose: 0 and 1 span the image plane, 2 is the viewing direction.
     if config.heading == "view":
         return start[:3, 2] * rng.choice([-1.0, 1.0])
     angle = rng.uniform(0, 2 * math.pi)
@@ -179,6 +184,7 @@ def look_rotation(direction: ArrayLike) -> np.ndarray:
     n = np.linalg.norm(x)
     x = x / n if n > 1e-9 else np.array([1.0, 0.0, 0.0]) - z[0] * z
     x /= np.linalg.norm(x)
+    # Columns are the image's right, its down and the viewing direction, a right-handed frame.
     return np.column_stack([x, np.cross(z, x), z])
 
 
@@ -220,6 +226,7 @@ def waypoints(
         times = np.linspace(0, t1_ns - t0_ns, count).round().astype(np.int64) + t0_ns
         return times, np.tile(start, (count, 1))
     if flat:
+        # The height of a body on the ground is fixed, so only obstacles and the horizontal extent count.
         space = FreeSpace(
             np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii
         )
@@ -244,6 +251,7 @@ def _walk(rng, config, space, radius, start, length, flat, count, ahead) -> np.n
     """Return (K, 3) waypoints from ``start``, legs of about length / (count - 1), until ``length`` is covered."""
     leg = length / (count - 1)
     points, covered, direction = [start], 0.0, ahead
+    # In a narrow space legs are halved and never cover the length; the walk ends after 16 times as many.
     while covered < length and len(points) <= 16 * count:
         step = leg * rng.uniform(0.6, 1.4)
         for attempt in range(4 * _TRIES):
@@ -278,6 +286,7 @@ def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
     end = np.interp(speed * duration, arc, at)  # a body that found no free direction is slower than configured
     times = np.rint(parameter * ((t1_ns - t0_ns) / end)).astype(np.int64)
     # Rounded times of very short legs may coincide: each is at least a nanosecond after the previous one.
+    # Subtracting 0, 1, 2, … turns "at least one more than the last" into a running maximum.
     order = np.arange(len(times))
     return np.maximum.accumulate(times - order) + order + t0_ns
 
@@ -301,6 +310,7 @@ def _resampled(times, positions, parts):
 
 
 def _refined(times, positions, rate):
+    # 1.4 is the largest factor on a drawn turn, see _random_turns and _camera_turns.
     parts = math.ceil(1.4 * rate * np.diff(times).max() * 1e-9 / _MAX_TURN)
     return _resampled(times, positions, parts) if parts > 1 else (times, positions)
 
@@ -331,6 +341,8 @@ def _camera_turns(rng, config, rate, times, R, aims) -> np.ndarray:
         tries.append(home * min(1.0, angle / max(float(np.linalg.norm(home)), 1e-12)))
         ends = R @ Rotation.from_rotvec(tries).as_matrix()
         towards = aims[k + 1] / max(float(np.linalg.norm(aims[k + 1])), 1e-12)
+        # ends[:, :, 2] are viewing directions; ends[:, 2, 0] are the heights of the image's right, 0 for
+        # a level horizon.
         off_target = np.arccos(np.clip(ends[:, :, 2] @ towards, -1.0, 1.0)) - cone
         off_level = np.arcsin(np.clip(np.abs(ends[:, 2, 0]), 0.0, 1.0)) - roll
         excess = np.maximum(off_target, 0.0) + np.maximum(off_level, 0.0)
@@ -354,9 +366,11 @@ def _rotations(R, turns, times, t0_ns, t1_ns, rate) -> Rotation:
     ``rate`` (to 0.1 %, unless turns would exceed 150 degrees)."""
     if rate == 0.0 or not turns.any():
         return _chained(R, 0.0 * turns)
+    # 2.6 rad, 149 degrees: well below pi, where the way from one rotation to the next becomes ambiguous.
     most = 2.6 / np.linalg.norm(turns, axis=1).max()
     middle = (np.arange(_SAMPLES * len(times)) + 0.5) / (_SAMPLES * len(times)) * ((t1_ns - t0_ns) * 1e-9)
     factor = min(0.9, most)  # a spline turns more than its key frames
+    # A fixed-point iteration: the mean rate is nearly proportional to the factor.
     for _ in range(5):
         rotations = _chained(R, factor * turns)
         mean = float(np.linalg.norm(RotationSpline(_seconds(times), rotations)(middle, 1), axis=1).mean())

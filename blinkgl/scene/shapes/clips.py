@@ -36,6 +36,7 @@ class Track:
         times = self.times
         cubic = self.interpolation == "CUBICSPLINE"
         values = self.values[:, 1] if cubic else self.values
+        # i: the last key that is not later than the time; -1 before the first one.
         i = int(np.searchsorted(times, time, side="right")) - 1
         if i < 0 or i >= len(times) - 1 or self.interpolation == "STEP":
             held = values[min(max(i, 0), len(times) - 1)]
@@ -142,6 +143,7 @@ def _evaluate(time, speed, joint, path, kind, first, times, values, out):
     value, rate = np.zeros(4), np.zeros(4)
     for track in range(len(joint)):
         begin, end = first[track], first[track + 1]
+        # path 1 is a rotation, of four numbers; kind 1 is STEP and 2 is CUBICSPLINE.
         n = 4 if path[track] == 1 else 3
         i, high = begin - 1, end  # the last key that is not later
         while high - i > 1:

@@ -45,6 +45,7 @@ class Beat:
 
     def half_change(self, t_ns: int, there_ns: int) -> float:
         """Return (phi(t') - phi(t)) / 2 minus whole turns."""
+        # Half of the phase repeats after two periods; fmod keeps the sign of the difference in time.
         return math.pi * math.fmod(int(there_ns) - int(t_ns), 2 * self.period_ns) / self.period_ns
 
     def sine_change(self, t_ns: int, there_ns: int) -> float:
@@ -102,6 +103,7 @@ class Waves(Deformer):
 
     def _terms(self, mesh: Mesh, t_ns: int):
         """Return (amplitude, wave vector, angles (V,), rate) of both waves."""
+        # The waves travel along k: phi(t) is subtracted, so the angle's rate is negative.
         for amplitude, (k, phase), beat in zip(self.amplitudes, self.waves, self.beats):
             yield amplitude, k, _dot(mesh.vertices, k) + phase - beat.at(t_ns), -beat.rate
 
@@ -125,6 +127,8 @@ class Waves(Deformer):
         return n * (1 + slope @ self.direction)[:, None] - slope * (n @ self.direction)[:, None]
 
     def _rows(self, last: tuple[float, float, float, float], t_ns: int | None = None) -> np.ndarray:
+        # The shader's five rows: direction; envelope; k and phase of either wave; amplitudes, or their
+        # rates or changes.
         out = np.zeros((5, 4))
         if t_ns is not None:
             out[0, :3], out[1] = self.direction, [*self.envelope[0], self.envelope[1]]
@@ -141,6 +145,7 @@ class Waves(Deformer):
         return self._rows((first, second, 0.0, 0.0))
 
     def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
+        # A sin(x + 2 h) - A sin x = 2 A sin h cos(x + h): the rows hold the half changes h and the factors 2 A sin h.
         a, b = (-beat.half_change(t_ns, there_ns) for beat in self.beats)
         first, second = (2 * A * math.sin(half) for A, half in zip(self.amplitudes, (a, b)))
         return self._rows((a, b, first, second))
@@ -156,10 +161,12 @@ class Wave(Waves):
         along, middle = _AXES[config.along], (low + high) / 2
         length = _length(low, high, along)
         k = 2 * math.pi / (config.wavelength * length) * along
+        # The phase is negative because Waves subtracts phi(t).
         beat, none = Beat(config.period, -math.radians(config.phase)), (np.zeros(3), 0.0)
         return cls(
             _AXES[config.towards],
             (np.zeros(3), 1.0),
+            # The wave's own phase is 0 in the middle of the mesh.
             ((k, -float(k @ middle)), none),
             (config.amplitude * length, 0.0),
             (beat, beat),
@@ -178,6 +185,7 @@ class Flag(Waves):
         length = _length(low, high, along)
         pole = low
         if config.held == "high":
+            # The envelope then grows from the high end downwards. The right-hand side still has the old direction.
             along, pole = -along, np.where(along > 0, high, low)
         # The second wave is oblique and twice as fast; otherwise the cloth would look like corrugated iron.
         k = 2 * math.pi / (config.wavelength * length)
@@ -186,6 +194,7 @@ class Flag(Waves):
         amplitude = config.amplitude * length
         return cls(
             towards,
+            # 0 at the pole and 1 at the free end.
             (along / length, -float(along @ pole) / length),
             ((first, -float(first @ pole)), (second, -float(second @ pole))),
             (amplitude, 0.3 * amplitude),
@@ -210,6 +219,7 @@ class Turn(Deformer):
 
     def transformed(self, matrix: np.ndarray) -> Turn:
         scale, turn = _similarity(self, matrix)
+        # For p' = k R p + t the share s . p + s0 has the vector R s / k and the constant s0 - (R s / k) . t.
         vector = turn @ self.share[0] / scale
         share = vector, self.share[1] - float(vector @ matrix[:3, 3])
         return type(self)(turn @ self.axis, matrix[:3, :3] @ self.pivot + matrix[:3, 3], share, self.angle, self.beat)
@@ -218,6 +228,7 @@ class Turn(Deformer):
         return _dot(mesh.vertices, self.share[0]) + self.share[1]
 
     def _turned(self, vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:
+        # Rodrigues' formula, with an angle of its own for each vector.
         c, s, b = np.cos(angles)[:, None], np.sin(angles)[:, None], self.axis
         return vectors * c + np.cross(b, vectors) * s + np.outer(vectors @ b, b) * (1 - c)
 
@@ -245,6 +256,7 @@ class Turn(Deformer):
         return n * (1 + (shear * along).sum(axis=1))[:, None] - along * (shear * n).sum(axis=1)[:, None]
 
     def numbers(self, t_ns: int) -> np.ndarray:
+        # The shader's four rows: axis, pivot, share, and the angle, its rate or its change.
         out = np.zeros((4, 4))
         out[0, :3], out[1, :3], out[2] = self.axis, self.pivot, [*self.share[0], self.share[1]]
         out[3, 0] = self._angle(t_ns)
@@ -284,6 +296,7 @@ class Bend(Turn):
     def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Bend:
         along, towards, middle = _AXES[config.along], _AXES[config.towards], (low + high) / 2
         length = _length(low, high, along)
+        # at: the held plane's coordinate along the axis; reach: from there to the farther end, where u is 1 or -1.
         at = float(along @ low) + config.held * length
         reach = length * max(config.held, 1 - config.held)
         pivot = middle + along * (at - float(along @ middle))
@@ -318,6 +331,7 @@ class Breathe(Deformer):
 
     def transformed(self, matrix: np.ndarray) -> Breathe:
         _, turn = _similarity(self, matrix)
+        # The amounts belong to the coordinate axes, so the mesh may be scaled evenly and shifted only.
         if not np.allclose(turn, np.eye(3), atol=1e-12):
             raise TypeError("Breathe cannot be turned")
         return type(self)(matrix[:3, :3] @ self.centre + matrix[:3, 3], self.amount, self.beat)
@@ -339,6 +353,7 @@ class Breathe(Deformer):
         return np.asarray(mesh.normals, np.float64) / self._factor(t_ns)
 
     def _rows(self, centre: np.ndarray, values: np.ndarray) -> np.ndarray:
+        # The shader's two rows: centre, and one value for each axis.
         out = np.zeros((2, 4))
         out[0, :3], out[1, :3] = centre, values
         return out

@@ -46,6 +46,7 @@ class Cycle:
         # Each wave of a real signal occurs twice in its spectrum, except the constant.
         spectrum[1:] *= 2
         self._cosines = np.ascontiguousarray(spectrum.real)
+        # The transform has exp(-i k phi), so the sine's amplitude is minus the imaginary part.
         self._sines = np.ascontiguousarray(-spectrum.imag)
         self._offsets = np.ascontiguousarray(offsets, np.float64)
 
@@ -80,6 +81,8 @@ def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
     for i in range(1, rows):
         q[:], d[:] = 0.0, 0.0
         q[3] = 1.0
+        # Quaternions x y z w. Each further axis belongs to the rotated body, so its rotation is multiplied
+        # from the right.
         for axis in range(3):
             half, half_rate = 0.5 * value[i, axis], 0.5 * change[i, axis]
             turn[:], turning[:] = 0.0, 0.0

@@ -25,10 +25,12 @@ JOINTS = (
     "thigh_l", "shank_l", "foot_l", "toes_l", "thigh_r", "shank_r", "foot_r", "toes_r",
 )  # fmt: skip
 J = {name: number for number, name in enumerate(JOINTS)}
+# The index of each joint's parent in JOINTS; a parent comes before its children.
 PARENTS = (-1, 0, 1, 2, 3, 2, 5, 6, 7, 2, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)
 STEPS = 256
 """Number of phases at which a round is computed."""
 _GRAVITY = 9.81
+# The side's name, the sign of its y, and its delay in rounds: the right leg steps half a round after the left.
 _SIDES = (("l", 1.0, 0.0), ("r", -1.0, 0.5))
 
 
@@ -46,6 +48,7 @@ class Proportions:
     @cached_property
     def unit(self) -> float:
         """Return the factor on the lengths of an average body of 1.75 m."""
+        # Lengths of an average body in m; together they are 1.75.
         trunk, leg, head = 0.045 + 0.10 + 0.16 + 0.24, 0.075 + 0.41 + 0.43, 0.08 + 0.21
         return self.height / (trunk + leg * self.legs + head * self.head)
 
@@ -115,8 +118,10 @@ class _Pose:
         same amount at all phases until the legs reach. feet : by side ((N, 3) ankle, (N,) pitch, (N,) yaw, (N,)
         toes)."""
         body = self.body
+        # Joint 0 is the pelvis, whose rotation moves the hips.
         limit, turned = reach * (body.thigh + body.shank), Rotation.from_euler("XYZ", self.angles[:, 0])
         hips = {side: turned.apply(body.offsets[J[f"thigh_{side}"]]) for side in feet}
+        # room: the greatest height of a hip from which a leg of length ``limit`` still reaches its ankle.
         room = [
             foot[0][:, 2] + np.sqrt(np.maximum(limit**2 - ((foot[0] - self.pelvis - hips[side])[:, :2] ** 2).sum(1), 0))
             for side, foot in feet.items()
@@ -125,13 +130,16 @@ class _Pose:
         # Lowered by the same amount at all phases: lowering it for one foot would make the body bob.
         self.pelvis[:, 2] += min(least, 0.0)
         for side, (ankle, pitch, yaw, toes) in feet.items():
+            # d: from hip to ankle in the pelvis's axes.
             d = turned.inv().apply(ankle - self.pelvis - hips[side])
             length = np.minimum(np.linalg.norm(d, axis=1), 0.9995 * (body.thigh + body.shank))
             # The law of cosines, for the outer angle of the knee: 0 is a straight leg.
             bent = (length**2 - body.thigh**2 - body.shank**2) / (2 * body.thigh * body.shank)
             knee = np.arccos(np.clip(bent, -0.9, 1))
+            # lag: the angle between the thigh and the line from hip to ankle.
             lag = np.arctan2(body.shank * np.sin(knee), body.thigh + body.shank * np.cos(knee))
             angles = self.angles[:, J[f"thigh_{side}"]]
+            # The angle about x puts the leg's plane through the ankle; the one about y turns the leg in that plane.
             angles[:, 0] = np.arctan2(d[:, 1], -d[:, 2])
             angles[:, 1] = np.arcsin(np.clip(-d[:, 0] / np.linalg.norm(d, axis=1), -1, 1)) - lag
             self.angles[:, J[f"shank_{side}"], 1] = knee
@@ -148,6 +156,7 @@ class _Pose:
 def _smooth(s: np.ndarray) -> np.ndarray:
     """Return a step from 0 to 1 with two zero derivatives at both ends."""
     s = np.clip(s, 0, 1)
+    # The polynomial of degree 5 that is 0 and 1 at the ends, where two derivatives are 0.
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
@@ -165,6 +174,8 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
 
     def at(s):
         """Return ((K, 2) ankle, (K,) pitch) on the ground, at s of ``duty``, 0 to 1."""
+        # The foot lands with its toes up by ``strike``, is flat after a fifth, and rises on its ball in
+        # the second half.
         down, up = -strike * (1 - _smooth(s / 0.2)), push * _smooth((s - 0.5) / 0.5)
         pitch = down + up
         ball, heel = (
@@ -173,6 +184,7 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
         )
         # It rolls over the heel while its toes are up, and then over the ball.
         fixed = np.where((pitch < 0)[:, None], foot[1] - heel, foot[0] - ball)
+        # 43 % of the way on the ground lies ahead of the body's origin.
         x = stride * duty * (0.43 - s) + fixed[:, 0]
         return np.stack([x, body.ankle + fixed[:, 1]], -1), pitch
 
@@ -185,6 +197,7 @@ def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, l
         back = -stride * (1 - duty)
         swing = np.stack([_between(s, last[0], first[0], back), _between(s, last[1], first[1])], -1)
         early = np.clip(s, 0, 1) ** 0.75  # before the toes, which point down, come forward
+        # 64 u^3 (1 - u)^3 is 1 in the middle, and two of its derivatives are 0 at the ends.
         swing[:, 1] += lift * 64 * (early * (1 - early)) ** 3
         turned = _between(s, left, came)
         ankle, pitch = np.where(ground[:, None], ankle, swing), np.where(ground, pitch, turned)
@@ -214,6 +227,7 @@ def _round(body: Proportions, tempo: float, longest: float, stride: float, froud
 
 def _walk(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     pose, u = _Pose(body), body.unit
+    # The seed's second number is that of the motion, so motions of the same variant differ.
     rng = np.random.default_rng([variant, 1])
     sway, swing, lean = rng.uniform(0.8, 1.25, 3) if variant else np.ones(3)
     stride, period = _round(body, tempo, 1.2, 1.36, 0.43)
@@ -232,6 +246,7 @@ def _walk(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
         pose.turn(f"forearm_{side}", 0, -20 * swing + 13 * swing * back, 0)
         pose.turn(f"hand_{side}", 0, -6 + 4 * back)
     pose.plant(_feet(pose, stride, 0.61, math.radians(18), math.radians(50), 0.045 * u, 0.05 * u), 0.996)
+    # Cycle rounds its period to whole ns, and the speed fits the rounded one.
     return pose.cycle(period, phase, stride / (round(period * 1e9) * 1e-9))
 
 
@@ -397,6 +412,7 @@ def _tap(pose: _Pose, feet: dict, pitch: float, per_round: int) -> None:
         ankle, _, yaw, _ = feet[name]
         turned = math.radians(pitch) * (0.5 + 0.5 * pose.wave(per_round, late / per_round)) ** 2
         ball = np.array([body.ball, body.ball_height - body.ankle])
+        # The ball stays where it is: the ankle moves by as much as the rotation would move the ball.
         x = ball[0] - (np.cos(turned) * ball[0] + np.sin(turned) * ball[1])
         ankle[:, :2] += x[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], 1)
         ankle[:, 2] += ball[1] - (np.cos(turned) * ball[1] - np.sin(turned) * ball[0])

@@ -109,6 +109,7 @@ class Skeleton:
 @kernel(error_model="numpy")
 def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
     """Compute transforms of all joints, parents first, and their rates by the product rule."""
+    # L and D: a joint's own transform and its rate; F and G: the same with the fixed transform before them.
     L, D, F, G = np.zeros((4, 4)), np.zeros((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     L[3, 3] = 1.0
     for i in range(len(parents)):
@@ -119,6 +120,7 @@ def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
         D[0, 0] = -4 * (y * dy + z * dz)
         D[1, 1] = -4 * (x * dx + z * dz)
         D[2, 2] = -4 * (x * dx + y * dy)
+        # a and b are the rates of xy and zw, of whose sum and difference the two entries are made; likewise below.
         a, b = dx * y + x * dy, dz * w + z * dw
         D[0, 1], D[1, 0] = 2 * (a - b), 2 * (a + b)
         a, b = dx * z + x * dz, dy * w + y * dw
@@ -127,6 +129,7 @@ def _world(parents, fixed, T, R, S, dT, dR, dS, world, rate):
         D[1, 2], D[2, 1] = 2 * (a - b), 2 * (a + b)
         for r in range(3):
             for c in range(3):
+                # The product rule on rotation times scale, before L itself is scaled.
                 D[r, c] = D[r, c] * S[i, c] + L[r, c] * dS[i, c]
                 L[r, c] *= S[i, c]
             L[r, 3], D[r, 3] = T[i, r], dT[i, r]

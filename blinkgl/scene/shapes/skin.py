@@ -51,6 +51,7 @@ class Morphs:
         """Return the targets of the mesh under a (3, 3) map; exact for rotations and uniform scales, which keep unit
         normals."""
         scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
+        # Directions of normals transform by the inverse transpose, which the scale brings back to their length.
         normals = None if self.normals is None else self.normals @ np.linalg.inv(linear) * scale
         return replace(self, positions=self.positions @ linear.T, normals=normals)
 
@@ -113,6 +114,7 @@ class Skin(Deformer):
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
         self.locomotion = getattr(skeleton.motion, "locomotion", "free")
+        # The body moves along its x axis, whose scale is the length of the first column.
         self.speed = getattr(skeleton.motion, "speed", 0.0) * float(np.linalg.norm(self.after[:3, 0]))
         self.mirrors = getattr(skeleton.motion, "mirrors", False) or self.side(0) != 1
         self.sizes = {"SKIN_WEIGHTS": self.weights.shape[1]}
@@ -209,6 +211,7 @@ class Skin(Deformer):
         return self._follow(points, dJ) + self._follow(rates, J, 0.0)
 
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        # a, b, c: the first, second and third rows of the vertices' matrices.
         a, b, c = np.moveaxis(self._blend(self.matrices(t_ns)[0])[:, :, :3], 1, 0)
         n = np.asarray(mesh.normals, np.float64)
         if self.morphs is not None:
@@ -274,12 +277,14 @@ def joined(skins: Sequence[Skin]) -> Skin | None:
         if key not in sets:
             sets[key] = count, s
             count += len(s.bones)
+        # Columns that a skin with fewer joints per vertex lacks are filled with weights of 0.
         room = ((0, 0), (0, width - s.weights.shape[1]))
         joints.append(np.pad(s.joints, room) + sets[key][0])
         weights.append(np.pad(s.weights, room))
     if 3 * count > MAX_ROWS:
         return None
     kinds = [s for _, s in sets.values()]
+    # ``before`` differs from skin to skin, so it becomes part of the inverse bind matrices.
     bind = np.concatenate([s.inverse_bind @ s.before for s in kinds])
     bones = np.concatenate([s.bones for s in kinds])
     return Skin(
@@ -364,5 +369,6 @@ def _deltas_texture(morphs: Morphs) -> np.ndarray:
     if morphs.normals is not None:
         texels[:, :, 1, :3] = morphs.normals
     flat = texels.reshape(-1, 4)
+    # The quotient, rounded up.
     height = -(-len(flat) // _TEXTURE_WIDTH)
     return np.pad(flat, ((0, height * _TEXTURE_WIDTH - len(flat)), (0, 0))).reshape(height, _TEXTURE_WIDTH, 4)

@@ -64,11 +64,13 @@ class Sweep:
             inside += _reach(points, halves, order, reach) / len(self.times)
         # Slightly enlarged, so that flat shapes, and those that an animation shrinks to a point, have an inside.
         reach += 1e-6 * (float(np.linalg.norm(self.high - self.low)) or 1.0)
+        # scipy's form of the half-spaces n . x - reach <= 0: normals and offsets in one row.
         corners = HalfspaceIntersection(np.column_stack([directions, -reach]), inside).intersections
         hull = ConvexHull(corners)
         vertices = corners[hull.vertices]
         faces = np.searchsorted(hull.vertices, hull.simplices)  # they are sorted in three dimensions
         a, b, c = (vertices[faces[:, k]] for k in range(3))
+        # Qhull's equations have outward normals, but the order of a face's corners is arbitrary.
         inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
         faces[inwards] = faces[inwards, ::-1]
         return vertices, faces.astype(np.int32)
@@ -140,6 +142,7 @@ def sweep(mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
     deformer = mesh.deformer
     assert deformer is not None
     if deformer.period_ns is not None and t1_ns - t0_ns >= deformer.period_ns:
+        # A whole period fills the same region wherever it begins, so all longer spans share one entry.
         t0_ns, t1_ns = 0, deformer.period_ns
     kept = _sweeps.setdefault(mesh, {})
     if (t0_ns, t1_ns) not in kept:

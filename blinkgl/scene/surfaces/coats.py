@@ -94,10 +94,12 @@ def clothes(seed: int) -> np.ndarray:
 def _face(image, x, y, skin, hair, rng) -> None:
     """Draw hair, eyes, brows and a mouth on the chart of the head."""
     head = CHARTS["head"]
+    # u runs around the head and is 0 in the middle of the face; v runs from the crown, 0, downwards.
     u, v = (x - head.left) / head.around - 0.5, (y - head.top) / head.length
     on = (np.abs(u) < 0.55) & (v > -0.07) & (v < 1.07)
     long = rng.uniform(0.42, 0.80)
     front = 0.26 + 0.03 * np.cos(12 * np.pi * u)
+    # The hair reaches down to ``front`` over the face, to 0.45 at the temples and to ``long`` elsewhere.
     image[on & (v < np.where(np.abs(u) < 0.16, front, np.where(np.abs(u) < 0.2, 0.45, long)))] = hair
     iris = _colour(rng, (0.3, 0.8), (0.2, 0.6))
     for side in (-1, 1):
@@ -153,12 +155,15 @@ def scales(seed: int) -> np.ndarray:
         else np.sin(30 * v + 3 * np.sin(9 * low)) * np.sin(22 * low + 2 * np.cos(17 * v)) > 0.3
     )  # fmt: skip
     image[bands & (v > 0.22) & (v < 0.9)] = band
+    # Scales lie in rows; every second row is shifted by half a scale.
     row = np.floor(v * 60)
     scale = np.hypot((u * 44 + 0.5 * row) % 1 - 0.5, v * 60 % 1 - 0.2)
     image *= (1 - 0.16 * np.clip(scale - 0.35, 0, 1) * ((v > 0.22) & (v < 0.85)))[..., None]
+    # The eyes, a light disc with a dark one in it.
     for side in (0.19, 0.81):
         r = np.hypot((u - side) * 1.2, (v - 0.105) * 1.0)
         image[r < 0.036], image[r < 0.020] = 245, 15
+    # A dark line: the edge of the gill cover.
     gill = (np.abs(v - 0.215 - 0.04 * np.sin(2 * np.pi * low * 0.5)) < 0.006) & (low > 0.15) & (low < 0.85)
     image[gill] *= 0.55
     return np.clip(image, 0, 255).astype(np.uint8)

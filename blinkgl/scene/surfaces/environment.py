@@ -73,6 +73,7 @@ def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
     small = (min(image.shape[1], PICTURE_WIDTH), min(image.shape[0], PICTURE_WIDTH // 2))
     picture = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32)
     quadric = quadric_of_harmonics(harmonics(image, directions, solid))
+    # The mean over all normals of n^T A n is a third of the trace of A, and that of the linear terms is 0.
     mean = np.trace(quadric, axis1=1, axis2=2) - (2 / 3) * np.trace(quadric[:, :3, :3], axis1=1, axis2=2)
     mean = mean + sum((sun.strength / 4 for sun in found), np.zeros(3))  # the mean of a sun over all normals is 1/4
     finer, size = quartic(picture, *pixel_directions(*picture.shape[:2]))
@@ -85,8 +86,10 @@ def turned(given: Environment, angle: float) -> Environment:
     T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     suns = tuple(sun._replace(towards=T[:3, :3] @ sun.towards) for sun in given.suns)
     columns = angle * given.picture.shape[1] / (2 * np.pi)  # azimuth decreases to the right
+    # A rotation by a part of a column is linear between two whole shifts.
     whole, part = math.floor(columns), np.float32(columns - math.floor(columns))
     a, b = (np.roll(given.picture, -k, axis=1) for k in (whole, whole + 1))
+    # The quartic is a quadratic form of the nine products n n^T, which K rotates.
     K = np.kron(T[:3, :3], T[:3, :3])
     finer = None if given.quartic is None else K @ given.quartic @ K.T
     return Environment(T @ given.quadric @ T.T, suns, a * (1 - part) + b * part, finer)
@@ -97,6 +100,7 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     sr."""
     edges = np.pi / 2 - np.arange(height + 1) * (np.pi / height)
     latitude = 0.5 * (edges[1:] + edges[:-1])
+    # The azimuth falls from pi at the left edge to -pi at the right one; +x is in the middle.
     azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
     flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(width)], axis=1)
     directions = np.cos(latitude)[:, None, None] * flat
@@ -107,6 +111,7 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 def harmonics(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> np.ndarray:
     """Return the coefficients of the radiance, (9, 3): 1; y, z, x; xy, yz, 3 z² - 1, xz, x² - y²."""
     x, y, z = np.moveaxis(directions, -1, 0)
+    # Norms of the real spherical harmonics: sqrt(1/pi)/2, sqrt(3/pi)/2, sqrt(15/pi)/2, sqrt(5/pi)/4, sqrt(15/pi)/4.
     c = 0.282094792, 0.488602512, 1.092548431, 0.315391565, 0.546274215
     basis = (
         np.full_like(x, c[0]), c[1] * y, c[1] * z, c[1] * x,
@@ -119,6 +124,7 @@ def harmonics(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> n
 def quadric_of_harmonics(L: np.ndarray) -> np.ndarray:
     """Return (3, 4, 4) of (9, 3) coefficients: the radiance of a white surface with unit normal n is (n, 1) Q (n,
     1)."""
+    # The constants c1 to c5 of Ramamoorthi and Hanrahan give irradiance; the radiance of a white surface is that / pi.
     c1, c2, c3, c4, c5 = 0.429042738, 0.511663354, 0.743123868, 0.886226925, 0.247707956
     one, y, z, x, xy, yz, zz, xz, xxyy = L
     rows = [
@@ -153,6 +159,7 @@ def quartic(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tup
 def _without_sun(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tuple[Sun | None, np.ndarray]:
     """Return the sun, and the image with the surrounding sky in its place. None where nothing is small and bright
     enough."""
+    # A coloured lamp counts by its brightest channel.
     grey = image.max(axis=2)
     mean = float((grey * solid[:, None]).sum() / (solid.sum() * image.shape[1]))
     peak = np.unravel_index(int(grey.argmax()), grey.shape)
@@ -166,6 +173,7 @@ def _without_sun(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -
     angle = np.arccos(np.clip(directions @ (centre / np.linalg.norm(centre)), -1.0, 1.0))
     if angle[disc].max() > _LARGEST:
         return None, image
+    # Twice the radius of the disc, at least three pixels, and at most the largest radius of a sun.
     glare = (angle < max(2.0 * angle[disc].max(), 2 * np.pi / image.shape[1] * 3)) & (angle < _LARGEST)
     ring = (angle < 1.5 * angle[glare].max()) & ~glare
     around = np.median(image[ring], axis=0) if ring.any() else np.zeros(3, np.float32)
@@ -173,10 +181,12 @@ def _without_sun(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -
     excess = np.maximum(image[glare] - around, 0.0).astype(np.float64) * weight[:, None]
     towards = (excess.sum(axis=1)[:, None] * directions[glare]).sum(axis=0)
     towards /= np.linalg.norm(towards)
+    # The irradiance of a surface that faces the sun, divided by pi: the radiance of a white one.
     strength = excess.sum(axis=0) / np.pi
     rest = image.copy()
     rest[glare] = np.minimum(image[glare], around)
     if strength.max() < _SHARE * mean:
         return None, image
     area = float(np.broadcast_to(solid[:, None], grey.shape)[disc].sum())
+    # The diameter of a flat disc of the same solid angle.
     return Sun(towards, strength, 2.0 * math.sqrt(area / np.pi)), rest

@@ -66,6 +66,7 @@ _LOOKS = """
 
 def lobe(nl: np.ndarray, nv: np.ndarray, nh: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Return pi times the lobe without its Fresnel term, D V. Cosines at the normal: of light, eye, half vector."""
+    # glTF's alpha is the square of the roughness, and a2 is the square of alpha.
     a2 = np.maximum(roughness, SMOOTHEST) ** 4
     distribution = a2 / (nh**2 * (a2 - 1) + 1) ** 2
     return distribution * 0.5 / (nl * np.sqrt(nv**2 * (1 - a2) + a2) + nv * np.sqrt(nl**2 * (1 - a2) + a2))
@@ -94,6 +95,7 @@ def visible(
     length = np.sqrt(hx**2 + hy**2 + hz**2)
     hx, hy, hz = hx / length, hy / length, hz / length
     vh = sv[:, None] * hx + nv[:, None] * hz
+    # The half vector mirrors the eye to the light, l = 2 (v . h) h - v; nl is its z component.
     nl = 2 * vh * hz - nv[:, None]
     a2 = alpha**2
     of_eye, of_light = np.sqrt(nv[:, None] ** 2 * (1 - a2) + a2), np.sqrt(np.maximum(nl, 0) ** 2 * (1 - a2) + a2)
@@ -128,6 +130,7 @@ def mean_energy() -> np.ndarray:
 def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Return F_ms of (N, C) reflectances at (N,) roughnesses (Turquin 2019, "Practical Multiple Scattering Compensation
     for Microfacet Models"): with F the mean of Schlick's term and E that of the energy, F E / (1 - F (1 - E))."""
+    # The mean of Schlick's term: the integral of 2 c (1 - c)^5 over the cosine c is 1/21.
     F = F0 + (1.0 - F0) / 21.0
     at = np.clip(roughness, 0, 1) * (_ROUGHNESSES - 1)
     E = np.interp(at, np.arange(_ROUGHNESSES), mean_energy())[:, None]
@@ -141,6 +144,7 @@ def looks() -> np.ndarray:
     which the surroundings are blurred, and cut off at the horizon: two looks approximate it
     (``tests/scene/surfaces/lobes.py``)."""
     table = np.array(_LOOKS.split(), np.float64).reshape(LEVELS, COSINES, 5) * 1e-3
+    # From the 15 x 8 fitted places to the 32 x 64 of the table.
     x = np.linspace(0, COSINES - 1, _ANGLES)
     rows = [_bilinear(table, x, np.full(_ANGLES, y)) for y in np.linspace(0, LEVELS - 1, _ROUGHNESSES)]
     return np.stack(rows)
@@ -210,6 +214,7 @@ def blurred(picture: np.ndarray) -> np.ndarray:
             continue
         few = _blurred(half, roughness)
         few = np.concatenate([few[:, -1:], few, few[:, :1]], axis=1).astype(np.float32)  # across the seam
+        # Each added column is two pixels wide after the enlargement and is cut off.
         out[k] = cv2.resize(few, (2 * few.shape[1], height), interpolation=cv2.INTER_LINEAR)[:, 2 : 2 + width]
     return out
 
@@ -219,6 +224,7 @@ def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
     so along a row this is a convolution."""
     height, width = picture.shape[:2]
     directions, solid = pixel_directions(height, width)
+    # z and across: sine and cosine of the latitude of each row.
     z = directions[:, 0, 2]
     across = np.sqrt(1 - z**2)
     turn = np.cos(np.arange(width) * (2 * np.pi / width))
@@ -227,6 +233,7 @@ def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
     a2 = max(roughness, SMOOTHEST) ** 4
     # the lobe for v = n, where (n.h)^2 = (1 + n.l) / 2, times the cosine, except for a common factor
     lobe = nl / ((0.5 + 0.5 * nl) * (a2 - 1) + 1) ** 2 / (nl + np.sqrt(nl**2 * (1 - a2) + a2))
+    # A convolution along the rows, by Fourier transform; frequency 0 of the weights is their sum, which normalises.
     waves = np.fft.rfft(lobe * solid[:, None], axis=2)
     sums = np.einsum("ijf,jfc->ifc", waves, np.fft.rfft(picture.astype(np.float64), axis=1), optimize=True)
     return np.fft.irfft(sums, n=width, axis=1) / waves[..., 0].real.sum(axis=1)[:, None, None]
@@ -235,6 +242,7 @@ def _blurred(picture: np.ndarray, roughness: float) -> np.ndarray:
 def mirrored(levels: np.ndarray, directions: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Return :func:`blurred` in (N, 3) unit directions at (N,) roughnesses, linear in between, (N, 3) float64."""
     height, width = levels.shape[1:3]
+    # The inverse of pixel_directions.
     x = (0.5 - np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi)) * width - 0.5
     y = (0.5 - np.arcsin(np.clip(directions[:, 2], -1, 1)) / np.pi) * height - 0.5
     at = np.clip(roughness, 0, 1) * (len(levels) - 1)

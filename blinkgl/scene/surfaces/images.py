@@ -24,6 +24,7 @@ from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, LUMA, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr", ".exr")
+# The first bytes of an OpenEXR file; those of a Radiance file are "#?".
 _EXR = b"v/1\x01"
 MAX_SIDE = 16_384  # the configuration's limit of max_size, and OpenGL implementations'
 MAX_PIXELS = MAX_SIDE**2
@@ -222,6 +223,7 @@ def _radiance(data: bytes, where: str) -> np.ndarray:
     if data[:4] == _EXR:
         from blinkgl.io.video import decode_exr
 
+        # The attribute's name, its type, its length of 16 bytes, and four 32-bit numbers.
         window = re.search(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", data[:8192], re.DOTALL)
         if window is None:
             raise AssetError("the image is corrupt (no size in the OpenEXR header)", where=where)
@@ -240,6 +242,7 @@ def _radiance(data: bytes, where: str) -> np.ndarray:
                 accepted="finite numbers",
             )
         return np.ascontiguousarray(image, np.float32)
+    # The line of the resolution, such as "-Y 512 +X 1024": rows first.
     size = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
     if size is None:
         raise AssetError("the image is corrupt (no size in the Radiance header)", where=where)
@@ -283,6 +286,7 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
         linear = cv2.resize(linear, (new_width, len(linear)), interpolation=cv2.INTER_AREA)
         edges = np.arange(rows.start, rows.stop + 1)[:, None] * (height / new_height)
         pixel = np.arange(source.start, source.stop)[None]
+        # overlap: how much of each row of the source lies in each row of the result.
         overlap = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
         share = np.clip(overlap, 0, None) * (new_height / height)
         average = np.tensordot(share.astype(np.float32), linear, axes=1)
@@ -306,6 +310,7 @@ def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.
         ray = np.asarray(forward, float) + right[..., None] * to_right + down[..., None] * to_down
         longitude = -np.arctan2(ray[..., 1], ray[..., 0])
         latitude = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
+        # The last 2 is for the columns added on the left.
         x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + 2
         y = (0.5 - latitude / np.pi) * height - 0.5
         faces.append(

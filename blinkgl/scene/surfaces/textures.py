@@ -36,6 +36,7 @@ def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
 def _palette(rng: np.random.Generator) -> np.ndarray:
     """Return (2..5, 3) sRGB colours in 0..255 with at least MIN_CONTRAST between darkest and brightest."""
     colours = rng.uniform(DARKEST, BRIGHTEST, (int(rng.integers(2, 6)), 3))
+    # Luma weights of Rec. 601.
     luma = colours @ [0.299, 0.587, 0.114]
     lack = MIN_CONTRAST - (luma.max() - luma.min())
     if lack > 0:
@@ -89,6 +90,7 @@ def _perlin_noise(rng, size: int, cells: int) -> np.ndarray:
     i, j, f = _lattice(size, cells)
     w = _smooth(f)
     total = 0.0
+    # The four corners of each pixel's cell: those before and after it, in y and in x.
     for rows, dy, wy in ((i, f, 1 - w), (j, f - 1, w)):
         across, along = gx[rows], gy[rows] * dy[:, None]
         for columns, dx, wx in ((i, f, 1 - w), (j, f - 1, w)):
@@ -110,6 +112,7 @@ def _perlin(rng, size):
 
 def _fbm(rng, size):
     cells, gain = int(rng.integers(2, 7)), rng.uniform(0.45, 0.75)
+    # Each octave has twice the frequency of the one before and ``gain`` of its amplitude.
     octaves = [gain**k * _perlin_noise(rng, size, cells * 2**k) for k in range(6)]
     return _stretch(sum(octaves[1:], octaves[0]))
 
@@ -117,6 +120,7 @@ def _fbm(rng, size):
 def _stripes(rng, size):
     x, y = _coordinates(size)
     a, b = int(rng.integers(0, 12)), int(rng.integers(0, 12))
+    # Without this, a and b may both be 0, which gives no stripes.
     a = a or (b == 0) * 5
     phase = (a * x + b * y) + rng.uniform(0, 0.3) * _perlin_noise(rng, size, 4)
     if rng.random() < 0.5:
@@ -127,6 +131,7 @@ def _stripes(rng, size):
 
 def _checks(rng, size):
     x, y = _coordinates(size)
+    # Even numbers, so that two colours alternate across the seam as well.
     n, m = 2 * int(rng.integers(1, 10)), 2 * int(rng.integers(1, 10))
     if rng.random() < 0.5:
         return (np.floor(n * x) + np.floor(m * y)).astype(np.int64)
@@ -136,6 +141,7 @@ def _checks(rng, size):
 
 def _glyphs(rng, size):
     """Return lines of words in an invented alphabet of 5x7 strokes."""
+    # Strokes lie on the columns 0, 2, 4 and the rows 0, 3, 6 of a letter.
     alphabet = np.zeros((24, 7, 5), bool)
     for letter in alphabet:
         for _ in range(int(rng.integers(2, 5))):
@@ -146,10 +152,12 @@ def _glyphs(rng, size):
                 c, r0 = 2 * int(rng.integers(0, 3)), 3 * int(rng.integers(0, 2))
                 letter[r0 : r0 + int(rng.integers(4, 8)), c] = True
     columns, rows = int(rng.integers(6, 22)), int(rng.integers(4, 16))
+    # A letter of 7 x 5 texels has a cell of 10 x 6, which leaves space between lines and letters.
     page = np.zeros((rows * 10, columns * 6), np.int64)
     for row in range(rows):
         ink = 1 + int(rng.integers(0, 4))
         for column in range(columns):
+            # 18 % of the places stay empty and separate words.
             if rng.random() > 0.18:
                 page[row * 10 + 2 : row * 10 + 9, column * 6 : column * 6 + 5] = ink * alphabet[rng.integers(0, 24)]
     y = np.minimum((np.arange(size) + 0.5) / size * page.shape[0], page.shape[0] - 1).astype(int)
@@ -186,9 +194,11 @@ def _bricks(rng, size):
     rows, columns = 2 * int(rng.integers(2, 9)), int(rng.integers(2, 9))
     x, y = _coordinates(size)
     row = np.floor(y * rows).astype(int)
+    # Every second row is shifted by half a brick.
     along = x * columns + 0.5 * (row % 2)
     brick = np.floor(along).astype(int) % columns
     tone = 0.35 + 0.6 * rng.random((rows, columns))[row, brick] + 0.25 * _perlin_noise(rng, size, 32)
+    # Distances to the joints are in heights of a brick, so sideways ones are scaled by its proportions.
     joint = rng.uniform(0.04, 0.1)
     mortar = (np.minimum(along % 1, 1 - along % 1) * rows / columns < joint) | (
         np.minimum(y * rows % 1, 1 - y * rows % 1) < joint
@@ -219,6 +229,7 @@ def _pips(rng: np.random.Generator, size: int) -> np.ndarray:
     for face, lattice in enumerate(_PIPS):
         row, column = divmod(face, columns)
         for r, c in (divmod(int(place), 3) for place in lattice):
+            # Pips lie at 0.27, 0.50 and 0.73 of a face's side.
             v, u = at * rows - row - (0.27 + 0.23 * r), at * columns - column - (0.27 + 0.23 * c)
             down, across = (np.flatnonzero(np.abs(d) < 0.1 + soft) for d in (v, u))
             distance = np.hypot(v[down, None], u[None, across])

@@ -210,6 +210,7 @@ def _beyond_a_path(animation: Animation, node: int, t0_ns: int, t1_ns: int) -> b
 def _rigid(animation: Animation, node: int, t_ns: int) -> tuple[Motion, np.ndarray]:
     """Return (a node's motion without the matrix that is baked into its vertices, that matrix, of a time)."""
     baked = split_rigid(animation.motion(node, Z_UP, np.eye(4))(t_ns)[0])[1]
+    # A node with a scale of 0 has no inverse.
     before = np.linalg.inv(baked) if np.linalg.matrix_rank(baked) == 4 else np.eye(4)
     return animation.motion(node, Z_UP, before), baked
 

@@ -33,6 +33,7 @@ _MAX_FILES = 1_000_000
 
 def split_of(source_hash: str, test_fraction: float) -> str:
     """Return 'train' or 'test', from the hash alone. Raising the fraction moves entries only to 'test'."""
+    # 13 hexadecimal digits, 52 bits of the hash, as a fraction of their range.
     return "test" if int(source_hash[:13], 16) < test_fraction * 16**13 else "train"
 
 

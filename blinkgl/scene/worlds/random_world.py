@@ -287,6 +287,7 @@ def _place(
             rotation = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * math.pi)]).as_matrix()
         changed, word = _changing(asset, settings.deform, rng_shape)
         parts = _dress(config, changed, radius, textures, rng_texture, split, log)
+        # Row 2 of a rotation is the world's vertical in the object's axes.
         lowest = min(_lowest(p.mesh, rotation[2]) for p in parts)
         in_view, taken = rng.random() < settings.in_view, len(placed) + 1
         for _ in range(_PLACEMENTS):
@@ -298,6 +299,7 @@ def _place(
             if max(abs(position[0]), abs(position[1])) > region.width / 2:
                 continue
             gap = np.sqrt(((centres[:taken] - position) ** 2).sum(axis=1)) - radii[:taken] - radius
+            # gap[0] is the distance from the camera.
             if gap.min() > _GAP and gap[0] > max(radius, _STAND_OFF):
                 break
         else:
@@ -355,6 +357,7 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     if not in_view:
         half = region.width / 2
         return rng.uniform([-half, -half, floor], [half, half, floor + region.height])
+    # The image begins half a pixel before the first pixel's centre.
     pixel = rng.random(2) * (camera.width, camera.height) - 0.5
     ray = T_cam[:3, :3] @ camera.rays(pixel)
     if resting:

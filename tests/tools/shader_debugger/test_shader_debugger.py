@@ -98,8 +98,8 @@ def both(config):
 
 def test_every_buffer_agrees(both):
     gpu, _, _, reports = both
-    assert set(reports) == set(quantities.QUANTITIES) & set(moments.buffers_of(both[1].scene, gpu.renderer.twinned))
-    assert gpu.renderer.twinned == ("luminance_edges",)  # of the default
+    assert set(reports) == set(quantities.QUANTITIES) & set(moments.buffers_of(both[1].scene, gpu.renderer.filtered))
+    assert gpu.renderer.filtered == ("luminance_edges",)  # of the default
     for name, report in reports.items():
         assert report.passed, (name, report.value)
         assert report.graded.mean() > 0.8, name
@@ -146,7 +146,7 @@ ALL_EDGED = ("--set", "render.image_antialiasing=edges")
 BOTH = ("--pass", "luminance_edges", "--pass", "colour_edges")
 
 
-def test_what_edges_puts_together_is_what_its_twin_does(shader, config, tmp_path):
+def test_what_edges_puts_together_is_what_its_reference_does(shader, config, tmp_path):
     """In luminance and colour, at all pixels, silhouettes first of all."""
     out = tmp_path / "d"
     status, text, _ = shader("diff", config, *ALL_EDGED, *BOTH, "--time", 0.1, "--json", "--out", out)

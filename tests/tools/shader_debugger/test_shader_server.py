@@ -21,7 +21,7 @@ import pytest
 from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 from PIL import Image
 
-from blinkgl.tools.shader_debugger.filters import twinned_of
+from blinkgl.tools.shader_debugger.filters import filtered_names
 from blinkgl.tools.shader_debugger.moments import buffers_of
 from blinkgl.tools.shader_debugger.server import LOCAL, DebugServer, host_allowed
 from blinkgl.tools.shader_debugger.session import moment, open_subject
@@ -39,7 +39,7 @@ def served(config, tmp_path_factory):
 def buffers(config: str) -> dict:
     """What the page has of this configuration."""
     subject = open_subject(config)
-    return buffers_of(subject.scene, twinned_of(subject.config, subject.scene))
+    return buffers_of(subject.scene, filtered_names(subject.config, subject.scene))
 
 
 def ask(server, path: str, method: str = "GET", host: str | None = None):

@@ -99,6 +99,7 @@ def _surface(made: SceneObject, poses: np.ndarray, t_ns: Sequence[int], k: int) 
 def _axes(document: gltf.Document, node: int, animation: Animation | None, t_ns: Sequence[int], k: int) -> np.ndarray:
     moving = animation is not None and animation.skeleton.at(t_ns[k])[0][document.places[node]]
     world = Z_UP @ (document.world(node) if animation is None else moving)
+    # The matrix's columns are the node's axes; here they are rows of length 1, without its scale.
     axes = world[:3, :3].T / np.linalg.norm(world[:3, :3], axis=0)[:, None]
     return world[:3, 3] + np.concatenate([np.zeros((1, 3)), axes])
 

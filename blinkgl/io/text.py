@@ -378,6 +378,7 @@ def _print(x, y, t, p, separator, micro, buffer):
             n = _put(t[i], 1, buffer, n)
         else:
             n = _put(t[i] // 1000000, 1, buffer, n)
+            # 46 is a full stop, 48 the digit 0, 10 the end of a line.
             buffer[n] = 46
             n = _put(t[i] % 1000000, 6, buffer, n + 1)
         buffer[n] = separator

@@ -80,6 +80,7 @@ def _value_noise(rng, size: int, cells: int) -> np.ndarray:
     corner = rng.random((cells, cells))
     i, j, f = _lattice(size, cells)
     w = _smooth(f)
+    # Bilinear with smooth weights: along axis 0, then along axis 1.
     rows = corner[i] * (1 - w)[:, None] + corner[j] * w[:, None]
     return rows[:, i] * (1 - w) + rows[:, j] * w
 

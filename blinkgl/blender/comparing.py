@@ -114,7 +114,7 @@ def _distances(those: Sequence[np.ndarray], ours: Sequence[At]) -> np.ndarray:
     largest = np.fmax.reduce(sizes, axis=1)[:, None]
     # A comparison with NaN is false, so that what is not there is hidden, too.
     hidden = ~(sizes > _NOTHING * largest)
-    # Times at which all instances are seen, or else the first one.
+    # Times at which all instances are seen, or else those at which the first one is.
     common = ~hidden.any(axis=0) if (~hidden.any(axis=0)).any() else ~hidden[0]
     directions = np.random.default_rng(0).normal(size=(sizes.shape[1], 3, 8)) * common[:, None, None]
     counts = [points.shape[1] for points in those]

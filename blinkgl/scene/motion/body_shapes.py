@@ -96,6 +96,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mean = points.mean(axis=0)
     # Principal axes: eigenvectors of the covariance, smallest first.
     _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+    # All three are reversed where they make a left-handed frame.
     axes = axes[:, ::-1] * np.sign(np.linalg.det(axes[:, ::-1]))
     along = (points - mean) @ axes
     low, high = along.min(axis=0), along.max(axis=0)

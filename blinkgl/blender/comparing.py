@@ -99,6 +99,7 @@ def _surface(made: SceneObject, poses: np.ndarray, t_ns: Sequence[int], k: int) 
 def _axes(document: gltf.Document, node: int, animation: Animation | None, t_ns: Sequence[int], k: int) -> np.ndarray:
     moving = animation is not None and animation.skeleton.at(t_ns[k])[0][document.places[node]]
     world = Z_UP @ (document.world(node) if animation is None else moving)
+    # The matrix's columns are the node's axes; here they are rows of length 1, without its scale.
     axes = world[:3, :3].T / np.linalg.norm(world[:3, :3], axis=0)[:, None]
     return world[:3, 3] + np.concatenate([np.zeros((1, 3)), axes])
 
@@ -111,7 +112,9 @@ def _distances(those: Sequence[np.ndarray], ours: Sequence[At]) -> np.ndarray:
     one tree for all instances of a name."""
     sizes = np.stack([np.ptp(points, axis=1).max(axis=1) for points in those])  # (instances, T)
     largest = np.fmax.reduce(sizes, axis=1)[:, None]
+    # A comparison with NaN is false, so that what is not there is hidden, too.
     hidden = ~(sizes > _NOTHING * largest)
+    # Times at which all instances are seen, or else those at which the first one is.
     common = ~hidden.any(axis=0) if (~hidden.any(axis=0)).any() else ~hidden[0]
     directions = np.random.default_rng(0).normal(size=(sizes.shape[1], 3, 8)) * common[:, None, None]
     counts = [points.shape[1] for points in those]
@@ -123,7 +126,9 @@ def _distances(those: Sequence[np.ndarray], ours: Sequence[At]) -> np.ndarray:
     error = np.zeros(sizes.shape)
     for k, points in enumerate(played):
         off = np.abs(points[nearest] - true[k]).max(axis=1)
+        # Of an instance that shrinks, at least a tenth of its largest size counts.
         scale = np.fmax(sizes[:, k], 0.1 * largest[:, 0])
+        # What float32 loses far from the origin is no difference.
         rounding = 4e-7 * np.maximum.reduceat(np.abs(true[k]).max(axis=1), starts)
         error[:, k] = np.maximum(np.maximum.reduceat(off, starts) - rounding, 0) / scale
         low, high = np.minimum.reduceat(points[nearest], starts), np.maximum.reduceat(points[nearest], starts)

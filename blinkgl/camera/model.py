@@ -170,6 +170,7 @@ class CameraModel(ABC):
             height=height,
             fx=self.fx * sx,
             fy=self.fy * sy,
+            # Pixel centres are at whole numbers, so the picture begins at -0.5.
             cx=(self.cx + 0.5) * sx - 0.5,
             cy=(self.cy + 0.5) * sy - 0.5,
         )

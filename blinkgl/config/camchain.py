@@ -128,6 +128,7 @@ def _of_matrix(tree: dict[str, Any], where: str) -> Calibrated | None:
     K = None if key is None else _flat(table[key])
     if K is None or len(K) != 9:
         return None
+    # K row by row: fx, skew, cx; 0, fy, cy; 0, 0, 1.
     if abs(K[1]) > 1e-6 * abs(K[0]):
         raise ConfigError("the pixels are skewed", where=f"{where}: {key}", value=K[1], accepted="0 in the first row")
     size = next((table[k] for k in ("img_size", "image_size", "resolution") if k in table), None)

@@ -111,6 +111,7 @@ class CameraConfig(Config):
     def scaled(self, factor: float) -> dict[str, Any]:
         """Return the keys of a camera with the same view and ``factor`` times the pixels in x and y, rounded to whole
         pixels."""
+        # Pixel centres are at whole numbers, so the picture begins at -0.5.
         said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
         said |= {key: value * factor for key in ("focal", "fx", "fy") if (value := getattr(self, key)) is not None}
         said |= {"fov": self.fov} if self.fov is not None else {}

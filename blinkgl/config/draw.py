@@ -74,6 +74,7 @@ def middle(tree: Any) -> Any:
 def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
     _check(path, kind, spec)
     if kind == "choice":
+        # The lower one of two middle values.
         return spec[(len(spec) - 1) // 2]
     if kind in ("weighted", "shares"):
         parts = spec.items() if kind == "weighted" else [(part["value"], part["share"]) for part in spec]
@@ -87,6 +88,7 @@ def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
     low, high = (_number(x) for x in spec)
     if kind == "integer":
         return (int(low) + int(high)) // 2
+    # Half-way between logarithms is the geometric mean.
     return math.exp(0.5 * (math.log(low) + math.log(high))) if kind == "log_uniform" else low + 0.5 * (high - low)
 
 

@@ -232,6 +232,7 @@ def exposure_starts(images: ImagesConfig, t0_ns: int, t1_ns: int, rows: int) -> 
     lasts_ns = round(NS_PER_US * (images.longest_us + readout_us(rows, images.row_us)))
     if images.rate is None:
         return [round(NS_PER_S * t) for t in images.times or ()]
+    # 1e-9, so that rounding does not lose an exposure that just fits.
     count = int(((t1_ns - t0_ns - lasts_ns) * images.rate) / NS_PER_S + 1e-9) + 1
     return [t0_ns + round(k * NS_PER_S / images.rate) for k in range(count)]
 

@@ -174,6 +174,7 @@ _B0, _B1, _B2, _B3, _B4, _B5, _B6 = (
 def log_f64(v: float) -> float:
     """Return ln(v), float64, v normal and positive; error < 4e-16 (1 + |ln v|)."""
     bits = bits_f64(v)
+    # The exponent for which m lies in [sqrt(1/2), sqrt(2)).
     exponent = _L(_L(bits - _SQRT_HALF_BITS_64) >> _EXP52)
     m = _L(bits - _L(exponent << _EXP52)).view(np.float64)
     # ln m = 2 artanh(s) = 2 s + s^3 p(s^2): odd, so half as many terms.

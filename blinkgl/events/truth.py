@@ -75,6 +75,7 @@ class SurfaceTruth:
         height, width = after.ids.shape
         pixel = y * width + x
         found = _where(late, _looked_up(after, pixel), _looked_up(before, pixel))
+        # found[1] is the depth, and the nearest surface wins.
         best = found[1].copy()
         for surfaces in (before, after):
             for dy, dx in self._offsets:

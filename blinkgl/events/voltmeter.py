@@ -140,6 +140,7 @@ def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
     """Compute how far light and leak have moved V by the interval's end if nothing fires."""
     dt_us = interval.dt_ns * 1e-3
     k1, k2, k4_dt, k5_dt = _F(interval.k1), _F(interval.k2), _F(interval.k4 * dt_us), _F(interval.k5 * dt_us)
+    # The drift of V at the interval's mean light.
     for i in range(now.size):
         mean = _HALF * (before[i] + now[i])
         light_end[i] = by_light[i] + k1 * (now[i] - before[i]) / (mean + k2)

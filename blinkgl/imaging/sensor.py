@@ -46,6 +46,7 @@ _LN_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
 @register_jitable
 def _log_factorial(k):
     """Return ln k! of k >= 9, float64: Stirling's series, error < 1e-12 there."""
+    # ln k! = ln Gamma(k + 1), with the series' terms up to x^-7.
     x = k + 1.0
     inverse = 1.0 / x
     z = inverse * inverse

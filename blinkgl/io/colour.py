@@ -71,6 +71,7 @@ def _look_up(flow, valid, maximum, wheel, invalid, rgb):
             u, v = np.float64(flow[y, x, 0]), np.float64(flow[y, x, 1])
             speed = np.sqrt(u * u + v * v)
             if valid[y, x] and np.isfinite(speed):
+                # Vectors beyond the maximum have the colour of the wheel's rim.
                 scale = radius / max(speed, maximum)
                 row, column = int(np.rint(v * scale)) + radius, int(np.rint(u * scale)) + radius
                 for c in range(3):
@@ -105,4 +106,5 @@ def _shade(counts, shade, rgb):
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):
             off, on = shade[min(counts[0, y, x], len(shade) - 1)], shade[min(counts[1, y, x], len(shade) - 1)]
+            # On white, ON takes red and green away, and OFF green and blue.
             rgb[y, x, 0], rgb[y, x, 1], rgb[y, x, 2] = 255 - on, 255 - max(off, on), 255 - off

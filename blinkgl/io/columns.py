@@ -57,6 +57,7 @@ def events_of(
         raise AssetError("event columns differ in length", where=where, value={k: c.shape for k, c in columns.items()})
     x = whole(columns["x"], "x", np.uint16, 0, MAX_SIDE - 1, where, first)
     y = whole(columns["y"], "y", np.uint16, 0, MAX_SIDE - 1, where, first)
+    # Times have to be in the range after the offset, too.
     t = whole(columns["t"], "t", np.int64, -_MAX_TIME - min(offset, 0), _MAX_TIME - max(offset, 0), where, first)
     accepted = "0 or 1, -1 or 1; or --polarity OFF/ON" if signed else None
     p = whole(columns["p"], "p", np.int8, -1 if signed else 0, 1, where, first, accepted)

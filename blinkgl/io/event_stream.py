@@ -65,6 +65,7 @@ def _decode(data, state, x, y, t, p):
     for byte in data:
         value = np.int64(byte)
         if got == 0:
+            # 255 is 127 µs without an event, 254 is padding.
             if value == 255:
                 time += 127
             elif value != 254:

@@ -93,6 +93,7 @@ def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
         data = Path(path).read_bytes()
     if len(data) < 12 or struct.unpack_from("<f", data)[0] != _TAG:
         raise AssetError("not a .flo file: wrong tag", where=str(path), accepted=f"{_TAG}")
+    # Width and height follow the tag, then u and v of each pixel, 8 bytes.
     width, height = struct.unpack_from("<ii", data, 4)
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
         raise AssetError("impossible .flo size", where=str(path), value=(width, height))

@@ -290,6 +290,7 @@ def _png_problem(data: bytes) -> str | None:
 
 def png_chunks(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
     """Yield where each chunk begins, its type, and its content, of which the last one's may be cut."""
+    # The signature has 8 bytes; a chunk's length, type and CRC have 4 each.
     at = 8
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)

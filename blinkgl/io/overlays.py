@@ -28,6 +28,7 @@ def with_boxes(picture: np.ndarray, boxes: Boxes) -> np.ndarray:
             continue
         colour = _colour(boxes.instance[k])
         pale = out.copy()
+        # Pixel centres are at whole numbers, so the picture begins at -0.5.
         _rectangle(pale, (boxes.cut_box[k] + 0.5) * scale, colour)
         out = cv2.addWeighted(out, 0.55, pale, 0.45, 0)
         if boxes.visible_pixels[k]:
@@ -53,6 +54,7 @@ def with_tracks(picture: np.ndarray, tracks: TrackLines, t_us: int) -> np.ndarra
     ends = (1 - share) * tracks.px[:, now] + share * tracks.px[:, later]
     places = np.concatenate([tracks.px[:, first : now + 1], ends[:, None]], axis=1)
     hidden = np.concatenate([tracks.occluded[:, first : now + 1], ~seen[:, None]], axis=1)
+    # In 1/16 px, the four bits that OpenCV's functions are told last; pixel centres are at whole numbers.
     fine = np.round(((places + 0.5) * scale - 0.5) * 16).clip(-(2**20), 2**20).astype(np.int32)
     for k in np.flatnonzero(seen):
         colour = _colour(tracks.instance[k])

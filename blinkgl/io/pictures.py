@@ -58,6 +58,7 @@ def id_colours(ids: np.ndarray) -> np.ndarray:
     colour."""
     numbers = ids.astype(np.int64)
     hue = (numbers * 0.61803398875) % 1.0
+    # Another irrational step, so that the value is not tied to the hue.
     value = 0.62 + 0.38 * ((numbers * 0.7548776662) % 1.0)
     # HSV to RGB: with k = (n + 6 hue) mod 6 a channel is value (1 - saturation clip(min(k, 4 - k), 0, 1)), n = 5, 3, 1.
     k = (np.array([5, 3, 1]) + 6 * hue[..., None]) % 6

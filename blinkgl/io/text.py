@@ -111,6 +111,7 @@ class TextReader:
         """Return events of both ends of the file as (N, K) numbers, and about how many events it holds."""
         file.seek(self._start)
         head, tail, total = file.read(size), b"", 0
+        # The end of a compressed file is reached only through all of it.
         if self.path.suffix.lower() == ".gz":
             for piece in iter(lambda: file.read(1 << 20), b""):
                 total, tail = total + len(piece), (tail + piece)[-size:]
@@ -122,6 +123,7 @@ class TextReader:
         whole = (head + tail).split(b"\n") if len(tail) == total else None
         lines = whole or head.split(b"\n")[:-1] + tail.split(b"\n")[1:]
         rows = [row for row in map(_row, lines) if row]
+        # Rows of another width than most are no events.
         wide = max(map(len, rows), key=[len(row) for row in rows].count, default=4)
         rows = [row for row in rows if len(row) == wide]
         density = len(rows) / max(len(head) + len(tail), 1)
@@ -378,6 +380,7 @@ def _print(x, y, t, p, separator, micro, buffer):
             n = _put(t[i], 1, buffer, n)
         else:
             n = _put(t[i] // 1000000, 1, buffer, n)
+            # 46 is a full stop, 48 the digit 0, 10 the end of a line.
             buffer[n] = 46
             n = _put(t[i] % 1000000, 6, buffer, n + 1)
         buffer[n] = separator

@@ -91,6 +91,7 @@ def _write_events(source: Source, path: Path) -> None:
                 for name, column in columns.items():
                     append(column, t if name == "t" else getattr(events, name))
                 if len(t):
+                    # ms whose first event cannot come in a later chunk.
                     settled = np.arange(next_ms, int(t[-1]) // 1000 + 1) * 1000
                     append(table, count + np.searchsorted(t, settled, side="left"))
                     count, next_ms = count + len(t), next_ms + len(settled)

@@ -181,6 +181,7 @@ def _baseline(left: Source, right: Source) -> float | None:
     T_left_right = np.linalg.inv(left.poses["T_world_cam"]) @ right.poses["T_world_cam"]
     t = T_left_right[:, :3, 3]
     turned = np.abs(T_left_right[:, :3, :3] - np.eye(3)).max()
+    # At all times the right camera must be at the same place on the left one's x axis.
     aside = np.abs(t - [t[0, 0], 0, 0]).max()
     parallel = t[0, 0] > 0 and max(turned, aside) < _PARALLEL * max(1.0, t[0, 0])
     return float(t[0, 0]) if parallel else None

@@ -83,6 +83,7 @@ def _camera(source: Source, topic: str, store: Any) -> Iterator[Iterator[Message
 
 def _events(source: Source, topic: str) -> Iterator[Message]:
     for events in source.events():
+        # A packet ends at whole multiples of its length, and at the end of a chunk.
         bounds = (
             np.arange(events.t[0] // _PACKET_US + 1, events.t[-1] // _PACKET_US + 1) * _PACKET_US if len(events) else []
         )

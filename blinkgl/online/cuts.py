@@ -116,5 +116,6 @@ def drawn_spans(
         )
     spans = np.rint(np.exp(rng.uniform(np.log(window_us[0]), np.log(longest), count))).astype(np.int64)
     spans = np.clip(spans, window_us[0], longest)
+    # + 1, as the latest start is among those that are drawn.
     times = t0_us + np.floor(rng.random(count) * (t1_us - t0_us - steps * spans + 1)).astype(np.int64)
     return [(int(t), int(span)) for t, span in zip(times, spans, strict=True)]

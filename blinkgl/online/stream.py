@@ -92,6 +92,7 @@ class SampleStream(Closing):
         self._next, self._stop, self._thread = self._base, False, None
         self._executor: Executor | None = None
         try:
+            # The samples of the block that come before the first one count as taken.
             for n in range(first // self.block * self.block, first):
                 self._mark(*self._place(n))
             cards = several_cards(self.job) if workers and card is not None else None
@@ -159,6 +160,7 @@ class SampleStream(Closing):
 
     def _mark(self, slot: int, item: int) -> None:
         path = sample_file(self.spool, slot, item)
+        # The mark comes first: a missing sample without a mark would be awaited for ever.
         path.with_suffix(_GONE).touch()
         path.unlink(missing_ok=True)
         if self._thread is None and os.getpid() == self._owner:
@@ -266,6 +268,7 @@ class SampleStream(Closing):
         stats.cpu_s += message.get("cpu_s", 0.0)
         if message["kind"] == "done":
             stats.slots, stats.samples = stats.slots + 1, stats.samples + self.job.samples
+            # A share of few sequences says little, so the first failures are free.
             if stats.failures > _FREE_FAILURES + _FAILURE_SHARE * stats.sequences:
                 self._give_up(f"{stats.failures} of {stats.sequences} sequences failed, the last: {message['last']}")
             return False
@@ -282,6 +285,7 @@ class SampleStream(Closing):
         temporary = self.spool / (_ERROR + ".tmp")
         with suppress(OSError):
             temporary.write_text(f"{where}\n{said}", encoding="utf-8")
+            # Takers see the whole text or none.
             os.replace(temporary, self.spool / _ERROR)
 
 

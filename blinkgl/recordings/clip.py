@@ -344,6 +344,7 @@ class Tiles:
     def __init__(self, size: tuple[int, int], frames: int, most: int = MOST_PIXEL_STEPS, seed: int = 0):
         self.size, self.share = size, 1.0
         self._corners: list[tuple[int, int]] = []
+        # The number of each tile in the cut; -1: it is not there.
         self._place = np.zeros((size[0] // TILE_PX, size[1] // TILE_PX), np.int64)
         wanted = most // (frames * TILE_PX * TILE_PX)
         if frames * size[0] * size[1] <= most or wanted >= self._place.size:

@@ -280,6 +280,7 @@ def _accumulate(
         )
         for f, shape in zip(files, shapes)
     ]
+    # -1: the pixel has had no event yet.
     last = [np.full(shape, -1, np.int64) for shape in shapes]
     bins = IEI_EDGES_US
     polarity = np.full(intervals, np.nan)
@@ -301,6 +302,7 @@ def _accumulate(
             for i, s in enumerate(smooth):
                 frame_correlation[i, k] = _correlation(s, change)
                 square = float(np.sum(s * s))
+                # The slope of a line through 0, by least squares.
                 threshold[i, k] = float(np.sum(s * change)) / square if square else np.nan
         if same:
             polarity[k] = _correlation(*smooth)
@@ -326,6 +328,7 @@ def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
         sums[r, c] += 2 * np.int32(p[i]) - 1
         now = t[i] - origin
         if last[r, c] >= 0:
+            # 1e-9, so that the rounded logarithm of a bin's first value is not in the bin below.
             k = int(10 * np.log10(max(now - last[r, c], 1)) + 1e-9)
             iei[min(k, bins - 1)] += 1
         last[r, c] = now

@@ -73,12 +73,14 @@ def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> 
     to_off = turns - to_on
     both = (to_on > 0) & (to_off > 0)
     x, y = right / linked, down / linked
+    # An event of each polarity is added, so that few events give no extreme share.
     log, on_share = np.log1p(count), (on + 1) / (count + 2)
     told = (
         np.log1p(on),
         np.log1p(off),
         np.abs(on - off) / some,
         turns / two,
+        # Without a pair, e^20 µs, about eight minutes, stands for the interval.
         np.where(pairs > 0, log_gap / two, 20.0),
         short / two,
         company / some,

@@ -306,6 +306,7 @@ def _seen(delay: float, decades: float, seconds: float) -> float:
     """Return the fraction of answers that fall into a recording of that length together with their events."""
     if decades <= 0:
         return max(1 - delay / seconds, 0.0)
+    # The mean over log-normal delays, up to six standard deviations of their logarithm on both sides.
     x = np.linspace(-6, 6, 600)
     weight = np.exp(-0.5 * x**2)
     late = delay * np.exp(_TEN * decades * x)

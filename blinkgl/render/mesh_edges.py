@@ -145,6 +145,7 @@ def _joined(edges: np.ndarray, places: int) -> np.ndarray:
     """Return (E, 4) int32 in which two borders that run in opposite directions between the same places are one edge."""
     border = np.flatnonzero(edges[:, 3] < 0)
     ends = edges[border, :2].astype(np.int64)
+    # Both directions between two places have one key.
     key = ends.min(axis=1) * places + ends.max(axis=1)
     order = np.argsort(key, kind="stable")
     border, ends, key = border[order], ends[order], key[order]

@@ -48,6 +48,7 @@ def cam_from_obj_rate(
     T_world_cam: np.ndarray, dT_world_cam: np.ndarray, T_world_obj: np.ndarray, dT_world_obj: np.ndarray
 ) -> np.ndarray:
     """Return d(T_cam_obj)/dt, (..., 4, 4) float64, 1/s, by the product rule on :func:`cam_from_obj`."""
+    # T_cam_obj has the rotation R^T R_obj and the place R^T (p_obj - p), with R and p of the camera.
     R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
     dR_t = np.swapaxes(dT_world_cam[..., :3, :3], -1, -2)
     offset = T_world_obj[..., :3, 3:] - T_world_cam[..., :3, 3:]

@@ -236,6 +236,7 @@ def _is_hole(mask, uvs, cutoff, texels, face, a, b, c):
     x, y = u * width - 0.5, v * height - 0.5
     i, j = np.int64(np.floor(x)), np.int64(np.floor(y))
     fx, fy = x - i, y - j
+    # mask[4] and mask[5]: how the texture goes on beyond its sides in u and in v.
     x0, x1 = _texel_index(i, width, mask[4]), _texel_index(i + 1, width, mask[4])
     y0, y1 = start + _texel_index(j, height, mask[5]) * width, start + _texel_index(j + 1, height, mask[5]) * width
     top = texels[y0 + x0] * (1.0 - fx) + texels[y0 + x1] * fx

@@ -93,6 +93,7 @@ def _box(lamp: Lamp, spheres: np.ndarray) -> Box:
     centres, radius = spheres[:, :3], spheres[:, 3:]
     if lamp.path.is_static:
         R = (lamp.path.pose(0) @ CV_FROM_LAMP)[:3, :3]
+        # Rows times R are in the lamp's axes.
         low, high = (centres @ R - radius).min(axis=0), (centres @ R + radius).max(axis=0)
         middle, half = R @ (low + high) / 2, (high - low) / 2
     else:  # for any direction

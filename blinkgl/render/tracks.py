@@ -82,6 +82,7 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     ahead = depth > 0
     xy = np.zeros((len(depth), 2))
     xy[ahead] = camera.project(moved[ahead])
+    # The picture reaches half a px beyond the centres of the pixels at its edges.
     inside = ahead & ((xy >= -0.5) & (xy < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
     seen, _ = casting.is_seen(scene, there, t_ns, moved, inside & (depth >= camera.near))
     return xy, world, depth, seen

@@ -91,12 +91,14 @@ def picture(result: Calibration) -> bytes:
     ax = axes[0, 0]
     for name, events in streams.items():
         rate = np.diff(np.searchsorted(events.t, clip.edges_us)) / np.diff(edges) / 1e3
+        # A step needs a value at its end, too.
         ax.step(edges, np.append(rate, rate[-1:]), where="post", color=_COLOURS[name], label=name)
     ax.axvspan(edges[result.halves[1][0]], edges[last], color="0.93", zorder=0)
     ax.set(title="event rate (grey: not fitted)", xlabel="s", ylabel="thousand events/s", ylim=(0, None))
     ax.legend(frameon=False, fontsize=9)
 
     ax = axes[0, 1]
+    # Bins begin at 1 µs; the axis is in ms.
     bins = 10 ** (np.arange(ISI_BINS) / ISI_PER_DECADE) / 1000
     for name, one in held.items():
         isi = one.isi.sum(axis=(0, 1))

@@ -54,12 +54,15 @@ def histogram(
     if log:
         low = max(low, float(values.min()), 1e-12) if not span else low
     if high <= low:
+        # Where all values are equal, the axis reaches half of them to both sides.
         low, high = low - 0.5 * (abs(low) or 1), high + 0.5 * (abs(high) or 1)
         log = False
     scale = np.log if log else (lambda v: np.asarray(v, float))
     edges = np.linspace(scale(low), scale(high), bins + 1)
+    # Values beyond the span count in the first and the last bar.
     counts, _ = np.histogram(np.clip(scale(values), edges[0], edges[-1]), edges)
     step, room = (WIDTH - 2 * LEFT) / bins, HEIGHT - BOTTOM - 8
+    # The rarest values keep a bar, 1 px high.
     bars = [
         (LEFT + i * step + 0.5, max(1.0, count / counts.max() * room))
         for i, count in enumerate(counts.tolist())

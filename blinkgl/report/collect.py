@@ -155,6 +155,7 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
             picks = sorted(rng.permutation(len(flows))[:LABELS_EACH])
             for k in picks:
                 flow, valid = read_flow_png(flows[k])
+                # Every few pixels are enough for a distribution.
                 displacement = np.hypot(flow[..., 0], flow[..., 1])[::PIXEL_STEP, ::PIXEL_STEP][
                     valid[::PIXEL_STEP, ::PIXEL_STEP]
                 ]
@@ -165,6 +166,7 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
                     values["depth"].append(depth[np.isfinite(depth)])
                 if (ids := _value(folder, "ids", flows[k])) is not None:
                     ids, counts = np.unique(ids, return_counts=True)
+                    # Objects are numbered from 1.
                     counts = counts[ids > 0]
                     values["objects"].append([len(counts)])
                     values["share"].append(counts / (line["height"] * line["width"]))

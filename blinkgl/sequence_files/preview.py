@@ -142,6 +142,7 @@ class Panels:
         inside = np.clip(_LEGEND + 0.5 - np.hypot(x, y), 0, 1)[..., None]  # one pixel of anti-aliasing
         wheel = cv2.resize(flow_wheel(), (size, size), interpolation=cv2.INTER_AREA)
         corner = view[-size - 6 : -6, -size - 6 : -6]
+        # A dark ring with soft edges around the wheel.
         ring = np.clip(1.5 - np.abs(np.hypot(x, y) - _LEGEND), 0, 1)[..., None]
         mixed = corner * (1 - inside) + wheel * inside
         corner[:] = mixed * (1 - ring) + 60 * ring

@@ -220,6 +220,7 @@ def _draw_depth(gl) -> str:
     program, vertices = _full_screen(gl, "uniform float value;\nlayout(location = 0) out float seen;", "seen = value;")
     with Target(gl, 4, 4, ("R32F",)) as target:
         gl.ctx.enable_only(moderngl.DEPTH_TEST)
+        # Depth is near / z: 0 at infinity, and nearer is greater.
         gl.ctx.depth_func = ">"
         worst = 0.0
         for z in np.geomspace(0.011, 1e6, 33):

@@ -93,6 +93,7 @@ def exp_f32(v: Tensor) -> Tensor:
 def log_f64(v: Tensor) -> Tensor:
     """Return ln(v), float64, v normal and positive."""
     bits = v.view(torch.int64)
+    # The exponent for which m lies in [sqrt(1/2), sqrt(2)).
     exponent = (bits - _ROOT_BITS_64) >> 52
     m = (bits - (exponent << 52)).view(torch.float64)
     # ln m = 2 artanh(s), a series in s^2.
@@ -160,6 +161,7 @@ def philox4x32(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> lis
         # 32 x 32 bits: the low 64 bits are exact, also in signed arithmetic.
         p0, p1 = c0 * _M0, c2 * _M1
         c0, c1, c2, c3 = ((p1 >> 32) & _MASK32) ^ c1 ^ k0, p1 & _MASK32, ((p0 >> 32) & _MASK32) ^ c3 ^ k1, p0 & _MASK32
+        # The key is raised after each of the ten rounds but the last.
         if turn < 9:
             k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
     return [c0, c1, c2, c3]

@@ -181,6 +181,7 @@ def _look(light, log, places, out):
 @kernel
 def _catmull_rom(f, out):
     """Compute the weights of the four samples around a place ``f`` beyond the second: exact for parabolas."""
+    # float32 numbers, so that no product becomes float64.
     half, one = np.float32(0.5), np.float32(1)
     out[0] = half * f * (f * (np.float32(2) - f) - one)
     out[1] = half * (f * f * (np.float32(3) * f - np.float32(5)) + np.float32(2))

@@ -92,6 +92,7 @@ class Stage:
         fx, fy, _, _ = camera.intrinsics
         frustum = self._scene.add_camera_frustum(
             f"/world/cameras/{sensor.name}",
+            # The vertical angle of view, and width over height of the picture on the plane z = 1.
             2 * math.atan(camera.height / 2 / fy),
             camera.width * fy / (camera.height * fx),
             scale=0.08 * self._radius,

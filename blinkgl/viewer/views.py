@@ -75,6 +75,7 @@ class CameraView:
         poses_us = source.poses["t_ns"] // 1000 if source.poses else np.zeros(0, np.int64)
         self._poses_us = poses_us
         flows = [[a for a, _ in source.flow_times(way)] for way in ("forward", "backward")]
+        # Label k is that of pose k + 1.
         self._label_us = np.array(poses_us[1:] if len(poses_us) else source.image_times or flows[0] or flows[1])
         size = (source.height, source.width)
         self._events = DsecEventReader(source.folder / "events.h5", size=size) if source.has("events.h5") else None
@@ -134,6 +135,7 @@ class CameraView:
         found = []
         for name in about["pictures"]:
             codes = read_image(self.source.folder / picture_file(name, k))
+            # The upper eight of the codes' bits.
             shown = (codes.astype(np.uint32) >> (about["bits"] - 8)).astype(np.uint8)
             shown = np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
             heading = "frame camera" if name == "images" else f"frame camera, {name}"
@@ -188,6 +190,7 @@ class CameraView:
         span = max(self.source.end_us - self.source.start_us, 1)
         wanted = self.source.height * self.source.width / 3
         steps = 1000 * np.array([1, 2, 5, 10, 20, 50, 100])
+        # The nearest step on a logarithmic scale.
         return int(steps[np.argmin(abs(np.log(steps) - np.log(wanted * span / max(self.event_count, 1))))])
 
     # ---- space ---------------------------------------------------------------------------------------------------
@@ -224,6 +227,7 @@ class CameraView:
         for row, number in enumerate(map(int, poses.get("object_ids", ()))):
             if number in self._everywhere() or number not in {*at_rest, *seen}:
                 continue
+            # The lower and the upper corner of the box at rest.
             low, high = np.array(at_rest.get(number, np.zeros((2, 3))), float)
             middle = np.eye(4)
             middle[:3, 3] = (low + high) / 2
@@ -253,6 +257,7 @@ class CameraView:
         some = slice(None, None, 1 + len(x) // MAX_POINTS)
         y, x = y[some], x[some]
         rays = camera.rays(np.stack([x, y], axis=-1).astype(float))  # pixel centres are at whole numbers
+        # Each ray is scaled to z = 1, as depth is along z; points are rows, so the rotation is transposed.
         points = rays / rays[:, 2:] * depth[y, x, None] @ pose[:3, :3].T + pose[:3, 3]
         if self.source.has(LABELS["images"].forms[0].file(k)):
             colours = self.source.image(k)[y, x]
@@ -284,6 +289,7 @@ def _rank(label: Label) -> int:
 
 def _inside(points: np.ndarray, body: Body) -> np.ndarray:
     """Return (N,) bool: which of (N, 3) points lie in a body's box, or within a hundredth of its size of it."""
+    # Points are rows, so the rotation without a transpose leads from the world to the body's axes.
     local = (points - body.pose[:3, 3]) @ body.pose[:3, :3]
     return np.all(abs(local) <= 0.51 * body.size + 1e-3, axis=1)
 
@@ -319,6 +325,7 @@ class SequenceView:
         if not len(places):
             return np.zeros(3), 1.0
         middle = np.median(places, axis=0)
+        # Nine tenths of all places, so that one that is far away does not make the others small.
         return middle, max(float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.9)), 1e-3)
 
     def close(self) -> None:

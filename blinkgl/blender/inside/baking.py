@@ -126,6 +126,7 @@ def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
 
     Return (owners that are broken, owners of each object's name)."""
     halves = 2 * (clock.last - clock.first)
+    # Multiples of the golden ratio lie evenly over the clip; two steps make a frame.
     some = {round((0.618033988749895 * k % 1) * halves) for k in range(SAMPLES)} | {0, halves}
     frames = [clock.first + k / 2 for k in sorted(some) if k % 2 == 0 or not clock.simulated]
     clock.go(clock.first)
@@ -169,6 +170,7 @@ class Track:
         self.kept, self.waiting, self.seen, self.other, self.coarse, self.over = [], [], [], [], False, 0
         self.data = self.object = None
         ends = shape.min(axis=0), shape.max(axis=0)
+        # Corner k lies at the upper end of axis a where bit a of k is set.
         self.box = np.array([[ends[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
 
     def add(self, frame: float, matrix: np.ndarray, shape: np.ndarray, form: int) -> None:
@@ -179,6 +181,7 @@ class Track:
         if form != self.form or self.over or (self.coarse and frame != int(frame)):
             return
         if not self.deforms:
+            # A place, a rotation and a scale, which is what a node's keys hold, make no shear.
             straight = np.array(Matrix.LocRotScale(*Matrix(matrix).decompose()))
             if np.abs(straight - matrix)[:3, :3].max() > 1e-5 * np.abs(matrix[:3, :3]).max() or np.abs(
                 shape - self.shape
@@ -232,6 +235,7 @@ class Track:
     @property
     def size(self) -> int:
         """Return about how many bytes the keys take in the GLB: positions and normals of morph targets."""
+        # A node's key has 44 bytes: a time, a place, a quaternion and a scale, each number with 4 bytes.
         return 24 * self.corners * (len(self.kept) - 1) if self.deforms else 44 * len(self.kept)
 
 
@@ -312,14 +316,17 @@ def write_keys(tracks: list[Track], tree: dict, binary: bytearray) -> None:
         node = nodes[track.object.name]
         tree["nodes"][node]["name"] = track.name
         if track.deforms:
+            # Key k shows target k alone; the base is no target.
             values = {"weights": np.delete(np.eye(len(track.kept)), track.base, axis=1)}
         else:
             turn = Matrix() if track.camera else Y_UP.transposed()  # a camera's axes are glTF's
             parts = [(Y_UP @ Matrix(matrix) @ turn).decompose() for _, matrix, _ in track.kept]
             places, turns, scales = (np.array([tuple(part) for part in parts]) for parts in zip(*parts))
+            # Blender's quaternions have w first, glTF's last.
             values = {"translation": places, "rotation": turns[:, [1, 2, 3, 0]], "scale": scales}
         for path, keys in values.items() if len(track.kept) > 1 else ():
             add_keys(tree, binary, node, path, track.times, keys)
         if track.shown:
+            # A scale of 0 hides the object.
             scales = np.repeat([[shows] for _, shows in track.shown], 3, axis=1)
             add_keys(tree, binary, node, "scale", [t for t, _ in track.shown], scales, "STEP")

@@ -169,6 +169,7 @@ class _Piece(NamedTuple):
         along, p = (self.b - self.a) * scale, (points - self.a) * scale
         t = np.clip(p @ along / max(along @ along, 1e-12), 0, 1)
         radius = self.radii[0] + (self.radii[1] - self.radii[0]) * t
+        # At most the distance in space that is not scaled.
         return (np.linalg.norm(p - t[:, None] * along, axis=1) - radius) * min(*self.flat, 1.0)
 
 

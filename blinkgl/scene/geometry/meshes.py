@@ -310,6 +310,7 @@ def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None =
     for (side_axis, side_sign), (right, right_sign, up) in _BOX_SIDES.items():
         here = (axis == side_axis) & (sign == side_sign)
         uvs[here, :, 0] = 0.5 + right_sign * centred[here][:, :, right]
+        # v runs down the texture.
         uvs[here, :, 1] = 0.5 - centred[here][:, :, up]
     return uvs
 
@@ -317,6 +318,7 @@ def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None =
 def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> bool:
     """Return whether more than half of the surface has (next to) no area in the texture."""
     a, b, c = (uvs[faces[:, i]] for i in range(3))
+    # Twice the area of each triangle in the texture.
     uv_area = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
     area = np.linalg.norm(_face_cross(vertices, faces), axis=1)
     return bool(area[uv_area < 1e-10].sum() > 0.5 * area.sum())

@@ -231,6 +231,7 @@ def cuboid(extents: Sequence[float] = (1.0, 1.0, 1.0), subdivisions: int = 1) ->
     """Box of edge lengths ``extents``; the texture once on each side."""
     x, y, z = np.array(extents) / 2
     n = subdivisions
+    # Sides +x, -x, +y, -y, +z, -z, each seen from outside.
     return join(
         [
             square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n),
@@ -389,6 +390,7 @@ def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_seg
         raise AssetError("bad parameter", where="torus.tube", value=tube, accepted=f"less than radius {radius:g}")
     angle = 2 * math.pi * np.arange(tube_segments + 1) / tube_segments
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    # The sine of 2 pi is not exactly 0, and the tube has to close.
     direction[-1] = direction[0]
     return _revolve(
         np.array([radius, 0.0]) + tube * direction,
@@ -420,6 +422,7 @@ def prism(sides: int = 6, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Upright prism over a regular polygon of circumradius ``radius``, flat-shaded; the texture once on each side."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
+    # The sine of 2 pi is not exactly 0, and the rim has to close.
     rim[-1] = rim[0]
     walls = [square(rim[i], rim[i + 1] - rim[i], (0, 0, height), 1, 1) for i in range(sides)]
     return join([*walls, _disc(radius, height / 2, True, sides), _disc(radius, -height / 2, False, sides)])
@@ -430,6 +433,7 @@ def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface
     """Pyramid over a regular polygon, flat-shaded; each side has the texture's triangle."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
+    # The sine of 2 pi is not exactly 0, and the rim has to close.
     rim[-1] = rim[0]
     tip = np.array([0, 0, height / 2])
     walls = []

@@ -72,8 +72,10 @@ def _solid(points: np.ndarray) -> Shape:
         return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
     hull, volume = _hull(points)
     ball = 4 / 3 * math.pi * radii.max() ** 3
+    # The hull's corners lie on a sphere, which it nearly fills.
     if np.ptp(np.linalg.norm(hull - centre, axis=1)) < 1e-4 * radii.max() and volume > 0.9 * ball:
         return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
+    # The hull's corners are those of its bounding box.
     if (np.abs(np.abs(hull - centre) - half) < 1e-6 * half.max()).all():
         return Shape("BOX", half, centre)
     return Shape("MESH", vertices=hull)
@@ -94,6 +96,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mean = points.mean(axis=0)
     # Principal axes: eigenvectors of the covariance, smallest first.
     _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+    # All three are reversed where they make a left-handed frame.
     axes = axes[:, ::-1] * np.sign(np.linalg.det(axes[:, ::-1]))
     along = (points - mean) @ axes
     low, high = along.min(axis=0), along.max(axis=0)

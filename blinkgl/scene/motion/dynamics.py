@@ -385,6 +385,7 @@ class _World:
         """Raise ConfigError where a body has no finite position, or is too fast."""
         limit = self.settings.max_speed
         for body in self.dynamic:
+            # A free body has 7 numbers in qpos and 6 in qvel, of which the first 3 are its velocity.
             p, v = qpos[:, 7 * body.at : 7 * body.at + 7], qvel[:, 6 * body.at : 6 * body.at + 3]
             # Overflow is expected here.
             with np.errstate(over="ignore", invalid="ignore"):

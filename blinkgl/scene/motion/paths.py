@@ -238,8 +238,8 @@ class PausedPath:
     def _clock(self, t_ns: int) -> tuple[int, float]:
         """Return the time on ``path``'s clock, ns, and the speed of that clock, in [0, 1]."""
         ramp, since = self.ramp_ns, t_ns - self.stop_ns
+        # Before the stop, slowing down, standing, speeding up, after; ramp/2 is the integral of the whole ramp.
         if since <= 0:
-            # Before the stop, slowing down, standing, speeding up, after; ramp/2 is the integral of the whole ramp.
             return t_ns, 1.0
         # The rate is 1 - smoothstep, of which this is the integral.
         if since < ramp:

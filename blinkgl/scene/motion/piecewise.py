@@ -170,6 +170,7 @@ def pose(t: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray, rot: np.ndar
         c = math.cos(angle)
     else:
         a, b, c = 1.0, 0.5, 1.0
+    # E = exp([phi]x), row by row.
     E00, E01, E02 = c + b * x * x, b * x * y - a * z, b * x * z + a * y
     E10, E11, E12 = b * x * y + a * z, c + b * y * y, b * y * z - a * x
     E20, E21, E22 = b * x * z - a * y, b * y * z + a * x, c + b * z * z

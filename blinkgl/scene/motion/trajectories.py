@@ -320,6 +320,7 @@ def _random_turns(rng, config, rate, times, vertical) -> np.ndarray:
     if given."""
     angles = rate * np.diff(times) * 1e-9 * rng.uniform(0.6, 1.4, len(times) - 1)
     if vertical is not None:
+        # One sign for all turns, so that they do not undo each other.
         return angles[:, None] * vertical * rng.choice([-1.0, 1.0])
     axes, axis = [], None
     for _ in angles:

@@ -35,6 +35,7 @@ class Track:
         rotation use :class:`Clip`."""
         times = self.times
         cubic = self.interpolation == "CUBICSPLINE"
+        # A key of a cubic spline has the tangent before it, its value, and the tangent after it.
         values = self.values[:, 1] if cubic else self.values
         # i: the last key that is not later than the time; -1 before the first one.
         i = int(np.searchsorted(times, time, side="right")) - 1

@@ -53,6 +53,7 @@ class Cycle:
     def locals(self, t_ns: int) -> Locals:
         out = Locals.rest(len(self._offsets))
         rounds = (int(t_ns) % self.period_ns) / self.period_ns + self.phase
+        # 2 pi over the period in seconds.
         rate = 2e9 * np.pi / self.period_ns
         _evaluate(2 * np.pi * rounds, rate, self._cosines, self._sines, self._offsets, out[0], out[1], out[3], out[4])
         return out

@@ -67,10 +67,12 @@ class Proportions:
     @cached_property
     def offsets(self) -> np.ndarray:
         """Return each joint's position in its parent's frame, (21, 3); the pelvis above the ground, legs straight."""
+        # x is forwards, y left, z up.
         out, u = np.zeros((len(JOINTS), 3)), self.unit
         out[J["pelvis"]] = [0, 0, self.hip + 0.045 * u]
         out[J["spine"]], out[J["chest"]], out[J["neck"]] = [0, 0, 0.10 * u], [0, 0, 0.16 * u], [-0.01 * u, 0, 0.24 * u]
         out[J["head"]] = [0.01 * u, 0, 0.08 * u * self.head]
+        # Shoulders vary less than the build does.
         broad = 0.6 + 0.4 * self.build
         for side, sign, _ in _SIDES:
             out[J[f"clavicle_{side}"]] = [0, sign * 0.03 * u * broad, 0.19 * u]
@@ -255,8 +257,10 @@ def _run(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     rng = np.random.default_rng([variant, 2])
     swing, lean, high = rng.uniform(0.8, 1.2, 3) if variant else np.ones(3)
     stride, period = _round(body, tempo, 1.25, 2.2, 0.95)
+    # Below a half, both feet are in the air at times.
     duty = 0.31
     pose.pelvis[:, 1] += 0.008 * u * pose.wave(1, duty / 2)
+    # Lowest in the middle of each foot's time on the ground.
     pose.pelvis[:, 2] -= 0.035 * u * pose.wave(2, duty / 2)
     yaw = -9 * pose.wave(1, -0.05)
     pose.turn("pelvis", 2 * pose.wave(1, duty / 2), 4, yaw)

@@ -354,6 +354,7 @@ def _streams(joints: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Return vertex attributes, four joints each."""
     streams = {}
     for number, start in enumerate(range(0, weights.shape[1], 4)):
+        # The last four are filled up with joint 0 at weight 0.
         room = ((0, 0), (0, 4 - weights[:, start : start + 4].shape[1]))
         streams[f"in_joints_{number}"] = np.pad(joints[:, start : start + 4], room).astype(np.float32)
         streams[f"in_weights_{number}"] = np.pad(weights[:, start : start + 4], room).astype(np.float32)

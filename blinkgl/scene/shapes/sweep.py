@@ -42,6 +42,7 @@ class Sweep:
         count = (
             1 if deformer.is_static or t1_ns <= t0_ns else min(max(_SAMPLES, (t1_ns - t0_ns) // _STEP_NS), _MAX_SAMPLES)
         )
+        # One time more than there are steps; a single one for what is at rest.
         times = tuple(int(t) for t in np.linspace(t0_ns, t1_ns, count + (count > 1)).round())
         low, high, margin, before = np.full(3, np.inf), np.full(3, -np.inf), 0.0, None
         for i, t in enumerate(times):

@@ -120,6 +120,7 @@ def bunting(seed: int) -> np.ndarray:
     b = b if rng.random() < 0.5 else np.array([245.0, 242, 235])
     u, v = np.meshgrid(*[(np.arange(_SIZE) + 0.5) / _SIZE] * 2)
     image = np.broadcast_to(a, (_SIZE, _SIZE, 3)).copy()
+    # 0, 1: three stripes; 2: a cross in a cross; 3: halves and a disc; 4: nine stripes and a triangle; 5: a chequer.
     kind = int(rng.integers(6))
     if kind == 0:
         image[(v > 1 / 3) & (v < 2 / 3)], image[v >= 2 / 3] = b, c
@@ -130,6 +131,7 @@ def bunting(seed: int) -> np.ndarray:
         image[(np.abs(u - 0.36) < 0.045) | (np.abs(v - 0.5) < 0.065)] = c
     elif kind == 3:
         image[v > 0.5] = b
+        # A circle on a flag whose sides are 3:2.
         image[((u - 0.5) * 1.5) ** 2 + (v - 0.5) ** 2 < 0.08] = c
     elif kind == 4:
         image[(v * 9).astype(int) % 2 == 1] = b

@@ -105,6 +105,7 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(width)], axis=1)
     directions = np.cos(latitude)[:, None, None] * flat
     directions[..., 2] = np.sin(latitude)[:, None]
+    # A zone of the unit sphere has an area of 2 pi times its height.
     return directions, (np.sin(edges[:-1]) - np.sin(edges[1:])) * (2 * np.pi / width)
 
 

@@ -188,6 +188,7 @@ def _bilinear(table: np.ndarray, x: np.ndarray, y: np.ndarray, wraps: bool = Fal
     x0, y0 = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), max(height - 2, 0))
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     y1 = np.minimum(y0 + 1, height - 1)
+    # A panorama's columns go around.
     x0, x1 = (np.mod(x0, width), np.mod(x0 + 1, width)) if wraps else (x0, np.minimum(x0 + 1, width - 1))
     return (table[y0, x0] * (1 - fx) + table[y0, x1] * fx) * (1 - fy) + (
         table[y1, x0] * (1 - fx) + table[y1, x1] * fx

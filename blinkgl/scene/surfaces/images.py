@@ -308,6 +308,7 @@ def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.
     faces = []
     for forward, to_right, to_down in SKY_SIDES:
         ray = np.asarray(forward, float) + right[..., None] * to_right + down[..., None] * to_down
+        # Longitude grows clockwise as seen from above, against the azimuth.
         longitude = -np.arctan2(ray[..., 1], ray[..., 0])
         latitude = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
         # The last 2 is for the columns added on the left.

@@ -80,6 +80,7 @@ def _value_noise(rng, size: int, cells: int) -> np.ndarray:
     corner = rng.random((cells, cells))
     i, j, f = _lattice(size, cells)
     w = _smooth(f)
+    # Bilinear with smooth weights: along axis 0, then along axis 1.
     rows = corner[i] * (1 - w)[:, None] + corner[j] * w[:, None]
     return rows[:, i] * (1 - w) + rows[:, j] * w
 
@@ -175,7 +176,9 @@ def _dots(rng, size):
         x = np.arange(int(cx - radius), int(cx + radius) + 2)
         y = np.arange(int(cy - radius), int(cy + radius) + 2)
         inside = (x[None, :] + 0.5 - cx) ** 2 + (y[:, None] + 0.5 - cy) ** 2 < radius**2
+        # The texture repeats, so a disc goes on at the opposite side.
         patch = np.ix_(y % size, x % size)
+        # 0: no disc covers the pixel.
         field[patch] = np.where(inside, colour + 1, field[patch])
     return field
 

@@ -382,7 +382,7 @@ class Tiles:
 def clock_offset(events: Events, changes: np.ndarray, clock_us: np.ndarray, size: tuple[int, int]) -> tuple[int, float]:
     """Return the offset of the frames' times, µs, for which polarity sums best follow ``changes`` (K, H, W), of the
     frames' blurred logarithms, and the mean correlation over the intervals there; searched within ``MOST_SHIFT_US`` and
-    half a frame interval."""
+    three quarters of a frame interval."""
     pairs = list(range(len(clock_us) - 1))
     if not pairs:
         return 0, float("nan")

@@ -370,7 +370,7 @@ def _gait(parts: Iterable[Part]) -> tuple[str, float]:
 
 
 def _rotation(rng, resting: bool) -> np.ndarray:
-    """Return (3, 3). Flying: uniform over rotations. Resting: any heading, upright or, for half of them, lying on its
+    """Return (3, 3). Flying: uniform over rotations. Resting: any heading, upright or, for three in ten, lying on its
     side."""
     if not resting:
         return Rotation.random(rng=rng).as_matrix()

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.integrate import trapezoid
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit, ndtr
 from scipy.stats import binom, ks_2samp, poisson
@@ -246,7 +247,7 @@ def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: floa
         # at: the logarithms of the median and the spread, and the logit of the share of pairs by chance.
         median, spread, chance = at[0], np.exp(at[1]), expit(at[2])
         pdf = lambda x: np.exp(-0.5 * ((x - median) / spread) ** 2) / spread
-        whole = np.trapezoid(pdf(grid) * (1 - np.exp(grid) / seconds), grid)
+        whole = trapezoid(pdf(grid) * (1 - np.exp(grid) / seconds), grid)
         room = np.maximum(1 - gap / seconds, 1e-9)
         # The law of ln(delay) becomes one of the delay by 1 / gap. Both events must be within the recording, which
         # for two independent ones gives the triangular law 2 (1 - gap / T) / T.

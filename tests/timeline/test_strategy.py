@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
@@ -220,6 +221,6 @@ def test_few_steps_are_refused_where_the_pace_changes_smoothly(speed):
     """A tenth more paces than frames at most, and a tenth more frames than the bound takes."""
     asked = []
     times = list(displacement_times(0.5, MS // 10, 20 * MS, 0, 100 * MS, lambda t: asked.append(t) or speed(t)))
-    least = np.trapezoid(speed(np.linspace(0, 100 * MS, 10_001)), dx=1e-5) / 0.5
+    least = trapezoid(speed(np.linspace(0, 100 * MS, 10_001)), dx=1e-5) / 0.5
     assert len(asked) <= 1.1 * len(times)
     assert len(times) <= 1.1 * least + 2

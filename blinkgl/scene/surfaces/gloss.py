@@ -15,6 +15,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from scipy.integrate import trapezoid
 
 from blinkgl.scene.surfaces.environment import pixel_directions
 
@@ -124,7 +125,7 @@ def mean_energy() -> np.ndarray:
     """Return :func:`energy` with reflectance 1, (roughness 32,), averaged over all directions with their cosine as
     weight."""
     E, mu = energy().sum(axis=2), np.arange(_ANGLES) / (_ANGLES - 1)
-    return np.trapezoid(2 * mu * E, mu, axis=1)
+    return trapezoid(2 * mu * E, mu, axis=1)
 
 
 def several(F0: np.ndarray, roughness: np.ndarray) -> np.ndarray:

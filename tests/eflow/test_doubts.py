@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("torch")
+
 from blinkgl.types.events import Events
 from eflow.cli import run
 from eflow.infer import doubts

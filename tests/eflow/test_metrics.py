@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("torch")
+
 from eflow.metrics import Tally, angle_2d, angle_3d, frame_metrics
 
 

@@ -7,14 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
-from blinkgl.config.sequence import RenderConfig
-from blinkgl.errors import GLError
-from blinkgl.gl import Target
-from blinkgl.render.renderer import Renderer
-from blinkgl.render.tensors import TextureReader
-from render_scenes import mixed_scene
+torch = pytest.importorskip("torch")
+
+from blinkgl.config.sequence import RenderConfig  # noqa: E402
+from blinkgl.errors import GLError  # noqa: E402
+from blinkgl.gl import Target  # noqa: E402
+from blinkgl.render.renderer import Renderer  # noqa: E402
+from blinkgl.render.tensors import TextureReader  # noqa: E402
+from render_scenes import mixed_scene  # noqa: E402
 
 
 def test_a_frame_as_a_tensor_is_what_is_read(gl):

@@ -8,22 +8,23 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 import yaml
 
-import blinkgl
-from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.run import load_run
-from blinkgl.dataset.generate import generate_sequence
-from blinkgl.dataset.verify import verify_dataset
-from blinkgl.errors import ConfigError, EventDataError
-from blinkgl.events import Esim
-from blinkgl.events.v2e import V2e
-from blinkgl.sequence_files.sequence_dir import read_manifest
-from blinkgl.tensors import emulator as devices
-from blinkgl.tensors.choice import make_on_device
-from same_events import assert_same
-from tests.tiny_recipe import TINY
+torch = pytest.importorskip("torch")
+
+import blinkgl  # noqa: E402
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig  # noqa: E402
+from blinkgl.config.run import load_run  # noqa: E402
+from blinkgl.dataset.generate import generate_sequence  # noqa: E402
+from blinkgl.dataset.verify import verify_dataset  # noqa: E402
+from blinkgl.errors import ConfigError, EventDataError  # noqa: E402
+from blinkgl.events import Esim  # noqa: E402
+from blinkgl.events.v2e import V2e  # noqa: E402
+from blinkgl.sequence_files.sequence_dir import read_manifest  # noqa: E402
+from blinkgl.tensors import emulator as devices  # noqa: E402
+from blinkgl.tensors.choice import make_on_device  # noqa: E402
+from same_events import assert_same  # noqa: E402
+from tests.tiny_recipe import TINY  # noqa: E402
 
 CARD, SOFTWARE = SimpleNamespace(is_software=False), SimpleNamespace(is_software=True)
 

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-import torch
 
-from blinkgl.events import arith, grids, philox
-from blinkgl.tensors import TensorEsim, arith as ours, event_counts, latest_times, time_surface, voxel_grid
-from blinkgl.tensors.batch import NEVER_US
+torch = pytest.importorskip("torch")
+
+from blinkgl.events import arith, grids, philox  # noqa: E402
+from blinkgl.tensors import TensorEsim, arith as ours, event_counts, latest_times, time_surface, voxel_grid  # noqa: E402
+from blinkgl.tensors.batch import NEVER_US  # noqa: E402
 
 RNG = np.random.default_rng(0)
 WIDE32 = np.exp(RNG.uniform(-20, 20, 100_003)).astype(np.float32)

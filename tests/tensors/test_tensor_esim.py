@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
-import torch
 
-import blinkgl
-from blinkgl.config.events import EsimConfig, V2eConfig
-from blinkgl.errors import EventDataError
-from blinkgl.events.esim import Esim
-from blinkgl.events.v2e import V2e
-from blinkgl.tensors import TensorEsim, TensorV2e, batch
-from same_events import assert_same, compare
+torch = pytest.importorskip("torch")
+
+import blinkgl  # noqa: E402
+from blinkgl.config.events import EsimConfig, V2eConfig  # noqa: E402
+from blinkgl.errors import EventDataError  # noqa: E402
+from blinkgl.events.esim import Esim  # noqa: E402
+from blinkgl.events.v2e import V2e  # noqa: E402
+from blinkgl.tensors import TensorEsim, TensorV2e, batch  # noqa: E402
+from same_events import assert_same, compare  # noqa: E402
 
 OPTIONS = {
     "defaults": {},

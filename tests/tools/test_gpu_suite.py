@@ -7,6 +7,10 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("torch")
+
 from blinkgl.tools import gpu_suite
 
 ROOT = Path(__file__).parents[2]

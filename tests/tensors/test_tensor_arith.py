@@ -6,7 +6,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from blinkgl.events import arith, grids, philox  # noqa: E402
-from blinkgl.tensors import TensorEsim, arith as ours, event_counts, latest_times, time_surface, voxel_grid  # noqa: E402
+from blinkgl.tensors import (  # noqa: E402
+    TensorEsim,
+    arith as ours,
+    event_counts,
+    latest_times,
+    time_surface,
+    voxel_grid,
+)
 from blinkgl.tensors.batch import NEVER_US  # noqa: E402
 
 RNG = np.random.default_rng(0)

@@ -105,8 +105,11 @@ def test_items_name_their_sensor():
 
 
 def test_former_names_stay_for_one_release(recorded):
-    former = blinkgl.record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["forward"])
+    with pytest.deprecated_call(match=r"record\(source, rig\)"):
+        former = blinkgl.record_rig(box_scene(), RIG, timeline=TIMELINE, labels=["forward"])
     assert isinstance(former, blinkgl.RigRecording) and set(former.imu) == {"rgb", "imu"}
     np.testing.assert_array_equal(former.t_us, recorded.rig_t_us)
-    with blinkgl.simulate_rig(box_scene(), RIG, timeline=TIMELINE, labels=[]) as sequence:
+    with pytest.deprecated_call(match="simulate_sequence"):
+        made = blinkgl.simulate_rig(box_scene(), RIG, timeline=TIMELINE, labels=[])
+    with made as sequence:
         assert {member.name for member, _ in sequence} == {member.name for member in sequence.members}

@@ -15,6 +15,7 @@ PYTHONS = ("3.11", "3.12", "3.13")
 EXTRAS = ".[dev,physics,view,formats]"
 nox.options.error_on_missing_interpreters = False
 nox.options.reuse_venv = "yes"
+nox.options.envdir = str(ROOT / ".nox")  # not in tools/, where the tests would take it for code
 
 
 def run_tests(session: nox.Session, constraints: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -216,10 +217,6 @@ class Gathered:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Iteration over a rig's sequence during its simulation, and one in memory.
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 # Former names; they stay for one release.
 
 RigRecording = Recording
@@ -228,12 +225,14 @@ RigRecording = Recording
 
 def record_rig(*arguments: Any, **settings: Any) -> Recording:
     """Write ``record(source, rig)``, whose ``units`` and ``rig_t_us`` are called ``imu`` and ``t_us`` here."""
+    warnings.warn("write record(source, rig) instead of record_rig", DeprecationWarning, stacklevel=2)
     made = record(*arguments, **settings)
     return replace(made, imu=cast(Any, made.units), t_us=made.rig_t_us)
 
 
 def simulate_rig(*arguments: Any, **settings: Any) -> Simulation:
     """Write ``simulate_sequence(source, rig)``, whose items have a ``sensor``; here they are (member, item) pairs."""
+    warnings.warn("write simulate_sequence(source, rig) instead of simulate_rig", DeprecationWarning, stacklevel=2)
     made = simulate_sequence(*arguments, **settings)
     made.in_pairs = True
     return made

@@ -75,7 +75,9 @@ class SensorConfig(Config):
         None, ge=0, le=1e7, description="Photoreceptor bandwidth in good light, Hz; 0: unlimited."
     )
     refractory_us: float | None = Field(None, ge=0, le=1e9, description="Dead time of a pixel, microseconds.")
-    leak_rate_hz: float | None = Field(None, ge=0, le=1e4, description="Leak events per second and pixel.")
+    leak_rate_hz: float | None = Field(
+        None, ge=0, le=1e4, description="Leak events per second and pixel; null: 0.01 with V2E and the Voltmeter."
+    )
     shot_noise_rate_hz: float | None = Field(
         None, ge=0, le=1e4, description="Noise events per second and pixel in the dark."
     )

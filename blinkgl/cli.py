@@ -30,8 +30,8 @@ def doctor(
     backend: Annotated[str, typer.Option(help="OpenGL backend to examine: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
 ) -> int:
-    """Report what this machine offers, what is missing, and the command that installs it. Exit status 2 if something
-    required is missing."""
+    """Report what this machine offers and what is missing. Every missing part has the command that installs it. Exit
+    status 2 if something required is missing."""
     from blinkgl.show import doctor as command
 
     return command.run(backend, device, as_json)
@@ -52,7 +52,13 @@ def generate(
         str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")
     ],
     num: Annotated[
-        int | None, typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")
+        int | None,
+        typer.Option(
+            "--num",
+            "-n",
+            min=1,
+            help="Sequences of the run, dealt over its groups by their shares (default: output.sequences).",
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
     overrides: Annotated[
@@ -98,8 +104,8 @@ def generate(
         str | None, typer.Option(help="When all are complete, also write them as OUT-LAYOUT (blinkgl export --layout).")
     ] = None,
 ) -> int:
-    """Generate sequences of events and optical flow from one YAML file. Exit status 3: done, but some sequences were
-    set aside."""
+    """Generate sequences of events and optical flow from a YAML file. Exit status 3: done, but some sequences were set
+    aside."""
     from blinkgl.show import generate as command
     from blinkgl.show.generate import choose_executor
 
@@ -133,7 +139,8 @@ def view(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
-    """View sequences in the browser: frames, events, labels and the scene in 3-D (extra [view]). Ctrl-C ends it."""
+    """View sequences in the browser (extra [view]). The page shows frames, events, labels and the scene in 3-D. Ctrl-C
+    ends it."""
     from blinkgl.show import view as command
 
     return command.run(sequences, port=port, save=save, overwrite=overwrite)
@@ -151,8 +158,8 @@ def verify(
         str | None, typer.Option(help="Folder for the recipe's relative paths (default: as recorded).")
     ] = None,
 ) -> int:
-    """Check a data set: names, manifests, checksums, contents, drawn values. Exit status 2 when something is wrong; the
-    last line lists what could not be compared."""
+    """Check the files and contents of a data set. Names, manifests, checksums, contents and drawn values are compared.
+    Exit status 2 when something is wrong; the last line lists what could not be compared."""
     from blinkgl.show import verify as command
 
     return command.run(folder, deep=sample if deep else 0, seed=seed, base=base)
@@ -169,7 +176,7 @@ def explain(
         list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
     ] = None,
 ) -> int:
-    """Report what a run models, what it leaves out and why, and its cost. Writes nothing."""
+    """Report what a run models, what it leaves out, and its cost. Writes nothing."""
     from blinkgl.show import explain as command
 
     return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
@@ -237,8 +244,8 @@ def trade(
         ),
     ] = None,
 ) -> int:
-    """Measure the cost of accuracy: settings are timed and compared with a converged reference; writes a table, a plot
-    and a page."""
+    """Measure the cost of accuracy of a scene. Settings are timed and compared with a converged reference; the result
+    is a table, a plot and a page."""
     from blinkgl.tools.trade import command
 
     if suite:
@@ -289,7 +296,7 @@ def report(
     examples: Annotated[int, typer.Option(min=0, max=100, help="Number of sequences shown in pictures.")] = 6,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing --out.")] = False,
 ) -> int:
-    """Write one self-contained HTML page about a data set; without --out also its index.jsonl."""
+    """Write one self-contained HTML page about a data set. Without --out it also writes the set's index.jsonl."""
     from blinkgl.show import report as command
 
     return command.run(folder, out, examples=examples, overwrite=overwrite)
@@ -314,8 +321,8 @@ def export(
         typer.Option(min=0, help="Seed of the samples' order in shards; a reader then only needs to shuffle shards."),
     ] = None,
 ) -> int:
-    """Write a data set as WebDataset shards, one sample per flow label, or in the layout of another data set's
-    loaders."""
+    """Write a data set for the loaders of other programs. The default is WebDataset shards, one sample per flow
+    label."""
     from blinkgl.show import export as command
 
     return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)

@@ -163,8 +163,8 @@ def compare(
         ),
     ] = False,
 ) -> int:
-    """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against
-    brightness."""
+    """Describe a recording, or compare it with events or frames. The table has counts, rates, intervals, and
+    polarity against brightness."""
     from blinkgl.io.frames import Declared
     from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
@@ -245,7 +245,7 @@ def calibrate(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
-    """Fit an emulator to a camera's recording; writes a sensor file, and a page that shows how close the fit is."""
+    """Fit an emulator to a camera's recording. It writes a sensor file, and a page that shows how close the fit is."""
     from blinkgl.io.reading import EventReading
     from blinkgl.show import calibrate as command
 
@@ -350,8 +350,8 @@ def import_(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
 ) -> int:
-    """Convert a scene of Blender, or of a format that Blender reads, to GLB (extra [cycles]); report what was converted
-    and what was not."""
+    """Convert a scene of Blender or a format it reads to GLB. It reports what was converted and what was not (extra
+    [cycles])."""
     from blinkgl.show import import_ as command
 
     return command.run(

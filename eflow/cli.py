@@ -115,7 +115,8 @@ def render(
     workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
     quiet: Quiet = False,
 ) -> None:
-    """Render windows of a recipe into a folder that several trainings can share. Ctrl-C keeps the finished windows."""
+    """Render windows of a recipe into a folder for trainings. Several trainings can share it. Ctrl-C keeps the finished
+    windows."""
     from blinkgl.sequence_files.sequence_dir import refuse_existing
     from eflow.data.online import open_online
     from eflow.data.pool import render_pool
@@ -164,7 +165,7 @@ def evaluate(
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Score a network or a method on a data set, beside baselines: zero flow, and global motions fitted to the
+    """Score a network or a method on a data set. Beside it stand baselines: zero flow, and global motions fitted to the
     truth."""
     from blinkgl.machine.terminal import plain_console
     from eflow.data.sources import FORMATS, open_source
@@ -243,7 +244,7 @@ def predict(
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Compute the flow of any event file, by a network or by a method that needs no training.
+    """Compute the flow of any event file. Networks do it, and methods that need no training.
 
     FWL (flow warp loss) says how much sharper the events of the new window become when the flow moves them back to its
     start; above 1 the flow helps."""
@@ -317,8 +318,8 @@ def import_(
     checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
 ) -> None:
-    """Convert a published checkpoint of E-RAFT to a file for predict, evaluate, submit and train (init_from). Only
-    tensors are read. The file also stores E-RAFT's padding, border and time bins."""
+    """Convert a published checkpoint of E-RAFT to one of eflow. predict, evaluate, submit and train (init_from) read
+    it. Only tensors are read. The file also stores E-RAFT's padding, border and time bins."""
     from eflow.models import parameters_of
     from eflow.published import import_published
 
@@ -360,8 +361,8 @@ def pack(
     ],
     raw: Raw = False,
 ) -> None:
-    """Pack a checkpoint as a network that can come with the package: weights (5 MB at most, above it in half precision)
-    and a card.
+    """Pack a checkpoint as a network that can come with the package. It has weights (5 MB at most, above it in half
+    precision) and a card.
 
     The weights are read back before the folder appears."""
     from eflow import shipped

@@ -198,3 +198,13 @@ def test_sides_of_files_are_an_override(monkeypatch, words, given):
     monkeypatch.setattr("blinkgl.show.generate.run", lambda *_, **keys: seen.update(keys) or 0)
     assert cli.run(["generate", "a.yaml", "-o", "out", "--set", "seed=3", *words]) == 0
     assert seen["overrides"] == ["seed=3", *(f"scene.both_sides={value}" for value in given)]
+
+
+@pytest.mark.parametrize("program", ["blinkgl", "blinkgl shader", "eflow"])
+def test_every_summary_fits_80_columns(program, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    name, *group = program.split()
+    __import__({"blinkgl": "blinkgl.cli", "eflow": "eflow.cli"}[name], fromlist=["run"]).run([*group, "--help"])
+    out = capsys.readouterr().out
+    assert "Commands:" in out and "..." not in out.partition("Commands:")[2]
+    assert max(map(len, out.splitlines())) <= 80

@@ -237,5 +237,6 @@ def plan_of(root: Path) -> Plan | None:
     with suppress(FileNotFoundError):
         open(open_regular(recipe), "rb").close()
         template = load_run(recipe)
-        return Plan.of(RunTemplate(template.tree, Path(known.get("base", "."))), known.get("num"))
+        template = RunTemplate(template.tree, Path(known.get("base", ".")))
+        return Plan.of(template, known.get("num"), of_each=known["format_version"] < 3)
     return None

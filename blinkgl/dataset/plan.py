@@ -109,21 +109,31 @@ class Plan:
     """Number of sequences of each group that has any."""
 
     @classmethod
-    def of(cls, template: RunTemplate, num: int | None = None) -> Plan:
-        """Return the plan. ``num``: at most this many of each group (a configuration without groups: exactly this
-        many).
+    def of(cls, template: RunTemplate, num: int | None = None, *, of_each: bool = False) -> Plan:
+        """Return the plan. ``num``: sequences of the whole run, dealt over the groups by their own numbers, so that a
+        larger ``num`` only adds.   of_each : ``num`` is the most of each group, as in records before format_version 3.
 
         Raises ConfigError: any bad value of the recipe, or all groups disabled."""
         groups = template.groups
-        parts = []
-        for group in groups:
-            count = group.count if num is None else num if group.name == "" else min(num, group.count)
-            output = validate(OutputConfig, group.template.tree.get("output") or {}, where="output")
-            if group.enabled:
-                parts.append((group.name, output, group.first, count))
-        if not parts:
+        enabled = [group for group in groups if group.enabled]
+        if not enabled:
             raise ConfigError("all groups are disabled", where="groups", accepted="enabled: true in at least one")
-        return cls(template, groups, Tasks(parts), {name: count for name, _, _, count in parts})
+        counts = [group.count for group in enabled]
+        if of_each and num is not None and enabled[0].name:
+            counts = [min(num, count) for count in counts]
+        elif num is not None:
+            counts = _dealt(num, counts)
+        parts = [
+            (
+                group.name,
+                validate(OutputConfig, group.template.tree.get("output") or {}, where="output"),
+                group.first,
+                n,
+            )
+            for group, n in zip(enabled, counts, strict=True)
+            if n
+        ]
+        return cls(template, groups, Tasks(parts), {name: n for name, _, _, n in parts})
 
     @cached_property
     def by_name(self) -> dict[str, Group]:
@@ -146,6 +156,15 @@ class Plan:
     def recipe_text(self) -> str:
         """Return the recipe with all overrides, as YAML that ``load_run`` reads."""
         return to_yaml(self.template.tree)
+
+
+def _dealt(num: int, counts: list[int]) -> list[int]:
+    """Return ``num`` dealt in proportion to ``counts`` by the method of Sainte-Laguë, in which no share falls when
+    ``num`` grows."""
+    shares = [max(num * count // sum(counts) - len(counts), 0) for count in counts]
+    while sum(shares) < num:
+        shares[min(range(len(counts)), key=lambda k: (2 * shares[k] + 1) / counts[k])] += 1
+    return shares
 
 
 def check_output(out: str | Path) -> None:

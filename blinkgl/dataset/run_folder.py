@@ -45,8 +45,8 @@ class _Run(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="allow")
     format: Literal["blinkgl-run"]
-    format_version: Literal[1, 2]
-    """1: without checksums.json"""
+    format_version: Literal[1, 2, 3]
+    """1: without checksums.json; below 3 num is the most sequences of each group, since then of the run"""
     groups: dict[str, str]
     environment: dict[str, str]
     mixed: list[dict[str, dict[str, str]]] = []
@@ -259,7 +259,7 @@ class RunFolder:
             "run.json",
             {
                 "format": FORMAT,
-                "format_version": 2,
+                "format_version": 3,
                 "groups": known["groups"],
                 "environment": known["environment"],
                 "mixed": later,

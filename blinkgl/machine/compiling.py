@@ -7,12 +7,14 @@ numba is not imported here: commands that need no kernel start without it.
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
 
-SAY_EVERY_S = 10.0
-"""Seconds of compiling between two lines, so that a program does not seem to hang."""
+_ALL_KERNELS = "blinkgl.show.compile_kernels"
+"""The program that compiles the kernels of the common commands. It uses every room, so it runs as a process."""
 
 
 class Watch:
@@ -21,25 +23,34 @@ class Watch:
 
     def __init__(self) -> None:
         self.seconds, self.kernels, self._depth, self._began = 0.0, 0, 0, 0.0
-        self._next_line_s = 0.0
         self.say: Callable[[str], None] | None = None
+        self.all_compiled = False
+        """whether the kernels of the common commands need no compiling, or cannot be kept"""
 
     def start(self) -> None:
         self._depth += 1
         if self._depth == 1:
             self._began = time.perf_counter()
-            if self.say is not None and not self._next_line_s:
-                self.say("compiling kernels, once per machine: this may take a minute or two")
-                self._next_line_s = self.seconds + SAY_EVERY_S
 
     def end(self) -> None:
         self._depth -= 1
         if self._depth == 0:
             self.seconds += time.perf_counter() - self._began
             self.kernels += 1
-            if self.say is not None and self.seconds >= self._next_line_s:
-                self.say(f"compiling kernels: {self.kernels} done in {self.seconds:.0f} s")
-                self._next_line_s = self.seconds + SAY_EVERY_S
+
+    def compile_all(self) -> bool:
+        """Compile the kernels of the common commands where a command line meets the first one that is not on disk, so
+        that no later command waits. Returns whether it was done now."""
+        if self.say is None or self.all_compiled:
+            return False
+        self.all_compiled = True
+        self.say("compiling kernels, once per machine and version: about a minute")
+        self.start()
+        done = subprocess.run([sys.executable, "-m", _ALL_KERNELS], capture_output=True, text=True, check=False)
+        self.end()
+        for line in done.stdout.splitlines():
+            self.say(line)
+        return True
 
 
 watch = Watch()
@@ -53,8 +64,8 @@ def compiled_s() -> float:
 
 @contextlib.contextmanager
 def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
-    """Call ``say`` with a sentence when the first kernel is compiled inside, and with another every :data:`SAY_EVERY_S`
-    seconds of compiling. Only the innermost of several listeners is called."""
+    """Call ``say`` with a sentence when the first kernel inside is not on disk, and with another when all are compiled.
+    Only the innermost of several listeners is called."""
     outer, watch.say = watch.say, say
     try:
         yield
@@ -64,6 +75,7 @@ def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
 
 def kernel_cache_failed(what: str) -> None:
     """Report the problem ``what`` of the kernels on disk to the listener of compiling, else as a warning."""
+    watch.all_compiled = True
     if watch.say is not None:
         watch.say(f"warning: {what}")
     else:
@@ -73,8 +85,3 @@ def kernel_cache_failed(what: str) -> None:
 def working_clock() -> float:
     """Return ``time.perf_counter()`` without the compilation."""
     return time.perf_counter() - watch.seconds
-
-
-def compiling_line(seconds: float) -> str:
-    """Return "compiling kernels, once per machine: 14 s"; "" where almost nothing was compiled."""
-    return f"compiling kernels, once per machine: {seconds:.0f} s" if seconds >= 0.5 else ""

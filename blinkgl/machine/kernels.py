@@ -80,7 +80,10 @@ class _Cache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
+            if found is None and watch.compile_all():
+                found = super().load_overload(sig, target_context)
+            return found
         except Exception:  # noqa: BLE001 - damaged bytes raise anything
             self._say("the kernels kept there are damaged or unreadable and are compiled again")
             with contextlib.suppress(OSError):

@@ -283,10 +283,20 @@ def _numba() -> Iterator[Check]:
         )
         return f"{widest} on {binding.get_host_cpu_name()}"
 
+    def kernels() -> str:
+        from blinkgl.machine.compiling import compiled_s
+        from blinkgl.recordings.simulation import frames_to_events
+
+        began = compiled_s()
+        list(frames_to_events(np.full((2, 8, 8), 0.5, np.float32), fps=100))
+        took = compiled_s() - began
+        return f"compiled in {took:.0f} s, once per machine and version" if took else "compiled before"
+
     mend = f"{python()} -m pip install --force-reinstall numba"
     yield _try(section, "numba", version, mend)
     yield _try(section, "threads", threads, mend)
     yield _try(section, "SIMD", simd, mend)
+    yield _try(section, "kernels", kernels, mend)
     yield Check(
         section,
         "bf16",

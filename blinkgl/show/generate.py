@@ -21,12 +21,15 @@ from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
 from blinkgl.layouts.export import refuse_plan
-from blinkgl.machine.compiling import compiling_line
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 from blinkgl.show import export
 
 MAX_NOTES = 20
 """Number of files whose undrawn features are listed."""
+BYTES_PER_EVENT = 3.3
+"""Size of a data set by its events, labels included: sets of `demo` and README's example have 3.0 and 3.5."""
+FORETOLD_AT = 0.3
+"""Part of the first sequence after which time and size of the run are foretold."""
 SET_ASIDE = 3
 """Exit status of a finished run with missing sequences."""
 
@@ -107,6 +110,7 @@ class Display:
         self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames and events of sequences in progress
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
         self._notes: set[str] = set()
+        self._foretold = False
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
         self._todo, self._started = len(plan.tasks) - outcome.found, time.monotonic()
@@ -135,6 +139,10 @@ class Display:
                 else "labels, files"
             )
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
+            if not self._foretold and message["fraction"] >= FORETOLD_AT:
+                self._foretold = True
+                size = message["events"] / message["fraction"] * BYTES_PER_EVENT * self._todo
+                self._say(f"expected: about {_clock(self._left_s())} and {_size(size)}")
         else:
             self._at_work.pop(name, None)
             if name in self._tasks:
@@ -155,9 +163,7 @@ class Display:
                 f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: "
                 f"{message['error']}"
             )
-        self._bars.update(
-            self._total, completed=self._done + sum(f for f, _, _ in self._at_work.values()), detail=self.summary()
-        )
+        self._bars.update(self._total, completed=self._made(), detail=self.summary())
 
     def end(self, outcome: Outcome) -> None:
         self._bars.stop()
@@ -172,9 +178,8 @@ class Display:
             f"{frames / elapsed:.0f} frames/s",
             f"{events / elapsed / 1e6:.2f} M events/s",
         ]
-        if made := self._done + sum(f for f, _, _ in self._at_work.values()):
-            left = (self._todo - self._given_up - made) * elapsed / made
-            parts.append(f"{int(left // 3600)}:{int(left // 60) % 60:02d}:{int(left) % 60:02d} left")
+        if self._made():
+            parts.append(f"{_clock(self._left_s())} left")
         if self._done:
             expected = self._bytes / self._done * self._todo
             room = shutil.disk_usage(self._out).free
@@ -182,6 +187,14 @@ class Display:
             if expected - self._bytes > room:
                 parts.append(f"DISK: only {_size(room)} free")
         return ", ".join(parts)
+
+    def _made(self) -> float:
+        """Return the sequences made so far, those in progress by their part."""
+        return self._done + sum(fraction for fraction, _, _ in self._at_work.values())
+
+    def _left_s(self) -> float:
+        made = self._made()
+        return (self._todo - self._given_up - made) * (time.monotonic() - self._started) / made
 
     def _note(self, lines: Iterable[str]) -> None:
         """Print what was guessed or is not drawn, once per file, for all sequences and workers."""
@@ -205,14 +218,16 @@ def _shares(seconds: dict[str, float]) -> str:
     return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
 
 
+def _clock(seconds: float) -> str:
+    return f"{int(seconds // 3600)}:{int(seconds // 60) % 60:02d}:{int(seconds) % 60:02d}"
+
+
 def _size(size: float) -> str:
     return f"{size / 1e9:.2f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB"
 
 
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     """Print the final table and the failed sequences."""
-    if line := compiling_line(outcome.made.compile_s):
-        say(console, line)
     if outcome.made:
         show_table(console, outcome.made, outcome.elapsed_s)
     else:

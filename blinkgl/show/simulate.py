@@ -112,8 +112,6 @@ def run(
 
 def _told(console: Console, target: str, report: SimulationReport) -> None:
     """Print counts of events made and lost, one line each."""
-    from blinkgl.machine.compiling import compiled_s, compiling_line
-
     rate = report.events / report.duration_s if report.duration_s else 0.0
     say(
         console,
@@ -140,8 +138,6 @@ def _told(console: Console, target: str, report: SimulationReport) -> None:
         say(console, str(report.displacement))
     elif report.steps > report.frames:
         say(console, f"{report.steps - report.frames} of the frames were interpolated, not recorded")
-    if line := compiling_line(compiled_s()):
-        say(console, line)
     if report.causes:
         say(console, causes_line(report.causes, report.duration_s))
     if report.lost:

@@ -1,23 +1,28 @@
 """Many workers, any interruption, the same bytes: faults are injected into real runs, and what is left is compared."""
 
+import io
+import itertools
 import json
 import os
 import signal
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.config.run import load_run
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.dataset import run as run_module
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.plan import Plan
-from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, OutputError
+from blinkgl.machine.terminal import plain_console
 from blinkgl.sequence_files.index import read_index
+from blinkgl.show.generate import Display
 from runs import NAMES, RECIPE, Listener, alive, assert_same, children, recipe_file, start, temporaries, tree, wait_for
 
 
@@ -205,7 +210,7 @@ def test_a_corrupt_asset_costs_the_sequences_that_need_it(tmp_path, capsys):
 
 def test_another_recipe_is_refused(tmp_path):
     recipe = load_run(recipe_file(tmp_path))
-    run_dataset(recipe, tmp_path / "out", num=1)
+    run_dataset(recipe, tmp_path / "out", num=3)
     before = tree(tmp_path / "out")
     other = load_run(recipe_file(tmp_path), ["groups.probe.camera.width=80"])
     for resume in (False, True):
@@ -214,10 +219,10 @@ def test_another_recipe_is_refused(tmp_path):
         ):
             run_dataset(other, tmp_path / "out", resume=resume)
     with pytest.raises(OutputError, match="exists; expected a new folder name, or --resume"):
-        run_dataset(recipe, tmp_path / "out", num=1)
+        run_dataset(recipe, tmp_path / "out", num=3)
     assert tree(tmp_path / "out") == before
-    outcome = run_dataset(other, tmp_path / "out", num=2, resume=True, mixed=True)
-    assert (outcome.found, len(outcome.made)) == (2, 2)
+    outcome = run_dataset(other, tmp_path / "out", num=6, resume=True, mixed=True)
+    assert (outcome.found, len(outcome.made)) == (3, 3)
     assert len(json.loads((tmp_path / "out/.run/run.json").read_text())["mixed"]) == 1, "the record says so"
 
 
@@ -267,3 +272,38 @@ def test_a_group_that_is_switched_off_is_not_planned(tmp_path):
     off = {name: {**group, "enabled": False} for name, group in RECIPE["groups"].items()}
     with pytest.raises(ConfigError, match="groups: all groups are disabled; expected enabled: true"):
         Plan.of(load_run(recipe_file(tmp_path, groups=off)))
+
+
+def test_num_is_of_the_whole_run_and_dealt_by_the_groups_own_numbers(tmp_path):
+    sizes = {"flying": 16, "held_out": 3, "dice": 1, "off": 40}
+    template = RunTemplate(
+        {"groups": {name: {"output": {"sequences": count}, "enabled": name != "off"} for name, count in sizes.items()}},
+        tmp_path,
+    )
+    dealt = [Plan.of(template, num).counts for num in range(1, 101)]
+    assert [sum(counts.values()) for counts in dealt] == list(range(1, 101))
+    for fewer, more in itertools.pairwise(dealt):
+        assert all(more.get(name, 0) >= count for name, count in fewer.items()), "a larger --num only adds"
+    assert dealt[19] == Plan.of(template).counts == {"flying": 16, "held_out": 3, "dice": 1}
+    assert dealt[99] == {"flying": 80, "held_out": 15, "dice": 5}
+    assert dealt[0] == {"flying": 1}
+    # Records of runs before format_version 3 mean "of each group at most".
+    assert Plan.of(template, 2, of_each=True).counts == {"flying": 2, "held_out": 2, "dice": 1}
+
+
+def test_num_of_a_run_without_groups_may_be_larger_than_the_file_says(tmp_path):
+    assert Plan.of(RunTemplate({"output": {"sequences": 2}}, tmp_path), 7).counts == {"": 7}
+
+
+def test_time_and_size_are_foretold_once():
+    display = Display(plain_console(file=(text := io.StringIO())), Path("/"))
+    display.begin(SimpleNamespace(tasks=range(4)), Outcome(4))
+    display._started -= 30.0
+    for fraction in (0.1, 0.3, 0.5):
+        display.message(
+            "train/a_000000",
+            {"kind": "progress", "fraction": fraction, "frames": 9, "events": int(1e7 * fraction), "seconds": {}},
+        )
+    lines = text.getvalue().splitlines()
+    # 30 s for 0.3 of a sequence of 10^7 events, of four: 3.7 are left.
+    assert lines == ["expected: about 0:06:10 and 0.13 GB"]

@@ -29,7 +29,7 @@ from runs import NAMES, recipe_file
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
-    run_dataset(load_run(recipe_file(folder)), folder / "out", num=2)
+    run_dataset(load_run(recipe_file(folder), ["groups.fly.output.sequences=2"]), folder / "out")
     return folder / "out"
 
 

@@ -1,6 +1,7 @@
 """Compilation is reported by itself and counts in no other figure; kernels on disk are used only if they are whole."""
 
 import importlib
+import subprocess
 import sys
 
 import numba
@@ -54,25 +55,40 @@ def test_stages_and_total_are_without_compilation(watch):
     assert clock.seconds == {"events": 1.5} and clock.total == 1.5 and clock.compile_s == 14.0
 
 
-def test_compiling_is_announced_once_and_then_every_ten_seconds(watch):
-    def compile_for(seconds):
-        watch.start()
-        watch.now[0] += seconds
-        watch.end()
+@pytest.fixture
+def ahead(monkeypatch, watch):
+    """The calls of the program that compiles all kernels, which here only prints."""
+    calls = []
 
+    def run(command, **_):
+        calls.append(command)
+        watch.now[0] += 30.0
+        return subprocess.CompletedProcess(command, 0, "compiled 70 kernels in 30 s\n")
+
+    monkeypatch.setattr(compiling.subprocess, "run", run)
+    monkeypatch.setattr(kernels, "watch", watch)
+    return calls
+
+
+def test_the_first_kernel_that_is_missing_has_all_compiled_which_is_said_once(kept, tmp_path, ahead, watch):
+    for file in tmp_path.rglob("*.nb?"):
+        file.unlink()
     outer, inner = [], []
-    with compiling.announced_compiling(outer.append):
-        with compiling.announced_compiling(inner.append):
-            for _ in range(8):
-                compile_for(3.0)
-        compile_for(7.0)
-    compile_for(50.0)  # nobody listens any more
-    assert inner == [
-        "compiling kernels, once per machine: this may take a minute or two",
-        "compiling kernels: 4 done in 12 s",
-        "compiling kernels: 8 done in 24 s",
-    ]
-    assert outer == [], "31 s is less than ten after the last line"
+    with compiling.announced_compiling(outer.append), compiling.announced_compiling(inner.append):
+        twice = kept()
+        assert twice(3) == 6 and twice(1.5) == 3.0
+    assert [call[-1] for call in ahead] == ["blinkgl.show.compile_kernels"] and outer == []
+    assert inner == ["compiling kernels, once per machine and version: about a minute", "compiled 70 kernels in 30 s"]
+    assert watch.seconds >= 30.0, "it belongs to no stage of a sequence"
+
+
+def test_nothing_is_compiled_ahead_where_nobody_listens_or_kernels_cannot_be_kept(kept, ahead, watch):
+    assert kept()(np.int8(3)) == 6
+    said = []
+    with compiling.announced_compiling(said.append):
+        compiling.kernel_cache_failed("the disk is full")
+        assert kept()(np.int16(3)) == 6
+    assert ahead == [] and said == ["warning: the disk is full"]
 
 
 @pytest.fixture
@@ -155,13 +171,12 @@ def test_an_edit_of_a_function_that_a_kernel_calls_is_seen():
     assert not any("config" in name for name in of_v2e), "no kernel calls those"
 
 
-def test_every_command_says_that_it_compiles(monkeypatch, capsys, watch):
+def test_every_command_says_that_it_compiles(monkeypatch, capsys, ahead, watch):
     app = typer.Typer()
 
     @app.command()
     def some(nothing: bool = False) -> None:
-        watch.start()
-        watch.end()
+        watch.compile_all()
 
     monkeypatch.setattr(command_line, "announced_compiling", compiling.announced_compiling)
     assert command_line.run_app(app, ["--nothing"], "some", "BlinkGL") == 0

@@ -49,7 +49,7 @@ def passes(
     overrides: Overrides = None,
     names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
 ) -> None:
-    """Write every buffer at one time as a labelled PNG and .npy, and a contact sheet."""
+    """Write every buffer at one time as PNG and .npy. A contact sheet shows all of them."""
     from blinkgl.tools.shader_debugger.commands import write_passes
 
     subject, when = _opened(config, seed, sequence, overrides, time)
@@ -68,8 +68,8 @@ def probe(
     overrides: Overrides = None,
     json: Json = False,
 ) -> None:
-    """Print every buffer at a pixel beside the float64 reference, the point's position, and why it is invalid or
-    occluded."""
+    """Print every buffer at a pixel beside the float64 reference. It also prints the point's position, and why it is
+    invalid or occluded."""
     from blinkgl.tools.shader_debugger.commands import run_probe
 
     subject, when = _opened(config, seed, sequence, overrides, time)
@@ -118,7 +118,7 @@ def check(
     device: Annotated[int, typer.Option(min=0, help="EGL device.")] = 0,
     json: Json = False,
 ) -> None:
-    """Compile every program in every variant that a configuration can need. Exit status 1 on an error."""
+    """Compile every shader in every variant that can be needed. Exit status 1 on an error."""
     from blinkgl.tools.shader_debugger import check as checking
 
     result = checking.check(files or [], shaders, backend, device)
@@ -138,7 +138,7 @@ def show(
     numbers: Annotated[bool, typer.Option("--numbers", help="Print file and line before each line.")] = False,
     shaders: Shaders = None,
 ) -> None:
-    """Print a program's source as the compiler reads it, with includes and defines expanded."""
+    """Print a program's source as the compiler reads it. Includes and defines are expanded."""
     from blinkgl.tools.shader_debugger.check import show_source
 
     typer.echo(show_source(program, define or [], stage, numbers, shaders), nl=False)
@@ -157,8 +157,8 @@ def serve(
     shaders: Shaders = None,
     overrides: Overrides = None,
 ) -> None:
-    """Serve a local page: passes, a time slider, probing by click, differences, and shaders that reload when saved.
-    Ctrl-C ends it."""
+    """Serve a local page on which passes are inspected. It has a time slider, probing by click, differences, and
+    shaders that reload when saved. Ctrl-C ends it."""
     from blinkgl.tools.shader_debugger.server import serve as run_server
 
     subject, when = _opened(config, seed, sequence, overrides, time)

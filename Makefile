@@ -1,4 +1,5 @@
 # make demo    install into .venv, check OpenGL, generate the demo sequence into out/demo
+#              EXTRAS=learn,view also installs these extras (docs/install.md lists them)
 # make test    install into .venv, check OpenGL, run the tests
 # make lint    ruff, formatting, types; what the tests last covered      make format  rewrite what the formatter would; make coverage
 # make docs    install into .venv, build the documentation into out/site
@@ -9,6 +10,7 @@
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
 
 JOBS ?= auto
+EXTRAS ?=
 WHAT ?= generate
 PIP = .venv/bin/python -m pip --disable-pip-version-check
 # setuptools warns about every editable install beside a folder of the same name; that is the layout wanted here.
@@ -20,10 +22,10 @@ INPUTS = setup.cfg setup.py pyproject.toml constraints.txt tools/setup.sh Makefi
 .PHONY: demo test lint format coverage docs slow bench fuzz matrix doctor setup opengl clean
 .DELETE_ON_ERROR:
 
-demo: .venv/.installed-core opengl
+demo: .venv/.installed-core $(if $(EXTRAS),.venv/.extras-$(EXTRAS)) opengl
 	@rm -rf out/demo
 	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
-	@echo "beside it: events.h5, flow/, images/ in DSEC's layout; README.md says what to do next"
+	@echo "beside it: events.h5, flow/, images/ in DSEC's layout. Next:  . .venv/bin/activate  and README.md"
 
 test: .venv/.installed-dev .venv/.installed-docs .venv/.kernels opengl
 	.venv/bin/python -m pytest -q -n $(JOBS) --maxprocesses 4 --dist worksteal
@@ -75,6 +77,12 @@ setup: .venv/.installed-dev opengl
 .venv/.installed-core: .venv/.made $(INPUTS)
 	@echo "installing BlinkGL into .venv (minutes the first time)"
 	@$(INSTALL) -e .
+	@touch $@
+
+.venv/.extras-%: .venv/.installed-core
+	@tools/setup.sh extras $*
+	@echo "installing the extras $* into .venv"
+	@$(INSTALL) -e '.[$*]'
 	@touch $@
 
 .venv/.installed-dev: .venv/.installed-core

@@ -54,7 +54,7 @@ def source(tmp_path_factory):
     copy = tmp_path_factory.mktemp("source")
     for name in ("setup.cfg", "setup.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, copy)
-    for name in (*PACKAGES, "tools"):
+    for name in (*PACKAGES, "docs", "tools"):
         shutil.copytree(
             REPOSITORY / name,
             copy / name,
@@ -122,6 +122,8 @@ def check_resources(bin_: Path, root: Path, elsewhere: Path) -> dict:
         suffix = {"shaders": "*.glsl", "configs": "*.yaml"}[folder]
         assert probe[folder] == {path.name: path.read_text() for path in (REPOSITORY / folder).glob(suffix)}
     assert probe["shaders"]
+    below = run(bin_ / "blinkgl", "--help", cwd=elsewhere).split("page below ")[1].split()[0]
+    assert (Path(below) / "docs" / "install.md").is_file()
     assert run(bin_ / "blinkgl", "--version", cwd=elsewhere) == f"blinkgl {probe['version']}\n"
     return probe
 
@@ -153,6 +155,7 @@ def test_wheel(source, tmp_path):
     missing = (expected_files() | {f"eflow/weights/toy/{name}" for name in NETWORK}) - names
     assert not missing, f"not in the wheel (packages and package_data in setup.cfg): {sorted(missing)}"
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]
+    assert {f"blinkgl/docs/{page.name}" for page in (REPOSITORY / "docs").glob("*.md")} <= names, "messages name them"
     programs = [name for name in names if name.startswith("blinkgl/tools/") and name.count("/") == 2]
     assert programs == ["blinkgl/tools/__init__.py"], "what only developers run"
     assert any(name.endswith("LICENSE") for name in names)

@@ -1,11 +1,12 @@
 #!/bin/sh
-# Set-up steps behind the Makefile:   tools/setup.sh venv|opengl
+# Set-up steps behind the Makefile:   tools/setup.sh venv|opengl|extras NAME,NAME
 #
 #   venv    make .venv with a current pip (python3-venv is installed when missing)
+#   extras  see that setup.cfg has extras of these names
 #   opengl  see that .venv can open a headless OpenGL context (Mesa's libraries are installed when missing)
 #
 # What is missing is installed with apt-get when this runs as root; otherwise the one command to type is printed and the
-# script stops with status 1. Both steps are quick and change nothing when there is nothing to do.
+# script stops with status 1. The steps are quick and change nothing when there is nothing to do.
 set -eu
 
 venv=.venv
@@ -80,8 +81,20 @@ check_opengl() {
     context_opens
 }
 
+# pip only warns about an extra that does not exist.
+check_extras() {
+    known=$("$python" -c 'from importlib.metadata import metadata; print(*metadata("blinkgl").get_all("Provides-Extra"))')
+    for extra in $(echo "$1" | tr , ' '); do
+        case " $known " in
+            *" $extra "*) ;;
+            *) echo "there is no extra '$extra'; expected some of: $known (docs/install.md says what each brings)" >&2; exit 1 ;;
+        esac
+    done
+}
+
 case "${1:-}" in
     venv) make_venv ;;
+    extras) check_extras "${2:-}" ;;
     opengl) check_opengl ;;
-    *) echo "usage: tools/setup.sh venv|opengl" >&2; exit 2 ;;
+    *) echo "usage: tools/setup.sh venv|opengl|extras NAME,NAME" >&2; exit 2 ;;
 esac

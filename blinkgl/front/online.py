@@ -10,6 +10,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import load
+from blinkgl.machine.extras import install
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob, stream_seed
 from blinkgl.online.samples import StreamSample, WindowSample
@@ -137,7 +138,7 @@ class OnlineSequences:
             raise ConfigError(
                 "torch is not installed",
                 where="batches",
-                accepted="pip install 'blinkgl[learn]', or iterate without it",
+                accepted=f"run {install('torch')}, or iterate without it",
             ) from None
         return Batches(self.stream, self.first, size, collate, count)
 

@@ -25,6 +25,7 @@ from blinkgl.io.alpha import over
 from blinkgl.io.ticks import frame_times
 from blinkgl.io.yuv import known, rgb_from_yuv
 from blinkgl.machine.closing import Finishing
+from blinkgl.machine.extras import install
 from blinkgl.machine.interrupts import uninterrupted
 
 if TYPE_CHECKING:
@@ -400,7 +401,7 @@ def _av(error: type, where: str | os.PathLike) -> Any:
     try:
         return _imported()
     except ImportError as problem:
-        raise error("no FFmpeg for video", where=str(where), accepted="use pip install av") from problem
+        raise error("no FFmpeg for video", where=str(where), accepted=f"run {install('av')}") from problem
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -44,8 +45,14 @@ def _global_options(
 def new_app(name: str, about: str) -> typer.Typer:
     """Return a command without commands, with the options that every command line has. about : its help."""
     app = typer.Typer(name=name, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    app.callback(help=about)(_global_options)
+    app.callback(help=about, epilog=f"docs/… in a message is a page below {pages()}")(_global_options)
     return app
+
+
+def pages() -> Path:
+    """Return the folder that holds docs/: the package's in a wheel, else the repository."""
+    package = Path(__file__).resolve().parents[1]
+    return package if (package / "docs").is_dir() else package.parent
 
 
 def run_app(

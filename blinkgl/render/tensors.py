@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from blinkgl.errors import GLError
+from blinkgl.machine.extras import install
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
@@ -38,9 +39,7 @@ def torch_device(name: Any) -> Any:
     try:
         torch = importlib.import_module("torch")
     except ImportError:
-        raise GLError(
-            "tensors need torch", where="device", accepted="pip install blinkgl[tensors], or read()"
-        ) from None
+        raise GLError("tensors need torch", where="device", accepted=f"run {install('torch')}, or use read()") from None
     try:
         return torch, torch.empty(0, device=name).device
     except Exception as error:  # noqa: BLE001 - torch raises what it likes for a device that is not there

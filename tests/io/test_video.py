@@ -133,7 +133,7 @@ def test_video_without_pictures(tmp_path):
 
 def test_no_ffmpeg(tmp_path, monkeypatch):
     monkeypatch.setattr("blinkgl.io.video._imported", lambda: (_ for _ in ()).throw(ImportError("no av")))
-    with pytest.raises(OutputError, match="no FFmpeg for video; use pip install av"):
+    with pytest.raises(OutputError, match="no FFmpeg for video; run .*pip install av"):
         VideoWriter(tmp_path / "v.mp4", 48, 64, 25)
 
 

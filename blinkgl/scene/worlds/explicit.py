@@ -20,6 +20,7 @@ from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig
 from blinkgl.config.primitives import PRIMITIVES
 from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig, object_names
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.machine.extras import install
 from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
@@ -340,7 +341,7 @@ def _material(
                 "no such photograph",
                 where=f"{where}.photograph",
                 value=config.photograph,
-                accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'",
+                accepted="one of: " + ", ".join(bundled) if bundled else f"run {install('scikit-image')}",
             )
         texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
     rough = _map(config, "metallic_roughness_map", base, where, maps)

@@ -18,6 +18,7 @@ import numpy as np
 from blinkgl.config.primitives import kinds
 from blinkgl.config.scene import TEXTURE_KINDS, PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.machine.extras import install
 from blinkgl.scene.geometry.random_primitives import random_primitive, random_primitive_hash
 from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
 from blinkgl.scene.reading import MAX_BYTES, contents
@@ -222,7 +223,7 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
                 "scikit-image's photographs are not installed",
                 where=f"{where}.photographs",
                 value=True,
-                accepted="run 'pip install scikit-image', or set it to false",
+                accepted=f"run {install('scikit-image')}, or set it to false",
             )
         entries += [Entry(content_hash(file.read_bytes()), name, "photographs", file) for name, file in bundled.items()]
     for i, folder in enumerate(config.folders):

@@ -122,7 +122,7 @@ def check_resources(bin_: Path, root: Path, elsewhere: Path) -> dict:
         suffix = {"shaders": "*.glsl", "configs": "*.yaml"}[folder]
         assert probe[folder] == {path.name: path.read_text() for path in (REPOSITORY / folder).glob(suffix)}
     assert probe["shaders"]
-    below = run(bin_ / "blinkgl", "--help", cwd=elsewhere).split("page below ")[1].split()[0]
+    below = run(bin_ / "blinkgl", "--help", cwd=elsewhere).split("page below\n")[1].strip()
     assert (Path(below) / "docs" / "install.md").is_file()
     assert run(bin_ / "blinkgl", "--version", cwd=elsewhere) == f"blinkgl {probe['version']}\n"
     return probe

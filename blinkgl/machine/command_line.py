@@ -45,7 +45,7 @@ def _global_options(
 def new_app(name: str, about: str) -> typer.Typer:
     """Return a command without commands, with the options that every command line has. about : its help."""
     app = typer.Typer(name=name, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    app.callback(help=about, epilog=f"docs/… in a message is a page below {pages()}")(_global_options)
+    app.callback(help=about, epilog=f"\b\ndocs/… in a message is a page below\n{pages()}")(_global_options)
     return app
 
 

@@ -77,14 +77,15 @@ def _of_a_sequence() -> None:
 
 def _of_files() -> None:
     """Compile the kernels of video and of event files."""
-    events = Events(*(np.arange(1, 4, dtype=kind) for kind in (np.uint16, np.uint16, np.int64)), np.ones(3, np.uint8))
+    xy, t, p = np.arange(1, 4, dtype=np.uint16), np.arange(3, dtype=np.int64), np.ones(3, np.uint8)
+    events = Events(xy, xy, t, p)
     with tempfile.TemporaryDirectory() as folder:
         for ending in (".h5", ".raw", ".txt", ".csv"):
             write_events(f"{folder}/events{ending}", events, 8, 8)
             read_events(f"{folder}/events{ending}")
         with VideoWriter(f"{folder}/video.mp4", 64, 64, 30.0) as video:
             for k in range(12):
-                video.write(np.uint8(127 + 90 * np.sin(np.indices((64, 64, 3)).sum(0) / 9 + k)))
+                video.write((127 + 90 * np.sin(np.indices((64, 64, 3)).sum(0) / 9 + k)).astype(np.uint8))
         file_to_events(f"{folder}/video.mp4", f"{folder}/video.h5")
 
 

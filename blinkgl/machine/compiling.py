@@ -12,6 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 _ALL_KERNELS = "blinkgl.show.compile_kernels"
 """The program that compiles the kernels of the common commands. It uses every room, so it runs as a process."""
@@ -38,18 +39,26 @@ class Watch:
             self.seconds += time.perf_counter() - self._began
             self.kernels += 1
 
-    def compile_all(self) -> bool:
+    def compile_all(self, stamp: Path) -> bool:
         """Compile the kernels of the common commands where a command line meets the first one that is not on disk, so
-        that no later command waits. Returns whether it was done now."""
+        that no later command waits. Returns whether it was done now.
+
+        stamp : a file that is written when it is done; it counts until code of the package is younger."""
         if self.say is None or self.all_compiled:
             return False
         self.all_compiled = True
+        code = Path(__file__).resolve().parents[1].rglob("*.py")
+        if stamp.is_file() and stamp.stat().st_mtime > max(file.stat().st_mtime for file in code):
+            return False
         self.say("compiling kernels, once per machine and version: about a minute")
         self.start()
         done = subprocess.run([sys.executable, "-m", _ALL_KERNELS], capture_output=True, text=True, check=False)
         self.end()
         for line in done.stdout.splitlines():
             self.say(line)
+        if done.returncode == 0:
+            with contextlib.suppress(OSError):
+                stamp.touch()
         return True
 
 

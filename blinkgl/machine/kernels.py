@@ -81,7 +81,7 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             found = super().load_overload(sig, target_context)
-            if found is None and watch.compile_all():
+            if found is None and watch.compile_all(_stamp()):
                 found = super().load_overload(sig, target_context)
             return found
         except Exception:  # noqa: BLE001 - damaged bytes raise anything
@@ -100,6 +100,12 @@ class _Cache(FunctionCache):
         if self.cache_path not in _said:
             _said.add(self.cache_path)
             kernel_cache_failed(f"{self.cache_path}: {what}")
+
+
+@cache
+def _stamp() -> Path:
+    """Return the file that says that the kernels of the common commands have been compiled by this numba."""
+    return Path(FunctionCache(_stamp.__wrapped__).cache_path) / f"all_kernels.{numba.__version__}"
 
 
 @cache

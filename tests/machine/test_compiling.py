@@ -56,7 +56,7 @@ def test_stages_and_total_are_without_compilation(watch):
 
 
 @pytest.fixture
-def ahead(monkeypatch, watch):
+def ahead(monkeypatch, watch, tmp_path):
     """The calls of the program that compiles all kernels, which here only prints."""
     calls = []
 
@@ -67,6 +67,7 @@ def ahead(monkeypatch, watch):
 
     monkeypatch.setattr(compiling.subprocess, "run", run)
     monkeypatch.setattr(kernels, "watch", watch)
+    monkeypatch.setattr(kernels, "_stamp", lambda: tmp_path / "stamp")
     return calls
 
 
@@ -80,6 +81,10 @@ def test_the_first_kernel_that_is_missing_has_all_compiled_which_is_said_once(ke
     assert [call[-1] for call in ahead] == ["blinkgl.show.compile_kernels"] and outer == []
     assert inner == ["compiling kernels, once per machine and version: about a minute", "compiled 70 kernels in 30 s"]
     assert watch.seconds >= 30.0, "it belongs to no stage of a sequence"
+    watch.all_compiled = False  # another process, and a kernel of no common command
+    with compiling.announced_compiling(inner.append):
+        assert kept()(np.int8(3)) == 6
+    assert len(ahead) == 1 and len(inner) == 2
 
 
 def test_nothing_is_compiled_ahead_where_nobody_listens_or_kernels_cannot_be_kept(kept, ahead, watch):
@@ -171,12 +176,12 @@ def test_an_edit_of_a_function_that_a_kernel_calls_is_seen():
     assert not any("config" in name for name in of_v2e), "no kernel calls those"
 
 
-def test_every_command_says_that_it_compiles(monkeypatch, capsys, ahead, watch):
+def test_every_command_says_that_it_compiles(monkeypatch, capsys, ahead, watch, tmp_path):
     app = typer.Typer()
 
     @app.command()
     def some(nothing: bool = False) -> None:
-        watch.compile_all()
+        watch.compile_all(tmp_path / "stamp")
 
     monkeypatch.setattr(command_line, "announced_compiling", compiling.announced_compiling)
     assert command_line.run_app(app, ["--nothing"], "some", "BlinkGL") == 0

@@ -310,7 +310,7 @@ def export(
         str | None,
         typer.Option(
             help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
-            "multiflow or eventkubric."
+            "multiflow, eventkubric or rosbag."
         ),
     ] = None,
     shard_mb: Annotated[

@@ -423,12 +423,18 @@ def _ms(value: float) -> str:
     return "" if math.isnan(value) else f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
+PAGE = Path("docs/benchmarks.md")
+PEERS = "\n## Beside the authors' programs\n"
+"""Heading of the section that tools/peers.py makes."""
+PEERS_ANCHOR = "#beside-the-authors-programs"
+
+
 def page(machine: str, rounds: int) -> str:
     """docs/benchmarks.md: every row of every part, on this machine."""
     about = (
         "# Benchmarks\n\nMade by `python -m blinkgl.tools.bench --page` on an otherwise idle machine; do not edit. "
         f"{machine}. Medians of {rounds} rounds (networks: one), milliseconds. Processor time is that of all threads. "
-        "Accuracy is in [what was measured](results.md), speed beside other programs in [peers](peers.md).\n"
+        f"Accuracy is in [what was measured](results.md), speed beside other programs is [below]({PEERS_ANCHOR}).\n"
     )
     parts = [about]
     for what, rows in WHATS.items():
@@ -460,12 +466,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--load", type=int, default=0, metavar="N", help="processes that spin meanwhile")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
-    parser.add_argument("--page", action="store_true", help="write docs/benchmarks.md")
+    parser.add_argument("--page", action="store_true", help=f"write {PAGE}")
     parser.add_argument("--answer", action="store_true", help=argparse.SUPPRESS)
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
     if options.page:
-        Path("docs/benchmarks.md").write_text(page(machine_line(), options.rounds), encoding="utf-8")
+        peers = PAGE.read_text(encoding="utf-8").partition(PEERS)  # tools/peers.py makes that section
+        PAGE.write_text(page(machine_line(), options.rounds) + "".join(peers[1:]), encoding="utf-8")
         return
     if options.what is None:
         parser.print_help()

@@ -4,7 +4,7 @@
 
 ``--v2e`` is a checkout of SensorsINI/v2e, ``--voltmeter`` of Lynn0306/DVS-Voltmeter; either may be left out. Each
 program runs in a process of its own with one thread, on a clip of 640x480 at 1000 frames/s (`bench.clip`). The first
-frame, which only sets the state, is not timed. ``--page`` writes docs/peers.md.
+frame, which only sets the state, is not timed. ``--page`` writes a section of docs/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sized
-from pathlib import Path
 from statistics import median
 from types import ModuleType
 from unittest.mock import MagicMock
@@ -25,9 +24,8 @@ from unittest.mock import MagicMock
 import numpy as np
 
 from blinkgl.machine.bench import machine_line
-from blinkgl.tools.bench import FPS, HEIGHT, WIDTH, clip
+from blinkgl.tools.bench import FPS, HEIGHT, PAGE, PEERS as SECTION, WIDTH, clip
 
-PAGE = Path("docs/peers.md")
 NOT_USED = ("screeninfo", "easygui", "tkinter", "engineering_notation", "dv_processing", "easydict")
 """Modules that the programs import for windows, output files and options, and that need not be installed here."""
 PARAMETERS = {
@@ -151,7 +149,7 @@ def main(arguments: list[str] | None = None) -> None:
     made = table(checkouts, options.rounds, options.frames)
     if options.page:
         PAGE.write_text(
-            "# Speed beside the authors' programs\n\n"
+            PAGE.read_text(encoding="utf-8").partition(SECTION)[0] + SECTION + "\n"
             "Made by `python -m blinkgl.tools.peers --v2e CHECKOUT --voltmeter CHECKOUT --page`; do not edit.\n\n"
             f"{machine_line()}. 640x480, 1000 frames/s, one thread each, in turns; medians of {options.rounds} rounds, "
             "processor milliseconds a frame. ESIM's authors publish C++ and CUDA, which it does not build.\n\n"

@@ -254,7 +254,7 @@ V2E_PRESETS = {
 
 _NO_COMPAT = {
     "compat": Removed(
-        "the key left out; docs/concepts.md says how these events differ from those of the authors' programs",
+        "the key left out; docs/sensors.md says how these events differ from those of the authors' programs",
         lambda value: value == "none",
     )
 }

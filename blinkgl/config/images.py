@@ -83,7 +83,7 @@ class ImagesConfig(Config):
 
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
         "plain",
-        description="gives the other keys the values of a use (docs/images.md); keys given beside it override it",
+        description="gives the other keys the values of a use (docs/cameras.md); keys given beside it override it",
     )
     rate: float | None = Field(
         30.0,

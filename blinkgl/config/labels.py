@@ -83,7 +83,7 @@ class LabelsConfig(Config):
         max_length=1000,
         description="optical flow: forward to the next label and backward to the previous one, DSEC 16-bit PNG; "
         "numbers are other intervals, s, from each label's time (`0.01`, `1/30`; negative: "
-        "backward), float32 .h5 (docs/over_time.md)",
+        "backward), float32 .h5 (docs/labels.md)",
     )
     float_flow: tuple[Literal["npy", "flo"], ...] = Field((), description="float32 flow in addition to the PNG")
     occlusion: bool = Field(True, description="masks of pixels that are not visible at the other end of the flow")
@@ -106,12 +106,12 @@ class LabelsConfig(Config):
         description="category of each pixel, 16-bit PNG. Table: patterns such as "
         '`{"wall-*": 1, "chair*": 7, "*": 0}`; the first that matches an object\'s name, mesh or '
         "category counts, 0 where none matches. true: by kind of shape, sky 1, ground 2, wall 3, "
-        "cuboid 4 … (docs/boxes.md)",
+        "cuboid 4 … (docs/labels.md)",
     )
     boxes: bool = Field(
         False,
         description="bounding boxes of objects, in the image (visible, whole) and in 3-D, .npz and KITTI's text "
-        "(docs/boxes.md)",
+        "(docs/labels.md)",
     )
 
 

@@ -1,4 +1,4 @@
-"""Materials of an explicit scene (docs/materials.md)."""
+"""Materials of an explicit scene (docs/light.md)."""
 
 from __future__ import annotations
 

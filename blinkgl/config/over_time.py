@@ -1,4 +1,4 @@
-"""The ``imu:`` and ``tracks:`` sections: time series beside events and labels (docs/over_time.md)."""
+"""The ``imu:`` and ``tracks:`` sections: time series beside events and labels (docs/labels.md)."""
 
 from __future__ import annotations
 

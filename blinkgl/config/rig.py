@@ -118,7 +118,7 @@ class RigSensorConfig(Config):
         default_factory=LabelsConfig,
         description="as at the top level; a camera without events has only those given here",
     )
-    images: ImagesConfig | None = Field(None, description="a frame camera (docs/images.md); null: none")
+    images: ImagesConfig | None = Field(None, description="a frame camera (docs/cameras.md); null: none")
     imu: ImuConfig | None = Field(
         None, description="an inertial unit, with position and rotation in the sensor's axes; null: none"
     )

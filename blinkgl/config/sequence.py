@@ -261,11 +261,11 @@ class SequenceConfig(Config):
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="ground truth to write")
     images: ImagesConfig | None = Field(
-        None, description="a frame camera beside the event camera (docs/images.md); null: none"
+        None, description="a frame camera beside the event camera (docs/cameras.md); null: none"
     )
-    imu: ImuConfig | None = Field(None, description="an inertial unit on the camera (docs/over_time.md); null: none")
+    imu: ImuConfig | None = Field(None, description="an inertial unit on the camera (docs/labels.md); null: none")
     tracks: TracksConfig | None = Field(
-        None, description="points on surfaces, followed through the sequence (docs/over_time.md); null: none"
+        None, description="points on surfaces, followed through the sequence (docs/labels.md); null: none"
     )
     rig: Literal["davis", "dsec", "mvsec", "stereo"] | None = Field(
         None, description="sensors of a known rig (docs/rigs.md); `sensors` given beside it override them by name"

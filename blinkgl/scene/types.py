@@ -187,7 +187,7 @@ class Map:
 
 @dataclass(frozen=True, eq=False)
 class Gloss:
-    """A glossy surface: glTF's metal and roughness (docs/materials.md).
+    """A glossy surface: glTF's metal and roughness (docs/light.md).
 
     metallic, roughness : 0 to 1; times the blue and the green channel of ``map``, if there is one.
     """

@@ -1,4 +1,4 @@
-// Radiance of a surface that is more than matt (docs/materials.md; the float64 reference: radiated() in
+// Radiance of a surface that is more than matt (docs/light.md; the float64 reference: radiated() in
 // tools/shader_debugger/appearance.py). Included after light.glsl.
 //
 //   BUMPED      a normal map

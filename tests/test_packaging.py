@@ -151,7 +151,7 @@ def test_wheel(source, tmp_path):
     for line in ("Author: The BlinkGL authors", "License: MIT", f"Project-URL: Source, {URL}\n", "Classifier: Typing"):
         assert line in metadata
     relative = re.findall(r"\]\((?!https?:|#)[^)]*", metadata)
-    assert not relative and f"({URL}/raw/HEAD/docs/images/demo.jpg)" in metadata
+    assert not relative and f"({URL}/raw/HEAD/docs/images/moving.webp)" in metadata
     missing = (expected_files() | {f"eflow/weights/toy/{name}" for name in NETWORK}) - names
     assert not missing, f"not in the wheel (packages and package_data in setup.cfg): {sorted(missing)}"
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]

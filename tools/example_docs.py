@@ -52,6 +52,7 @@ ORDER = (
     "rig_in_python",
     "video_to_events",
     "events_over_frame",
+    "moving_picture",
     "event_tensors",
     "tensor_environments",
     "tensor_gym",
@@ -70,7 +71,7 @@ Each is a program of its own in `examples/`, does one thing, and ends with a che
 Copy one and change it:
 
 ```
-.venv/bin/python examples/scene_in_python.py        # writes below out/examples/
+python examples/scene_in_python.py        # writes below out/examples/
 ```
 
 This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit.
@@ -132,6 +133,7 @@ def main() -> int:
             if name in PICTURES:
                 with Image.open(out / PICTURES[name][0]) as picture:  # 256 colours: half the bytes, and nobody sees it
                     picture.convert("RGB").quantize(256).save(PAGE.parent / "images" / PICTURES[name][1], optimize=True)
+    load("moving_picture").main(PAGE.parent / "images", duration=1.6)  # README's
     PAGE.write_text("\n".join(parts), encoding="utf-8")
     return 0
 

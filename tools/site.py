@@ -28,6 +28,7 @@ SOURCES = (
     "blinkgl",
     "eflow",
     "tools/docstrings.py",
+    "README.md",
     "CHANGELOG.md",
     "changes",
     "towncrier.toml",
@@ -116,6 +117,7 @@ def build(root: Path, out: Path) -> None:
         # Where the documentation of a module is looked for: the package lies in two places.
         shutil.copytree(root / "tools", copy / "blinkgl/tools", ignore=shutil.ignore_patterns("__pycache__"))
         (copy / "docs/changelog.md").write_text(changelog(copy), encoding="utf-8")
+        (copy / "docs/index.md").write_text(first_page(copy), encoding="utf-8")
         moved = moved_places((copy / "docs" / MOVED).read_text(encoding="utf-8"))
         (copy / "docs" / MOVED).unlink()
         done = subprocess.run(
@@ -191,6 +193,13 @@ def changelog(root: Path) -> str:
         raise BuildError(done.stdout + done.stderr)
     coming = re.sub(r"\A.*?^## next.*?$", "## Not released yet", done.stdout, count=1, flags=re.S | re.M)
     return (root / "CHANGELOG.md").read_text(encoding="utf-8").replace("<!-- releases -->", coming.strip())
+
+
+def first_page(root: Path) -> str:
+    """README.md with the links of a page in docs/; files that are no page of the site are only named."""
+    text = (root / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
+    text = text.replace("](CHANGELOG.md)", "](changelog.md)")
+    return re.sub(r"\[([^]]+)\]\((?:LICENSE|CITATION\.cff|CONTRIBUTING\.md)\)", r"\1", text)
 
 
 def problems(site: Path) -> list[str]:

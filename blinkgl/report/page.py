@@ -91,7 +91,12 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
 
 
 def _example(e: Example) -> dict[str, Any]:
-    pictures = (("frame", e.image), ("events", e.events), ("flow", e.flow), *e.others)
+    first = (
+        ("frame", e.image),
+        ("events: ON blue, OFF red", e.events),
+        ("flow: hue is direction, saturation speed", e.flow),
+    )
+    pictures = (*first, *e.others)
     return {
         "name": e.name,
         "caption": e.caption,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 
@@ -18,7 +19,9 @@ from blinkgl.types.events import Events
 _BAR = 30
 _GAP = 4
 _BACK, _TEXT, _DIM = (22, 24, 28), (235, 238, 242), (150, 156, 166)
-_MAX_PANEL_HEIGHT = 360
+_MAX_PANEL_HEIGHT, _LEAST_PANEL_WIDTH = 360, 256
+_EVENTS_PER_PIXEL = 0.35
+"""Most events of a picture: of more, the newest are shown, since edges and textures would cover each other."""
 _LEGEND = 27
 
 
@@ -41,11 +44,12 @@ class Panels:
         label: str = "frame",
     ):
         self._counts = np.zeros((2, height, width), np.uint16)
-        self._pending = 0
+        self._shown: list[Events] = []
+        self._most, self._pending = max(1, round(_EVENTS_PER_PIXEL * height * width)), 0
         self._noise: int | None = None  # of the pending events; None: unknown
         factor = min(1.0, _MAX_PANEL_HEIGHT / height)
-        if height < 200:
-            factor = 2.0
+        if height < 200:  # whole pixels, with room for the captions
+            factor = max(2, min(_MAX_PANEL_HEIGHT // height, math.ceil(_LEAST_PANEL_WIDTH / width)))
         self._panel = (max(2, round(width * factor / 2) * 2), max(2, round(height * factor / 2) * 2))  # (w, h), even
         self._ticks, self._t0_us = Ticks(t0_us, rate_hz), t0_us
         self._slow = rate_hz / fps
@@ -58,7 +62,7 @@ class Panels:
         self._font, self._small = ImageFont.load_default(14), ImageFont.load_default(11)
         if flow:
             self._panel_view(2)[:] = (32, 34, 38)
-            self._caption(2, "")
+            self._caption(2)
 
     @property
     def canvas(self) -> np.ndarray:
@@ -66,7 +70,9 @@ class Panels:
 
     def add_events(self, events: Events) -> None:
         """Add events to those of the next frame."""
-        count_events(events.x, events.y, events.p, self._counts)
+        self._shown.append(events)
+        while sum(map(len, self._shown[1:])) >= self._most:
+            del self._shown[0]
         self._pending += len(events)
         if events.cause is not None:
             self._noise = (self._noise or 0) + int(np.count_nonzero(events.cause))
@@ -100,13 +106,22 @@ class Panels:
         small = self._toned(small) if small.dtype.kind == "f" else small
         shown = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small
         self._panel_view(0)[:] = shown
-        self._panel_view(1)[:] = self._fit(event_colour(self._counts))
-        self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")
-        share = "" if self._noise is None else f"   {100 * self._noise / max(self._pending, 1):.0f} % noise"
-        self._caption(1, f"ON blue, OFF red   {self._pending:,}{share}")
-        self._counts[:] = 0
-        self._pending, self._noise = 0, None if self._noise is None else 0
+        self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms", f"slowed {self._slow:g}x")
+        self._show_events()
         return self._ticks.passed(t_us)
+
+    def _show_events(self) -> None:
+        """Draw the newest pending events, and forget all."""
+        few = min(self._most, self._pending)
+        newest = Events.concatenate(self._shown) if self._shown else Events.empty()
+        newest = newest.part(slice(len(newest) - few, None))
+        self._counts[:] = 0
+        count_events(newest.x, newest.y, newest.p, self._counts)
+        self._panel_view(1)[:] = self._fit(event_colour(self._counts))
+        number = f"{self._pending:,}" if few == self._pending else f"newest {few:,} of {self._pending:,}"
+        share = () if self._noise is None else (f"{100 * self._noise / max(self._pending, 1):.0f} % noise",)
+        self._caption(1, number, "ON blue, OFF red", *share)
+        self._shown, self._pending, self._noise = [], 0, None if self._noise is None else 0
 
     def _toned(self, image: np.ndarray) -> np.ndarray:
         """Return uint8 sRGB without clipping. The assumed maximum follows a brighter picture at once and a darker one
@@ -123,12 +138,16 @@ class Panels:
         larger = self._panel[1] > image.shape[0]
         return cv2.resize(image, self._panel, interpolation=cv2.INTER_NEAREST if larger else cv2.INTER_AREA)
 
-    def _caption(self, panel: int, detail: str) -> None:
+    def _caption(self, panel: int, *details: str) -> None:
+        """Write the panel's name, and as many of the details as there is room for."""
         w = self._panel[0]
+        room = w - 24 - self._font.getlength(self._names[panel])
+        while details and self._small.getlength("   ".join(details)) > room:
+            details = details[:-1]
         strip = Image.new("RGB", (w, _BAR), _BACK)
         draw = ImageDraw.Draw(strip)
         draw.text((8, _BAR / 2), self._names[panel], fill=_TEXT, font=self._font, anchor="lm")
-        draw.text((w - 8, _BAR / 2), detail, fill=_DIM, font=self._small, anchor="rm")
+        draw.text((w - 8, _BAR / 2), "   ".join(details), fill=_DIM, font=self._small, anchor="rm")
         left = panel * (w + _GAP)
         self._canvas[:_BAR, left : left + w] = np.asarray(strip)
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import re
 import threading
 import time
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
 
 from blinkgl.errors import BlinkGLError, printable
 from blinkgl.io.atomic import write_whole
+from blinkgl.io.colour import flow_colour
+from blinkgl.io.images import encode_image
 from blinkgl.viewer.server import LocalServer
-from blinkgl.viewer.stage import FOV, LAYERS, Stage
+from blinkgl.viewer.stage import ASPECT, FOV, LAYERS, OFF, ON, Stage
 from blinkgl.viewer.views import Picture, SequenceView
 
 SPEEDS = ("1x", "1/2x", "1/5x", "1/10x", "1/20x", "1/50x", "1/100x")
@@ -130,12 +135,12 @@ class Page:
         self._windows, self._layers = [], {}
         if with_events := [s for s in sequence.sensors if s.event_count]:
             usual = with_events[0].usual_window_us() / 1000
-            for said, long in (("events of, ms", usual), ("in space of, ms", SPACE_WINDOWS * usual)):
+            for said, long in (("window, ms", usual), ("window in 3-D, ms", SPACE_WINDOWS * usual)):
                 self._windows.append(gui.add_slider(said, 0.1, max(100.0, long), 0.1, float(long)))
-        with gui.add_folder("in space"):
+        with gui.add_folder("3-D view"):
             looks = [name for name, there in (("world", sequence.has_space), ("events", with_events)) if there]
             if looks:
-                look = gui.add_button_group("look at", looks)
+                look = gui.add_button_group("show", looks)
                 look.on_click(lambda event: self._look_at(event.target.value))
             if sequence.has_space:
                 there = [name for name in LAYERS if self.stage.has(name)]
@@ -256,8 +261,8 @@ def _about(sequence: SequenceView) -> str:
 
 
 def save(folder: Path, out: Path) -> None:
-    """Write a sequence as one HTML file that plays without a server: the world, the events, and all pictures on a wall.
-    Raises AssetError as :class:`SequenceView`, OutputError."""
+    """Write a sequence as one HTML file that plays without a server: all pictures on the left, the world and the events
+    in space on the right, a legend above. Raises AssetError as :class:`SequenceView`, OutputError."""
     sequence, server = SequenceView(folder), LocalServer(0)
     try:
         stage = Stage(server.scene, sequence, pictures=True)
@@ -272,7 +277,70 @@ def save(folder: Path, out: Path) -> None:
             pictures = {s.name: s.pictures(t_us, window_us) for s in sequence.sensors}
             stage.show(t_us, SPACE_WINDOWS * window_us, pictures)
             film.insert_sleep(SAVED_S / SAVED_STEPS)
-        write_whole(out, film.as_html())
+        write_whole(out, _framed(sequence, window_us, film.as_html()))
     finally:
         server.stop()
         sequence.close()
+
+
+_SAVED = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>$name</title>
+<style>
+body { margin: 0; height: 100vh; display: flex; flex-direction: column; font: 14px/1.4 system-ui, sans-serif }
+header { display: flex; flex-wrap: wrap; gap: .2em 1.6em; align-items: center; padding: .5em 1em; color: #333 }
+h1 { font-size: 1.15em; margin: 0; color: #000 }
+i { display: inline-block; width: .8em; height: .8em; border-radius: 50% }
+img { height: 2.6em; vertical-align: middle }
+main { flex: 1; min-height: 0; display: flex; justify-content: center; align-items: center }
+iframe { border: 0; width: 100%; height: 100%; max-width: calc((100vh - 4em) * $aspect); aspect-ratio: $aspect }
+@media (max-aspect-ratio: 16/11) { iframe { height: auto } }
+</style>
+</head>
+<body>
+<header>
+<h1>$name</h1>
+<span>$about; slowed $slowed times</span>
+<span><i style="background: rgb$on"></i> ON, brighter <i style="background: rgb$off"></i> OFF, darker; $window ms in the
+picture, $long ms in space</span>
+<span><img alt="colour wheel" src="data:image/png;base64,$wheel"> flow: hue is direction, saturation speed$full</span>
+<span>drag to turn, wheel to zoom; times are of the sequence</span>
+</header>
+<main><iframe title="pictures, world and events"></iframe></main>
+<script id="film" type="text/plain">$film</script>
+<script>
+document.querySelector("iframe").srcdoc = document.getElementById("film").textContent.replaceAll("<\\\\/", "</");
+</script>
+</body>
+</html>
+""")
+"""A saved sequence: what it shows, in words, around viser's page."""
+
+
+def _framed(sequence: SequenceView, window_us: int, film: str) -> str:
+    """Return viser's page with title, units and legend around it."""
+    duration_s = (sequence.end_us - sequence.start_us) / 1e6
+    x, y = np.meshgrid(np.linspace(-1, 1, 61), np.linspace(-1, 1, 61))
+    inside = x**2 + y**2 <= 1
+    wheel = np.where(inside[..., None], flow_colour(np.stack([x, y], axis=-1).astype(np.float32), 1.0), 255)
+    middle_us = (sequence.start_us + sequence.end_us) // 2
+    notes = [p.note for s in sequence.sensors for p in s.pictures(middle_us, window_us) if "flow" in p.heading]
+    sensors = ", ".join(
+        f"{s.name} {s.source.width}x{s.source.height} px, {s.event_count:,} events" for s in sequence.sensors
+    )
+    return _SAVED.substitute(
+        name=html.escape(printable(sequence.name)),
+        about=html.escape(printable(f"{duration_s:g} s; {sensors}")),
+        slowed=f"{SAVED_S / duration_s:.3g}",
+        on=ON,
+        off=OFF,
+        window=f"{window_us / 1000:g}",
+        long=f"{SPACE_WINDOWS * window_us / 1000:g}",
+        wheel=base64.b64encode(encode_image(wheel.astype(np.uint8))).decode(),
+        full=html.escape(f", {notes[0].partition(', ')[2]}") if notes else "",
+        film=film.replace("</", "<\\/"),
+        aspect=f"{ASPECT:g}",
+    )

@@ -26,14 +26,18 @@ _EDGES = np.array(
     [[a, b] for a in np.ndindex(2, 2, 2) for b in np.ndindex(2, 2, 2) if a < b and sum(np.abs(np.subtract(a, b))) == 1]
 )
 """(12, 2, 3): the edges of a box, by corners of 0 and 1."""
-_ON, _OFF, _PALE = (40, 90, 235), (225, 50, 50), (170, 170, 180)
+ON, OFF, _PALE = (40, 90, 235), (225, 50, 50), (170, 170, 180)
 FOV = math.radians(45)
 """Field of view of the eye; viser's own 75 degrees make everything small."""
+ASPECT = 1.6
+"""Width over height of a saved page's view: half for the pictures, half for the world and the events below it."""
+_HEIGHT = 4.4
+"""Height of that view, in radii of the world."""
 
 
 class Stage:
-    """The nodes of a sequence: ``/world`` in its own axes (z up) and units, ``/events`` beside it, on request
-    ``/pictures`` on the other side."""
+    """The nodes of a sequence: ``/world`` in its own axes (z up) and units, ``/events`` beside it. pictures : for a
+    saved page, all in one view: ``/pictures`` on the left, the world and the events turned towards the eye."""
 
     def __init__(self, scene: viser.SceneApi, sequence: SequenceView, *, pictures: bool = False):
         self._scene, self._sequence = scene, sequence
@@ -49,8 +53,10 @@ class Stage:
         self._volumes = [s for s in sequence.sensors if s.event_count]
         for k, sensor in enumerate(self._volumes):
             self._volume(sensor, k)
+        if pictures:
+            self._arrange()
         if sequence.has_space:
-            size = 4 * self._radius
+            size = (2.4 if pictures else 4) * self._radius
             scene.add_grid("/world/grid", size, size, cell_size=size / 40, section_size=size / 8, cell_color=(225,) * 3,
                            section_color=(200,) * 3, position=(*self._middle[:2], 0.0))  # fmt: skip
 
@@ -67,12 +73,33 @@ class Stage:
         span = 1.2 * max(len(self._volumes), 1)
         at = aside + (span - 1.2) / 2 * radius * right - 0.5 * radius * _DEPTH * forward
         events = at - (1.4 + 0.9 * span) * radius * forward + 0.7 * radius * up + (0.7 + 0.6 * span) * radius * right
-        everything = self._middle + 0.5 * (span - 1.2) * radius * right
+        distance = self._height() / (2 * math.tan(FOV / 2))
         return {
             "world": (world, self._middle),
             "events": (events, at),
-            "all": (everything - (4.4 + 0.6 * span) * radius * forward + 1.3 * radius * up, everything),
+            "all": (self._middle - distance * forward, self._middle),
         }
+
+    def _height(self) -> float:
+        """Return the height of the view in which everything stands; several volumes of events need more."""
+        return self._radius * max(_HEIGHT, 1.9 * len(self._volumes))
+
+    def _arrange(self) -> None:
+        """Turn the world and the events as :meth:`views` sees them, and put them into the right half of the view."""
+        views, height = self.views(), self._height()
+        place = self._middle + 0.25 * ASPECT * height * self._turn[:, 0]
+        halves = [name for name, there in (("world", self._sequence.has_space), ("events", self._volumes)) if there]
+        for number, name in enumerate(halves):
+            eye, at = views[name]
+            forward = (at - eye) / np.linalg.norm(at - eye)
+            right = np.cross(forward, self._turn[:, 2])
+            right /= np.linalg.norm(right)
+            turn = self._turn @ np.stack([right, forward, np.cross(right, forward)])
+            up = 0.25 * height * (len(halves) - 1 - 2 * number) * self._turn[:, 2]
+            node = {"world": self.world, "events": self.space}[name]
+            rotation = turn @ (self._turn if name == "events" else np.eye(3))
+            node.wxyz = _wxyz(rotation)
+            node.position = place + up + turn @ (node.position - at)
 
     def has(self, layer: str) -> bool:
         """Return whether a layer of the world has anything."""
@@ -189,7 +216,7 @@ class Stage:
     def _events(self, sensor: CameraView, t_us: int, window_us: int, pictures: list[Picture]) -> None:
         (points, on), size, root = sensor.event_points(t_us, window_us), self._radius, f"/events/{sensor.name}"
         points = points[:, [0, 2, 1]] * [1, -_DEPTH, -1]
-        for name, which, colour in (("ON", on, _ON), ("OFF", ~on, _OFF)):
+        for name, which, colour in (("ON", on, ON), ("OFF", ~on, OFF)):
             # Half floats of a picture's widths are accurate to a tenth of a pixel.
             self._scene.add_point_cloud(
                 f"{root}/{name}", points[which], colour, point_size=0.004, scale=size, point_shape="circle"
@@ -203,20 +230,32 @@ class Stage:
 
     def _wall(self, pictures: dict[str, list[Picture]]) -> None:
         """Show all pictures, side by side."""
-        found = [(f"{name}: {one.heading}", one.image) for name, some in pictures.items() for one in some]
-        columns = math.ceil(math.sqrt(max(len(found), 1)))
-        size = 2.4 * self._radius / columns
+        several = len(pictures) > 1
+        found = [
+            (f"{name}: {one.heading}" if several else one.heading, one.image)
+            for name, some in pictures.items()
+            for one in some
+        ]
+        # In the left half of the view, as large as they can be, with a line of text above each.
+        width, height = 0.48 * ASPECT * self._height(), 0.94 * self._height()
+        tall = max((image.shape[0] / image.shape[1] for _, image in found), default=1.0)
+        rows_of = lambda columns: math.ceil(len(found) / columns)
+        size_of = lambda columns: min(width / columns, height / rows_of(columns) / (tall + 0.14))
+        columns = max(range(1, max(len(found), 1) + 1), key=size_of)
+        size, step = size_of(columns), (tall + 0.14) * size_of(columns)
         if "wall" not in self._shown:
-            place = self._aside(-2.5 * self._radius)
+            place = self._aside(-0.25 * ASPECT * self._height())
             self._shown["wall"] = self._scene.add_frame(
                 "/pictures", show_axes=False, wxyz=_wxyz(self._turn), position=place
             )
         for number, (name, image) in enumerate(found):
             row, column = divmod(number, columns)
-            at = size * np.array([column - (columns - 1) / 2, 0, 0.95 * ((columns - 1) / 2 - row)])
+            at = np.array(
+                [size * (column - (columns - 1) / 2), 0, step * ((rows_of(columns) - 1) / 2 - row) - 0.05 * size]
+            )
             known, plain = self._shown.get(name), name.replace("/", " ")
             if known is None:  # beside the picture: nodes below another are removed when that is made again
-                above = (0, 0, 0.53 * size * image.shape[0] / image.shape[1])
+                above = (0, 0, 0.5 * size * image.shape[0] / image.shape[1] + 0.03 * size)
                 self._label(f"/pictures/names/{plain}", name, at + above)
             if known is None or not np.array_equal(known, image):
                 self._image(f"/pictures/{plain}", _small(image), at, 0.96 * size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from PIL import ImageFont
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.video import VideoReader, VideoWriter
@@ -161,3 +162,35 @@ def test_preview(tmp_path, height, width, flow):
     reader = VideoReader(tmp_path / "p.mp4")
     assert len(list(reader)) == 6 and reader.fps == 20
     assert reader.width > (2.5 if flow else 1.5) * width
+
+
+def test_a_dense_picture_has_the_newest_events_and_says_so():
+    panels = Panels(300, 400, flow=False, rate_hz=20, fps=20)
+    most = round(0.35 * 300 * 400)
+    for k in range(10):  # each chunk fills rows of its own
+        y, x = np.divmod(np.arange(30 * 400), 400)
+        polarity = np.full(len(x), k % 2, np.uint8)
+        panels.add_events(Events(x.astype(np.uint16), (y + 30 * k).astype(np.uint16), np.full(len(x), k), polarity))
+    panels.compose(0, np.zeros((300, 400), np.float32))
+    events = panels.canvas[30:, 404:]
+    rows = (events < 200).any(axis=-1).all(axis=1)
+    assert not rows[: 300 - most // 400 - 1].any() and rows[300 - most // 400 :].all(), "the newest, and only those"
+    assert {tuple(c) for c in np.unique(events.reshape(-1, 3), axis=0)} == {
+        (255, 255, 255),
+        (255, 104, 104),
+        (104, 104, 255),
+    }
+
+
+@pytest.mark.parametrize("height, width", [(48, 64), (8, 8), (360, 202), (1920, 1080), (24, 500)])
+def test_captions_do_not_run_into_each_other(height, width):
+    panels = Panels(height, width, rate_hz=30, fps=15)
+    panels.set_flow(np.ones((height, width, 2), np.float32))
+    panels.compose(123_456_789, np.zeros((height, width), np.float32))
+    panel = (panels.canvas.shape[1] - 8) // 3
+    for k in range(3):
+        strip = panels.canvas[:30, k * (panel + 4) : k * (panel + 4) + panel].max(axis=(0, 2))
+        name = ["frame", "events", "optical flow"][k]
+        start = int(8 + ImageFont.load_default(14).getlength(name)) + 1
+        assert (strip[start : start + 6] < 40).all(), f"a gap behind {name}"
+        assert (strip[:7] < 40).all() and (strip[-7:] < 40).all()

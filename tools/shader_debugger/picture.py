@@ -81,8 +81,10 @@ def _save(figure: Figure, path: Path, palette: bool = False) -> None:
 
 def _title(figure: Figure, ends: tuple[float, float], y: float, texts: tuple[str, str]) -> None:
     """Write a line above a picture: its name at the left end, its unit at the right one (figure fractions)."""
-    figure.text(ends[0], y, texts[0], fontsize=8.5, color=INK, va="center", weight="bold")
-    figure.text(ends[1], y, texts[1], fontsize=7, color=MUTED, va="center", ha="right")
+    wide = 7.2 * len(texts[0]) + 5.4 * len(texts[1]) + 8  # px at these sizes
+    scale = min(1.0, (ends[1] - ends[0]) * 100 * figure.get_figwidth() / wide)  # so that they do not overlap
+    figure.text(ends[0], y, texts[0], fontsize=8.5 * scale, color=INK, va="center", weight="bold")
+    figure.text(ends[1], y, texts[1], fontsize=7 * scale, color=MUTED, va="center", ha="right")
 
 
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:

@@ -314,8 +314,8 @@ class DsecEventReader(Closing):
             return self.count if otherwise else (int(table[-1]) if len(table) else 0)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """Yield all events in pieces of ``size``. Raises EventDataError as :meth:`slice` where the sensor's size is
-        known from elsewhere; else whoever opened the file checks them, or keeps what is whole."""
+        """Yield all events in pieces of ``size``. Raises EventDataError as :meth:`slice` does, if the sensor's size was
+        given when the file was opened; without a size the caller has to check the events."""
         last = None
         for start in range(0, self.count, size):
             events = self._read(start, min(self.count, start + size))

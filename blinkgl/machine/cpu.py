@@ -22,8 +22,8 @@ def cpu_field(*names: str, path: str = "/proc/cpuinfo") -> str:
 
 
 def cpu_flags(path: str = "/proc/cpuinfo") -> frozenset[str]:
-    """Return the kernel's names of the first core's features (x86: flags; Arm: Features), without those that a virtual
-    machine hides, which mathematics libraries do not see either."""
+    """Return the features of the first core by the names of Linux (x86: flags; Arm: Features). Features that a virtual
+    machine hides are missing; mathematics libraries do not see them either."""
     return frozenset(cpu_field("flags", "Features", path=path).split())
 
 

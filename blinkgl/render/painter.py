@@ -67,7 +67,7 @@ class Painter:
         self.stats.frames += 1
 
     def prepare(self, target: Target) -> None:
-        """Set ``target`` for drawing, over its content."""
+        """Make ``target`` the one that is drawn to, and keep its content."""
         ctx = self.gl.ctx
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)

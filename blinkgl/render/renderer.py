@@ -236,8 +236,8 @@ class Renderer:
         return self.draw(self.seen(Velocity(every, lens=self.lens)), t_ns)
 
     def velocity_of_movers(self, t_ns: int, every: int = 1) -> Frame:
-        """Return the :meth:`velocity` of moving objects, for time sampling: with a static camera only of moving
-        objects, hidden ones included, which is still a bound."""
+        """Return the :meth:`velocity` that bounds a time step. Before a static camera only moving objects are drawn,
+        hidden ones too, so it may be larger than that of the visible surfaces but not smaller."""
         return self.draw(self.seen(Velocity(every, not self.whole, self.lens)), t_ns)
 
     def colour(self, at: int | Moment, antialiasing: str | None = None) -> Frame:

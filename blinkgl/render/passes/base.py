@@ -103,8 +103,8 @@ class Pass:
         return moment
 
     def serves(self, drawn: Moment, moment: Moment) -> bool:
-        """Return, for a ``common`` pass, whether its last picture, of the moment ``drawn``, can be used for a
-        moment."""
+        """Return whether the picture that a ``common`` pass drew of the moment ``drawn`` is also right for
+        ``moment``, so that it need not be drawn again."""
         return drawn.t_ns == moment.t_ns
 
     def begin(self, painter: Painter, shot: Shot) -> None:

@@ -25,7 +25,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from blinkgl.machine.compiling import kernel_cache_failed, watch
 
 _said: set[str] = set()
-"""Folders that have been reported."""
+"""Folders that have been reported; "" where there is none."""
 
 
 class _Listener(event.Listener):
@@ -134,6 +134,11 @@ def kernel(function: Callable | None = None, *, error_model: Literal["python", "
     dispatcher: Any = numba.njit(nogil=True, error_model=error_model)(function)
     try:
         dispatcher._cache = _Cache(function)  # noqa: SLF001 - what njit(cache=True) does, with a class of its own
-    except RuntimeError as error:  # numba found no writable folder
-        kernel_cache_failed(f"{error}; kernels are compiled in every process")
+    except RuntimeError:  # numba found no writable folder
+        if "" not in _said:
+            _said.add("")
+            kernel_cache_failed(
+                "kernels cannot be kept, since neither the package's folder nor the home folder can be written: they "
+                "are compiled in every process. NUMBA_CACHE_DIR=FOLDER keeps them in a folder of yours"
+            )
     return dispatcher

@@ -141,8 +141,10 @@ class Display:
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
             if not self._foretold and message["fraction"] >= FORETOLD_AT:
                 self._foretold = True
-                size = message["events"] / message["fraction"] * BYTES_PER_EVENT * self._todo
-                self._say(f"expected: about {_clock(self._left_s())} and {_size(size)}")
+                whole = self._todo / message["fraction"]
+                seconds = sum(message["seconds"].values()) * whole / len(self._at_work)  # without compiling
+                size = message["events"] * whole * BYTES_PER_EVENT
+                self._say(f"expected: about {_clock(seconds)} and {_size(size)}")
         else:
             self._at_work.pop(name, None)
             if name in self._tasks:
@@ -178,8 +180,9 @@ class Display:
             f"{frames / elapsed:.0f} frames/s",
             f"{events / elapsed / 1e6:.2f} M events/s",
         ]
-        if self._made():
-            parts.append(f"{_clock(self._left_s())} left")
+        if made := self._made():
+            left = (self._todo - self._given_up - made) * elapsed / made
+            parts.append(f"{_clock(left)} left")
         if self._done:
             expected = self._bytes / self._done * self._todo
             room = shutil.disk_usage(self._out).free
@@ -191,10 +194,6 @@ class Display:
     def _made(self) -> float:
         """Return the sequences made so far, those in progress by their part."""
         return self._done + sum(fraction for fraction, _, _ in self._at_work.values())
-
-    def _left_s(self) -> float:
-        made = self._made()
-        return (self._todo - self._given_up - made) * (time.monotonic() - self._started) / made
 
     def _note(self, lines: Iterable[str]) -> None:
         """Print what was guessed or is not drawn, once per file, for all sequences and workers."""

@@ -298,12 +298,17 @@ def test_num_of_a_run_without_groups_may_be_larger_than_the_file_says(tmp_path):
 def test_time_and_size_are_foretold_once():
     display = Display(plain_console(file=(text := io.StringIO())), Path("/"))
     display.begin(SimpleNamespace(tasks=range(4)), Outcome(4))
-    display._started -= 30.0
     for fraction in (0.1, 0.3, 0.5):
         display.message(
             "train/a_000000",
-            {"kind": "progress", "fraction": fraction, "frames": 9, "events": int(1e7 * fraction), "seconds": {}},
+            {
+                "kind": "progress",
+                "fraction": fraction,
+                "frames": 9,
+                "events": int(1e7 * fraction),
+                "seconds": {"render": 9.0, "events": 3.0},
+            },
         )
     lines = text.getvalue().splitlines()
-    # 30 s for 0.3 of a sequence of 10^7 events, of four: 3.7 are left.
-    assert lines == ["expected: about 0:06:10 and 0.13 GB"]
+    # 12 s for 0.3 of a sequence of 10^7 events, of four.
+    assert lines == ["expected: about 0:02:40 and 0.13 GB"]

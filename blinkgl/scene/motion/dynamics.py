@@ -76,7 +76,7 @@ def engine() -> ModuleType:
         import mujoco
     except ImportError:
         raise ConfigError(
-            "physics needs MuJoCo, which is not installed", where="scene.physics", accepted=f"run '{install('mujoco')}'"
+            "physics needs MuJoCo, which is not installed", where="scene.physics", accepted=f"run {install('mujoco')}"
         ) from None
     finally:
         if said is None:

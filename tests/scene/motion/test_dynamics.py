@@ -291,7 +291,7 @@ def test_a_nan_is_an_explosion(monkeypatch):
 
 def test_without_mujoco_there_is_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ConfigError, match=r"needs MuJoCo.*run '.* -m pip install 'mujoco") as caught:
+    with pytest.raises(ConfigError, match=r"needs MuJoCo.*run .* -m pip install 'mujoco") as caught:
         simulate([ball()], {"ball": BodyConfig()}, PhysicsConfig(), 0, S)
     assert "\n" not in str(caught.value)
 

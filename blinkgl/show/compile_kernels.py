@@ -28,9 +28,9 @@ from blinkgl.types.events import Events
 def compile_ahead() -> str:
     """Compile the kernels of all emulators, for both frame types, of a sequence and of event files, on all cores.
     Return "compiled 70 kernels in 38 s", or "" where all were compiled. A second process waits for the first."""
-    # The longest first; a sequence's own kernels together with its default emulator.
+    # The longest first; a sequence's own kernels together with its default emulator, which shares some.
     default, began = EmulatorConfig.default_member, time.perf_counter()
-    parts = [*((kind,) for kind in sorted(EMULATORS) if kind != default), (default, _SEQUENCE), (_FILES,)]
+    parts = [(_SEQUENCE, default), *((kind,) for kind in sorted(EMULATORS) if kind != default), (_FILES,)]
     workers = min(len(os.sched_getaffinity(0)), len(parts))
     with open(__file__) as lock, ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -118,9 +118,9 @@ class Panels:
         self._counts[:] = 0
         count_events(newest.x, newest.y, newest.p, self._counts)
         self._panel_view(1)[:] = self._fit(event_colour(self._counts))
-        number = f"{self._pending:,}" if few == self._pending else f"newest {few:,} of {self._pending:,}"
+        cut = () if few == self._pending else (f"the newest {few:,}",)
         share = () if self._noise is None else (f"{100 * self._noise / max(self._pending, 1):.0f} % noise",)
-        self._caption(1, number, "ON blue, OFF red", *share)
+        self._caption(1, f"{self._pending:,}", *cut, "ON blue, OFF red", *share)
         self._shown, self._pending, self._noise = [], 0, None if self._noise is None else 0
 
     def _toned(self, image: np.ndarray) -> np.ndarray:

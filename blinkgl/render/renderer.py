@@ -48,6 +48,7 @@ from blinkgl.render.passes import (
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 from blinkgl.scene.types import Scene
+from blinkgl.types.recent import Recent
 
 if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
@@ -285,7 +286,7 @@ class Labels:
     def __init__(self, renderer: Renderer, camera: PinHole | None = None):
         self._renderer, self._view = renderer, None if camera is None else View.of(camera)
         self.scene = renderer.scene if camera is None else renderer.scene.with_camera(camera)
-        self._kept: dict[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = {}
+        self._kept: Recent[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = Recent(KEPT)
 
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
         """Return the label frame; see :meth:`Renderer.labels`."""
@@ -305,8 +306,7 @@ class Labels:
         leading = {ns: self.frame(t_ns, each, t_ns + ns, None) for ns in request.intervals_ns} if each else {}
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:
-            frame = self._drawn(names, t_ns, ends)
-            drawn = {name: frame.read(name) for name in names}
+            drawn = _read(self._drawn(names, t_ns, ends), names)
         values: dict[str, Any] = {}
         for name in request:
             if LABELS[name].anti_aliased:
@@ -349,11 +349,8 @@ class Labels:
 
     def _buffers(self, t_ns: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Return buffers of these labels at a time, as the shader wrote them."""
-        key = (t_ns, names)
-        if key not in self._kept:
-            frame = self._drawn(names, t_ns, {})
-            self._kept[key] = {name: frame.read(name) for name in names}
-            # Neighbouring labels use the same moments; the oldest is dropped first.
-            while len(self._kept) > KEPT:
-                self._kept.pop(next(iter(self._kept)))
-        return self._kept[key]
+        return self._kept.of((t_ns, names), lambda: _read(self._drawn(names, t_ns, {}), names))
+
+
+def _read(frame: Frame, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    return {name: frame.read(name) for name in names}

@@ -75,7 +75,7 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     """Return for the points of ``hits`` at a time: (N, 2) px, 0 behind the camera; (N, 3) world; (N,) depth; (N,) bool
     visible."""
     camera = scene.camera
-    there = replace(hits, local=_local(scene, hits, t_ns))
+    there = replace(hits, local=casting.local_at(scene, hits, t_ns))
     moved = casting.applied(scene, there, lambda obj: casting.relative_pose_at(scene, obj, t_ns))
     world = casting.applied(scene, there, lambda obj: obj.path.pose(t_ns))
     depth = moved[:, 2].copy()
@@ -86,16 +86,6 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     inside = ahead & ((xy >= -0.5) & (xy < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
     seen, _ = casting.is_seen(scene, there, t_ns, moved, inside & (depth >= camera.near))
     return xy, world, depth, seen
-
-
-def _local(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
-    """Return object-local positions at t_ns, (N, 3), of any part."""
-    out, parts = np.full((len(hits.hit), 3), np.nan), casting.scene_parts(scene)
-    for p in np.unique(hits.part):
-        rows, mesh = hits.part == p, parts[p][1].mesh
-        corners = casting.vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
-        out[rows] = np.einsum("nc,nck->nk", hits.bary[rows], corners)
-    return out
 
 
 _ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")

@@ -29,6 +29,7 @@ from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
 from blinkgl.scene.types import Lamp, Light, Panorama
+from blinkgl.types.poses import pose_of
 
 MAX_LAMPS = 32
 """Largest number of lamps of a scene: every lit pixel evaluates each."""
@@ -44,9 +45,7 @@ def lamp_pose(position: ArrayLike = (0.0, 0.0, 0.0), shines: ArrayLike = (0.0, 0
     # Any axis that is not nearly parallel to z.
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), position
-    return T
+    return pose_of(position, np.stack([x, np.cross(z, x), z], axis=1))
 
 
 def _scaled(color: Sequence[float] | np.ndarray, factor: float) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from blinkgl.scene.geometry.meshes import MAX_COORDINATE, crease_normals, weld
 from blinkgl.scene.geometry.polygons import triangulate
 from blinkgl.scene.importing.gltf_file import inside
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
-from blinkgl.scene.reading import Omissions, contents
+from blinkgl.scene.reading import Omissions, contents, limit_faces
 from blinkgl.scene.surfaces.images import content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
 
@@ -92,9 +92,7 @@ def raw_meshes(
 
 
 def _check(given: Polygons, max_faces: int, where: str) -> None:
-    total = int(np.maximum(given.sizes - 2, 0).sum())
-    if total > max_faces:
-        raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+    limit_faces(int(np.maximum(given.sizes - 2, 0).sum()), max_faces, where)
     if (most := int(given.sizes.max(initial=0))) > MAX_CORNERS:
         raise AssetError(
             "a polygon has too many corners", where=where, value=most, accepted=f"at most {MAX_CORNERS}, or triangles"

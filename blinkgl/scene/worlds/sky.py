@@ -15,7 +15,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.primitives import parameter_hash, square
 from blinkgl.scene.lights import lit_by
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.reading import contents
+from blinkgl.scene.reading import contents, existing, resolve
 from blinkgl.scene.surfaces.environment import environment, turned
 from blinkgl.scene.surfaces.images import (
     IMAGE_SUFFIXES,
@@ -27,7 +27,7 @@ from blinkgl.scene.surfaces.images import (
     shrink,
 )
 from blinkgl.scene.types import FARTHEST, Light, Material, Mesh, Part, SceneObject, Texture
-from blinkgl.scene.worlds.pool import files_below, resolve, split_of
+from blinkgl.scene.worlds.pool import files_below, split_of
 
 _MARGIN = 1 / 16
 PANORAMA_INSET = 1 / (1 + _MARGIN)
@@ -88,9 +88,7 @@ def with_environment(
     if config is None:
         return light, objects
     where = "scene.light.environment.map"
-    file = resolve(config.map, base)
-    if not file.is_file():
-        raise ConfigError("no such file", where=where, value=config.map, accepted="an equirectangular image")
+    file = existing(config.map, base, where, "an equirectangular image")
     angle = np.radians(config.heading)
     light = panorama_light(file, angle, config.strength, light, f"{where}: {config.map}")
     if config.visible:

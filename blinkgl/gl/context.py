@@ -20,6 +20,7 @@ import moderngl
 
 from blinkgl.errors import GLError
 from blinkgl.gl.shader import ShaderLoader
+from blinkgl.machine.closing import Releasing
 
 # ---------------------------------------------------------------------------------------------------------------------
 # OSMesa (Mesa's off-screen software renderer) as a context object for moderngl.
@@ -134,7 +135,7 @@ class _EGLUnavailable(Exception):
         self.no_such_device = no_such_device
 
 
-class GLContext:
+class GLContext(Releasing):
     """A current OpenGL >= 4.3 core context with its programs and targets. Use it in ``with``, or call :meth:`release`.
 
     ctx        : the ``moderngl.Context``.
@@ -259,12 +260,6 @@ class GLContext:
                 self.ctx.release()
                 self._raw.release()
                 self._raw = None
-
-    def __enter__(self) -> GLContext:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.release()
 
     def __repr__(self) -> str:
         return f"<GLContext {self.backend}:{self.device} {self.renderer}, OpenGL {self.version}>"

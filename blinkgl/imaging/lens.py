@@ -46,13 +46,9 @@ def points(count: int, diameter: float) -> np.ndarray:
 
 def through(camera: CameraModel, point: np.ndarray, focus: float) -> CameraModel:
     """Return the pinhole camera at ``point`` (2,) of the lens, whose picture is aligned at depth ``focus``."""
-    a, b = (float(v) for v in point)
-    return _drawn(camera).from_lens_point(a, b, focus)
-
-
-def _drawn(camera: CameraModel) -> PinHole:
     assert isinstance(camera, PinHole)  # the renderer draws no other
-    return camera
+    a, b = (float(v) for v in point)
+    return camera.from_lens_point(a, b, focus)
 
 
 def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ _CANDIDATES = 6  # candidate positions for each requested sample
 
 Sample = WindowSample | StreamSample
 Cut = Callable[[SensorSimulation, StreamJob, str, int, np.random.Generator], Iterator[Sample]]
-"""(sequence, job, name of the sequence, largest number of samples, random generator) -> samples."""
+"""(sequence, job, name of the sequence, number of wanted samples, random generator) -> samples, perhaps more."""
 
 
 def windows(
@@ -48,9 +48,6 @@ def windows(
             None if backward is None else backward.valid,
             f"{name}/{t}us+{span}us",
         )
-        wanted -= 1
-        if wanted == 0:
-            return
 
 
 def streams(
@@ -68,9 +65,6 @@ def streams(
         if not _moves_as_asked(job, flow[valid], valid[0].size, parts):
             continue
         yield StreamSample(tuple(parts), edges, flow, valid, f"{name}/{start}us+{job.steps}x{span}us")
-        wanted -= 1
-        if wanted == 0:
-            return
 
 
 CUTS: dict[str, Cut] = {"windows": windows, "streams": streams}

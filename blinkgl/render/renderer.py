@@ -22,6 +22,7 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.gl import GLContext
 from blinkgl.labels import LABELS, LabelFrame, LabelRequest
+from blinkgl.machine.closing import Releasing
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, StillCanvas
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
 
 
-class Renderer:
+class Renderer(Releasing):
     """Draws one scene. It holds GL resources: use it as a context manager or call :meth:`release`.
 
     scene : as it is drawn, for frames and ground truth: at the configured level of detail, without triangles that are
@@ -110,12 +111,6 @@ class Renderer:
         # The shadow of a moving object also changes surfaces at rest.
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
         self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand)
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
 
     def release(self) -> None:
         if self.gl.released:  # everything was released with the context

@@ -282,14 +282,7 @@ def _start_of(
         offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
     if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
         return Start(offset, leak, dead_ns, age_ns, by_noise)
-    nominal_on, nominal_off = config.thresholds
-    shot = np.zeros(len(on))
-    if config.shot_noise_rate_hz and not config.photoreceptor_noise:
-        # Shot noise per second of both polarities: half the rate each, less in bright light, more at
-        # low thresholds.
-        level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
-        each = nominal_on / on.astype(np.float64) + nominal_off / off.astype(np.float64)
-        shot = 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
+    shot = _shots_per_s(config, intensity, on, off)
     moving = np.flatnonzero(leak > 0) if leak.size else np.empty(0, np.int64)
     # between: mean time from one event to the next, s.
     between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)
@@ -325,6 +318,17 @@ def _start_of(
         offset = np.where(often, by_noise, offset)
         age_ns[often] = 0
     return Start(offset, leak, dead_ns, age_ns, by_noise)
+
+
+def _shots_per_s(config: V2eConfig, intensity: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Return shot noise per second of both polarities: half the rate each, less in bright light, more at low
+    thresholds."""
+    if not config.shot_noise_rate_hz or config.photoreceptor_noise:
+        return np.zeros(len(on))
+    nominal_on, nominal_off = config.thresholds
+    level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
+    each = nominal_on / on.astype(np.float64) + nominal_off / off.astype(np.float64)
+    return 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
 
 
 def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:

@@ -329,6 +329,36 @@ def steady(clock: Clock, objs: list[Any]) -> None:
         obj.data.energy, obj.data.color = energy, colour
 
 
+def written(
+    job: dict, out: Path, say: Callable[..., None], clock: Clock, broken: set[str], owners: dict, figures: bool
+) -> tuple[dict[str, int], list[Track], dict[str, str]]:
+    """Write ``out`` until it plays as Blender shows it: what differs is baked, and more of it at each round. Return the
+    counts of the file, the baked tracks, and why others are not baked."""
+    tracks: list[Track] = []
+    tried, reasons = set(broken), {}
+    for number in range(ROUNDS):
+        say(doing="writing the GLB")
+        found = export(clock, out, job["clips"], tracks)
+        if not found["meshes"] and not figures:  # a clip for another's figure
+            raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
+        if job["clips"] or not owners:
+            break
+        say(compare=clock.per)
+        verdict = json.loads(sys.stdin.readline())
+        differ = {owner for name in verdict["differs"] for owner in owners.get(name, {name})} - tried
+        denser = 1 if clock.simulated else verdict["denser"]
+        if number == ROUNDS - 1 or not (differ or denser > 1):
+            break
+        clock.stretch(clock.per * denser)
+        say(doing=f"baking {len(differ)} objects")
+        room = 1e6 * job["bake_mb"] - sum(track.size for track in tracks)
+        more, why = bake(clock, differ, room)
+        tracks, reasons, tried = tracks + more, reasons | why, tried | differ
+        if denser == 1 and tried == broken | why.keys():
+            break
+    return found, tracks, reasons
+
+
 def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     """Write ``out`` and return the report, for the fields of :class:`blinkgl.blender.importing.Imported`."""
     say(doing="opening the file")
@@ -353,28 +383,8 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     failed: dict[str, str] = {}
     for place, what, instead in (("material.materials", "gather_material", NO_MATERIAL), ("mesh", "gather_mesh", None)):
         forgive(place, what, instead, failed)
-    tracks: list[Track] = []
-    tried, reasons = set(broken), {}
-    for number in range(ROUNDS):
-        say(doing="writing the GLB")
-        found = export(clock, out, job["clips"], tracks)
-        if not found["meshes"] and not any(obj.type == "ARMATURE" for obj in objs):  # a clip for another's figure
-            raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
-        if job["clips"] or not owners:
-            break
-        say(compare=clock.per)
-        verdict = json.loads(sys.stdin.readline())
-        differ = {owner for name in verdict["differs"] for owner in owners.get(name, {name})} - tried
-        denser = 1 if clock.simulated else verdict["denser"]
-        if number == ROUNDS - 1 or not (differ or denser > 1):
-            break
-        clock.stretch(clock.per * denser)
-        say(doing=f"baking {len(differ)} objects")
-        room = 1e6 * job["bake_mb"] - sum(track.size for track in tracks)
-        more, why = bake(clock, differ, room)
-        tracks, reasons, tried = tracks + more, reasons | why, tried | differ
-        if denser == 1 and tried == set(broken) | why.keys():
-            break
+    figures = any(obj.type == "ARMATURE" for obj in objs)
+    found, tracks, reasons = written(job, out, say, clock, set(broken), owners, figures)
     lines += [f"'{name}' cannot be exported, it is left out or plain ({why})" for name, why in sorted(failed.items())]
     cameras = [obj for obj in objs if obj.type == "CAMERA" and obj.data.type != "PANO"]
     scene.frame_set(scene.frame_start)

@@ -28,7 +28,6 @@ def make_mesh(
     normals: np.ndarray | None = None,
     uvs: np.ndarray | None = None,
     name: str = "",
-    source_hash: str = "",
     where: str | None = None,
     uv_size: float | None = None,
     project_degenerate: bool = False,
@@ -49,8 +48,7 @@ def make_mesh(
     project_degenerate : also project when the given coordinates cannot carry a texture (:func:`uvs_degenerate`). They
         are kept otherwise, because palette textures use exactly such coordinates.
     log : gets a line for each repair.
-    source : gets (W,) int64, the index of the given vertex of each of the mesh's; then no two of different origin are
-    joined.
+    source : gets (W,) int64, the index of the given vertex of each of the mesh's: none of different origin are joined.
 
     Faces without area are dropped and unused vertices removed; no face is turned round. Raises :class:`AssetError`
     (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
@@ -78,9 +76,7 @@ def make_mesh(
         corner_normals = normals[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     corners = None if source is None else origin[faces]
-    mesh, first = _from_corners(
-        vertices[faces], corner_normals, corner_uvs, corners, name=name, source_hash=source_hash
-    )
+    mesh, first = _from_corners(vertices[faces], corner_normals, corner_uvs, corners, name=name)
     if source is not None and corners is not None:
         source.append(corners.ravel()[first])
     return mesh

@@ -1,6 +1,7 @@
 """A recipe small enough to be made many times, and helpers to look at what came of it."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -8,6 +9,9 @@ import time
 from pathlib import Path
 
 import yaml
+
+from blinkgl.io.records import sealed
+from blinkgl.sequence_files.sequence_dir import digest_of
 
 RECIPE = {
     "seed": 11,
@@ -122,3 +126,12 @@ class Listener:
     @property
     def errors(self) -> list[str]:
         return [message["error"] for _, message in self.messages if message["kind"] == "failed"]
+
+
+def forge(folder: Path, name: str = "", **changes) -> None:
+    """Bring the manifest in line with what was done to a file, as a bug in the writer would; change what it says."""
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    if name:
+        manifest["files"][name] = digest_of(folder / name)
+    path.write_text(sealed({**manifest, **changes}))

@@ -361,6 +361,7 @@ def _unbind_egl() -> ctypes.CDLL:
     lib.eglGetCurrentDisplay.restype = ctypes.c_void_p
     lib.eglGetCurrentContext.restype = ctypes.c_void_p
     lib.eglMakeCurrent.argtypes = [ctypes.c_void_p] * 4
+    # No display: no EGL context was ever current in this thread.
     display = lib.eglGetCurrentDisplay()
     if display:
         lib.eglMakeCurrent(display, None, None, None)

@@ -51,6 +51,7 @@ class SlotMaker(Maker):
         job, began, made, failures, barren, last, tried = self.job, time.process_time(), 0, 0, 0, "", 0
         slot = job.slot_of_all(number)
         while made < job.samples and barren < TRIES:
+            # Later tries take sequences whose numbers no slot begins with.
             tried, before = tried + 1, made
             index = slot + (tried - 1) * _APART
             group = self._group(slot, tried)

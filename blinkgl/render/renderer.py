@@ -198,6 +198,7 @@ class Renderer(Releasing):
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
         frame = done.get(pass_)
         if frame is None:
+            # Another sensor of the rig has drawn it for this time.
             if pass_.common and (last := self._last.get(pass_)) is not None and pass_.serves(last.moment, moment):
                 done[pass_] = last
                 return last

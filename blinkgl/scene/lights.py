@@ -83,6 +83,7 @@ def shadowing(light: Light) -> tuple[int, ...]:
 def quadric_of(light: Light) -> np.ndarray:
     """Return the light of the surroundings per channel, (3, 4, 4), for :func:`ambient`; world axes."""
     one = np.zeros((4, 4))
+    # The quadric n^T Q n with n = (x, y, z, 1): a constant, and half of the linear term on either side of the diagonal.
     one[3, 3] = 0.5
     one[2, 3] = one[3, 2] = 0.25  # 0.5 + 0.5 n_z
     sky = light.sky * np.asarray(light.sky_color, np.float64)[:, None, None] * one

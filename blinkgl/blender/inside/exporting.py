@@ -69,6 +69,7 @@ def open_file(source: Path, fps: float | None) -> None:
     }
     usd = lambda path: operators.usd_import(filepath=path, import_textures_mode="IMPORT_PACK", set_frame_range=True)
     ending = source.suffix.lower()
+    # The user's start-up file would add its own camera, light and cube.
     operators.read_factory_settings(use_empty=True)
     # Independent of the defaults: text blocks marked 'register' and drivers' expressions are never run.
     bpy.context.preferences.filepaths.use_scripts_auto_execute = False
@@ -223,11 +224,13 @@ def has_plain_colour(material: Any) -> bool:
     surface = links[0].from_node
     colour = surface.inputs["Base Color" if surface.type == "BSDF_PRINCIPLED" else "Color"]
     paint = colour.links[0].from_node if colour.links else None
+    # A plain colour, unless its nodes are animated.
     if paint is None or paint.type in ("VERTEX_COLOR", "RGB"):
         return material.node_tree.animation_data is None
     if paint.type != "TEX_IMAGE" or paint.projection != "FLAT":
         return False
     where = paint.inputs["Vector"].links
+    # Mappings become KHR_texture_transform.
     while where and where[0].from_node.type == "MAPPING":
         where = where[0].from_node.inputs["Vector"].links
     still = paint.image is None or paint.image.source in ("FILE", "GENERATED")
@@ -318,6 +321,7 @@ def counts(tree: dict) -> dict[str, int]:
 def steady(clock: Clock, objs: list[Any]) -> None:
     """Give lights with key frames the greatest energy that they have at nine times."""
     keyed = [obj for obj in objs if obj.type == "LIGHT" and obj.data.animation_data is not None]
+    # glTF's lights are constant: the brightest of nine times stands for the whole.
     best = dict.fromkeys(keyed, (0.0, 1.0, 1.0, 1.0))
     for k in range(9 if keyed else 0):
         clock.go(clock.first + k * (clock.last - clock.first) / 8)

@@ -125,6 +125,7 @@ class Animation:
         whole = self.document.morph_weights(node, max(len(positions), 1))
         # Entry 1 of a cubic key is its value; 0 and 2 are tangents.
         values = [t.values[:, 1] if t.values.ndim == 3 else t.values for t in mine]
+        # Targets whose weight is always 0 would cost memory on the card.
         used = np.flatnonzero(np.any([whole != 0, *(np.abs(v).max(axis=0) > 0 for v in values)], axis=0))
         if not len(used):
             return None

@@ -128,8 +128,10 @@ def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, 
     if suffix not in MESH_SUFFIXES:
         raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
     data = contents(path, "mesh", max_bytes=max_bytes)
+    # A .gltf file is only its JSON: the buffers beside it decide about the mesh, too.
     digest = source_hash or content_hash(data, *dependencies(path, data))
     is_gltf = suffix in (".glb", ".gltf")
+    # Only glTF's standard says which axis is up.
     turn = Z_UP if up == "y" or (up == "auto" and is_gltf) else None
     if is_gltf:
         document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=materials)

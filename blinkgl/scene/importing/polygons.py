@@ -77,6 +77,7 @@ def raw_meshes(
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
     kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
     # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
+    # One raw mesh for each material and for each of the two kinds of coordinates; faces keep the file's order.
     order, raws = np.argsort(kind, kind="stable"), []
     for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():
         (number, bare), corners, tint = divmod(int(kind[chosen[0]]), 2), triangles[chosen].ravel(), None

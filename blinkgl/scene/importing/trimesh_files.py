@@ -52,6 +52,7 @@ def _raw_mesh(mesh: trimesh.Trimesh, wanted: bool) -> RawMesh:
         return RawMesh(vertices, faces)
     codes = np.asarray(mesh.visual.face_colors)[:, :3] / 255
     material, tint = tinted(None, linear_from_srgb(np.repeat(codes, 3, axis=0)))
+    # Colours belong to faces, so no two share a vertex.
     apart = np.arange(faces.size).reshape(-1, 3)
     return RawMesh(vertices[faces.ravel()], apart, None, None, material, colours=tint)
 
@@ -99,6 +100,7 @@ def _check_3mf(data: bytes, max_faces: int, where: str) -> None:
     """Check what the archive says about its sizes before anything is unpacked."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(info.file_size for info in archive.infolist())
+    # XML packs to a tenth; more than a hundred times is a bomb.
     if size > MAX_BYTES or size > 100 * len(data):
         raise AssetError("the mesh is too large when it is unpacked", where=where, value=f"{size / 1e6:.0f} MB")
     limit_faces(_model_of(data).count(b"<triangle "), max_faces, where)

@@ -192,6 +192,7 @@ def trajectory_path(
     form = None if config.form == "auto" else config.form
     declared = PoseFile(form, config.columns, config.time_unit, config.maps_from, config.axes, config.rate)
     t_ns, poses = read_trajectory(file, declared, log)
+    # From the file's clock to the scene's.
     t_ns = t_ns - (t_ns[0] - t0_ns if config.start is None else round(config.start * 1e9))
     if t_ns[0] > t0_ns or t_ns[-1] < t1_ns:
         raise ConfigError(
@@ -333,6 +334,7 @@ def _material(
                 accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'",
             )
         texture = texture_of(bundled[config.photograph], config.max_size)
+    # glTF's convention: green is roughness, blue is metallic, each times the material's number.
     rough = _map(config, "metallic_roughness_map", base, where, maps)
     shines = config.metallic > 0 or config.roughness < 1 or rough is not None
     plain = texture, config.color, config.uv_scale, config.unlit, config.both_sides

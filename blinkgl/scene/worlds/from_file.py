@@ -236,6 +236,7 @@ def _with_lights(
     found = document.lights()
     if not found:
         raise ConfigError("the file has no lights", where="scene.lights", value="file", accepted="config")
+    # The configuration's own lamps come first; of the file's, the brightest fill the rest.
     room = MAX_LAMPS - len(light.lamps)
     kept = sorted(found, key=lambda node: -found[node]["intensity"] * max(found[node]["color"]))[:room]
     if len(found) > room:
@@ -261,6 +262,7 @@ def _camera_node(document: gltf.Document, name: str | int | None) -> int:
                 where=document.where,
                 value=n.camera,
             )
+        # A camera may be asked for by its own name or its node's; the first of several wins.
         names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
         names.setdefault(n.name, i)
     order = list(found)

@@ -95,6 +95,7 @@ def random_world(
         random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, room.for_camera(), clearance, target, T_cam)
         for _ in range(_CAMERA_PATHS)
     )
+    # Bodies of the engine are left to it: their collisions are its own.
     kept, camera_path = _resolved(scene_objects, set(bodies), camera_paths, clearance, t0_ns, t1_ns, log)
     kept, dynamics = _fallen(config, kept, bodies, (camera_path, clearance), floor, t0_ns, t1_ns, log)
     return Scene(
@@ -375,6 +376,7 @@ def _rotation(rng, resting: bool) -> np.ndarray:
 def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]:
     """Return the asset at its size, with its own materials or a random texture and tint."""
     tint = 1 - config.objects.tint * rng.random(3)
+    # Drawn for every object, worn or not, so that a file's materials change no later draw.
     repeats = _log_uniform(rng, config.objects.texture_scale)
     parts = []
     texture = None if asset.has_materials else textures.draw(rng, split, log)
@@ -394,6 +396,7 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
     """Return the falling objects by name. The same number of values is drawn for each object, falling or not."""
     found = {}
     for name in names if config is not None else ():
+        # All numbers of a body are drawn whether it falls or not: a changed share leaves the others' as they are.
         falls, thrown, around, axis = rng.random(), rng.random(), rng.uniform(0, 2 * math.pi), rng.normal(size=3)
         elevation, speed, spin = rng.uniform(0, math.pi / 3), rng.uniform(*config.speed), rng.uniform(*config.spin)
         density, friction = _log_uniform(rng, config.density), rng.uniform(*config.friction)

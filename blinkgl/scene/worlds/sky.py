@@ -66,6 +66,7 @@ def panorama_sky(textures: Sequence[Texture], brightness: float) -> tuple[Part, 
 
 def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture]:
     """Return six textures of an equirectangular image, for :func:`panorama_sky`."""
+    # A quarter of the panorama's width for 90 degrees keeps its resolution at the horizon.
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _MARGIN)
     return [
         Texture(side, f"{name} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)
@@ -93,6 +94,7 @@ def with_environment(
     light = panorama_light(file, angle, config.strength, light, f"{where}: {config.map}")
     if config.visible:
         image = shrink(load_image(file), 4096)
+        # A panorama's columns are azimuth, so turning it about z moves them; it decreases to the right.
         image = np.roll(image, -round(config.heading / 360 * image.shape[1]), axis=1)
         textures = panorama_textures(image, file.stem, content_hash(contents(file, "image"), repr(config).encode()))
         parts = panorama_sky(textures, config.strength)
@@ -126,6 +128,7 @@ def drawn_panorama(
                 accepted="an equirectangular image or a folder of them",
             )
         files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
+    # By content: neither names, copies nor the order of a folder change what is drawn.
     hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
     mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
     if not mine:

@@ -149,6 +149,7 @@ def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.n
     """Return the median (2,) and the least-squares affine field (H, W, 2) of the truth; zeros if nothing is valid."""
     if not valid.any():
         return np.zeros(2), np.zeros_like(truth)
+    # Coordinates of about 1 condition the least squares.
     y, x = np.indices(valid.shape) / max(valid.shape)
     ground = np.stack([np.ones_like(x), x, y], axis=-1)
     affine = np.linalg.lstsq(ground[valid], truth[valid].astype(np.float64), rcond=None)[0]
@@ -158,6 +159,7 @@ def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.n
 def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
     """Return the component-wise median of the ground truth over at most 64 samples and every 8th pixel."""
     rows = []
+    # Rounded up, so that no more than MEDIAN_FRAMES are read.
     for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]:
         if (sample := dataset[i]) is None:
             continue

@@ -37,6 +37,7 @@ def points(count: int, diameter: float) -> np.ndarray:
     Vogel's spiral, sqrt(k + 1/2) at k golden angles, in the order of the bit-reversed numbers: instants are taken in
     the order of time, so the lens point must not depend on time."""
     bits = max(1, (count - 1).bit_length())
+    # 0, 4, 2, 6, 1, … of eight: numbers that are not below ``count`` are left out.
     order = [int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits)]
     k = np.array([number for number in order if number < count], np.float64)
     # The square root gives every point the same area; pi (3 - sqrt(5)) is the golden angle.

@@ -23,6 +23,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
     """Return the boxes of the objects in front of the camera at t_ns. ids : (H, W) uint32 visible instances."""
     camera, T_world_cam = scene.camera, scene.camera_path.pose(t_ns)
     shown = extents(ids, 1 + max((obj.instance_id for obj in scene.objects), default=0))
+    # Edges of the picture: pixel centres are whole numbers.
     whole = np.array([-0.5, -0.5, camera.width - 0.5, camera.height - 0.5])
     rows = []
     for obj in scene.objects:

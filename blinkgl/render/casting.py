@@ -236,6 +236,7 @@ def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors
         obj, part = scene_parts(scene)[p]
         if part.mesh.deformer is not None:
             corners = vectors_of(part.mesh)[part.mesh.faces[hits.triangle[rows]]]
+            # The mean of the corners' vectors, with barycentric weights.
             moved = np.einsum("nc,nck->nk", hits.bary[rows], corners)
             out[rows] += moved @ relative_pose_at(scene, obj, t_ns)[:3, :3].T
 
@@ -327,6 +328,7 @@ def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
         points = rays_of(scene.camera, hits.xy) * hits.depth[:, None]
+        # The chain rule: the projection's derivative at the point, (2, 3), times its rate in the camera's axes.
         return np.einsum("nij,nj->ni", scene.camera.jacobian(points), rate)
 
 

@@ -98,6 +98,7 @@ def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray,
     columns = min(width, max(1, round(np.sqrt(points * width / height))))
     rows = min(height, max(1, points // columns))
     columns = min(width, max(1, points // rows))
+    # Pixels at the middles of equal cells.
     x = np.floor((np.arange(columns) + 0.5) * width / columns)
     y = np.floor((np.arange(rows) + 0.5) * height / rows)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -107,6 +107,7 @@ def ambient(quadric: np.ndarray, normal: np.ndarray, quartic: np.ndarray | None 
     1) Q (n, 1) per channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals.   quartic : (3, 9,
     9), a form of the nine products of two coordinates, which is added."""
     n = np.concatenate([normal, np.ones((*normal.shape[:-1], 1))], axis=-1)
+    # n^T Q n of each channel.
     sums = np.einsum("...i,cij,...j->...c", n, quadric, n)
     if quartic is not None:
         pairs = np.einsum("...i,...j->...ij", normal, normal).reshape(*normal.shape[:-1], 9)

@@ -92,6 +92,7 @@ def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.nd
     twist = 0.5 * (turning - turning.swapaxes(1, 2))
     second = np.array([_second(body, t)[:3, 3] for t in times])
     rate = np.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]], axis=1)
+    # An accelerometer at rest measures the force that holds it, minus gravity.
     return rate, np.einsum("nij,nj->ni", R_body_world, second - gravity)
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import yaml
 
+from blinkgl.cli import run
+from blinkgl.config.reader import to_yaml
 from blinkgl.io.records import sealed
 from blinkgl.sequence_files.sequence_dir import digest_of
 
@@ -47,6 +49,14 @@ def recipe_file(folder: Path, **changes) -> Path:
     path = folder / "recipe.yaml"
     path.write_text(yaml.safe_dump({**RECIPE, **changes}))
     return path
+
+
+def generated(folder: Path, config: dict | str) -> Path:
+    """``folder`` with a run.yaml and, in ``out``, the data set that `generate` makes of it."""
+    path = folder / "run.yaml"
+    path.write_text(config if isinstance(config, str) else to_yaml(config), encoding="utf-8")
+    assert run(["generate", str(path), "--out", str(folder / "out")]) == 0
+    return folder
 
 
 def tree(out: Path) -> dict[str, str]:

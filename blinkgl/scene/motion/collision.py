@@ -383,6 +383,7 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
     if not keep.any():
         return None
     normals = normals[keep] / length[keep, None]
+    # n . x = d for the plane's points, with d from one corner.
     planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, corners[keep, 0])])
     extent = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
     # Coplanar triangles have one plane: compared to 1e-6, offsets relative to the extent.

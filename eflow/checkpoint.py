@@ -74,6 +74,7 @@ def _sort_header(path: Path) -> None:
     """Sort the names in a file's header, so that two equal runs write equal files: the library writes metadata in
     the random order of a hash map."""
     with open(path, "r+b") as file:
+        # A file begins with 8 bytes, the length of the JSON header that follows; data are relative to its end.
         size = int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(size))
         data = json.dumps(header, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()

@@ -72,9 +72,8 @@ def evaluate(
     dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads, option="--empty skip")
     indices = evenly(len(dataset), limit or len(dataset))
     shown = {indices[k] for k in evenly(len(indices), pictures)}
-    median = _set_median(dataset, indices)
-    tallies = {name: Tally() for name in ("network", *BASELINES)}
-    spent, sum_aee, scored, left_out, warm = 0.0, 0.0, 0, 0, WarmStart(warm_start)
+    scores = _Scores(_set_median(dataset, indices))
+    spent, left_out, warm = 0.0, 0, WarmStart(warm_start)
     for done, i in enumerate(indices, 1):
         if (sample := dataset[i]) is None:
             left_out += 1
@@ -90,32 +89,49 @@ def evaluate(
             flow = method(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began
         truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
-        metrics = frame_metrics(flow, truth, valid)
-        tallies["network"].add(scene, metrics)
-        for name, constant in zip(BASELINES, (np.zeros(2), median, *best_motions(truth, valid)), strict=True):
-            tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
-        if metrics:
-            sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
+        scores.add(scene, flow, truth, valid)
         if progress is not None:
-            progress(done, len(indices), sum_aee / max(scored, 1))
+            progress(done, len(indices), scores.aee)
         if out is not None and i in shown:
             name = batch["name"][0].replace("/", "_")
             picture = comparison(events_of(batch["new"][0].numpy()), flow, truth, valid)
             write_picture(inside(out / "pictures", f"{name}.png"), picture)
-    if not scored:
+    if not scores.count:
         raise AssetError("no sample has events and a valid ground-truth pixel", accepted="a labelled data set")
     result = {
         **_of_the_model(model),
         "samples": len(indices) - left_out,
-        "skipped": tallies["network"].skipped,
+        "skipped": scores.tallies["network"].skipped,
         "left_out": left_out,
         **({"warm": warm.count} if warm_start else {}),
         "ms": 1000 * spent / (len(indices) - left_out),
-        "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
+        "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in scores.tallies.items()},
     }
     if out is not None:
         write_whole(out / "results.json", json.dumps(result, indent=1) + "\n")
     return result
+
+
+class _Scores:
+    """Metrics of the network and of the baselines, by scene. median : (2,) of the set's ground truth, px."""
+
+    def __init__(self, median: np.ndarray):
+        self.median = median
+        self.tallies = {name: Tally() for name in ("network", *BASELINES)}
+        self.count, self._sum = 0, 0.0
+
+    @property
+    def aee(self) -> float:
+        """Return the network's mean AEE so far, px."""
+        return self._sum / max(self.count, 1)
+
+    def add(self, scene: str, flow: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> None:
+        metrics = frame_metrics(flow, truth, valid)
+        self.tallies["network"].add(scene, metrics)
+        for name, constant in zip(BASELINES, (np.zeros(2), self.median, *best_motions(truth, valid)), strict=True):
+            self.tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
+        if metrics:
+            self._sum, self.count = self._sum + metrics["AEE"], self.count + 1
 
 
 def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
@@ -133,6 +149,7 @@ def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.n
     """Return the median (2,) and the least-squares affine field (H, W, 2) of the truth; zeros if nothing is valid."""
     if not valid.any():
         return np.zeros(2), np.zeros_like(truth)
+    # Coordinates of about 1 condition the least squares.
     y, x = np.indices(valid.shape) / max(valid.shape)
     ground = np.stack([np.ones_like(x), x, y], axis=-1)
     affine = np.linalg.lstsq(ground[valid], truth[valid].astype(np.float64), rcond=None)[0]
@@ -142,6 +159,7 @@ def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.n
 def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
     """Return the component-wise median of the ground truth over at most 64 samples and every 8th pixel."""
     rows = []
+    # Rounded up, so that no more than MEDIAN_FRAMES are read.
     for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]:
         if (sample := dataset[i]) is None:
             continue

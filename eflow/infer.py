@@ -41,6 +41,7 @@ def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
     ``pad_start``)."""
     height, width = batch["new"].shape[-2:]
     multiple = model.pad_to or model.divisor
+    # -width % multiple is what is missing to the next multiple.
     right, down = -width % multiple, -height % multiple
     left, top = (right, down) if model.pad_start else (0, 0)
     pad = (left, right - left, top, down - top)
@@ -137,6 +138,7 @@ def windows(
                     accepted="--end-ms before the jump or --start-ms after it",
                 )
             yield StreamWindow.of(pending, t - span_us, t, t + span_us)
+            # The next pair begins with this one's new window.
             pending = pending.window(t, last + 1)
             t += span_us
         if end_us is not None and last >= end_us:
@@ -186,6 +188,7 @@ def likely_span(
         if not grows and before[1] > LIKELY_PX / 10:
             return before[0], longest
         before = span, speed
+        # Not more at once: the speed was measured at another length of window.
         factor = min(max(LIKELY_PX / speed, 0.4), 2.5)
         span = int(min(max(span * factor, 1000), longest))
         if 0.8 < factor < 1.25:
@@ -205,6 +208,7 @@ def at_places(
     """Yield a window, or pair, of ``span`` µs at a quarter, half and three quarters from ``first`` to ``last``; those
     without events are left out."""
     for place in (0.25, 0.5, 0.75):
+        # The reference time is at the place, unless a window would pass an end of the recording.
         start = max(first, min(round(first + place * (last - first)) - span, last + 1 - len(reads) * span))
         window = next(windows(file, span, start_us=start, end_us=last + 1, reads=reads), None)
         if window is not None and all(len(getattr(window, name)) for name in reads):
@@ -429,6 +433,7 @@ def doubts(events: Events, height: int, width: int) -> list[str]:
         )
     counts = np.bincount(events.pixel(width), minlength=height * width)
     few = max(round(FEW * counts.size), 1)
+    # The largest counts, without sorting all.
     share = np.partition(counts, -few)[-few:].sum() / len(events)
     if share > FLOOD:
         found.append(

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
+import resource
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -27,6 +30,23 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+
+
+_STATM = Path("/proc/self/statm")
+_GROWTH = 100 * 2**20 // resource.getpagesize()
+_tidied = 0  # pages that the process had when its memory was last given back
+
+
+def pytest_runtest_logfinish() -> None:
+    """Give memory back when the process has grown: the collector counts objects, and a few in a circle hold large
+    arrays and OpenGL's programs; and glibc keeps what is freed unless it is told to return it."""
+    global _tidied
+    pages = int(_STATM.read_text().split()[1]) if _STATM.is_file() else 0
+    if pages > _tidied + _GROWTH:
+        gc.collect()
+        with contextlib.suppress(AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
+        _tidied = int(_STATM.read_text().split()[1])
 
 
 class _Lender:

@@ -253,9 +253,7 @@ def position():
 
 
 def labelled(folder, **changes):
-    path = folder / "labelled.yaml"
-    path.write_text(yaml.safe_dump({**PLAIN, **changes}))
-    return path
+    return written(folder, **{**PLAIN, **changes})
 
 
 @pytest.fixture

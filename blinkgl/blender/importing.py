@@ -94,6 +94,7 @@ def import_scene(
         with output_errors(temporary):
             temporary.touch()  # now, not after minutes
         with tempfile.TemporaryDirectory(prefix="blinkgl-blender-") as name:
+            # Blender writes only here; the result is copied once it is known to be whole.
             folder = Path(name)
             job = {
                 "source": str(source.absolute()),
@@ -170,6 +171,7 @@ def _run(
         for words in blender.answers():
             if "doing" in words:
                 progress(words["doing"])
+            # Blender waits for this answer before it bakes or ends.
             if "compare" in words:
                 compared = differences(folder / "seen.npz", words["compare"])
                 blender.tell({"differs": list(compared[0]), "denser": compared[1]})

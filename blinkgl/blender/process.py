@@ -65,6 +65,7 @@ def require() -> None:
 
 def environment(home: Path) -> dict[str, str]:
     """Return the environment of Blender's process: ``home``, an empty folder, replaces all of the user's folders."""
+    # Blender reads add-ons, scripts and presets wherever variables point it: only these are passed on.
     given = {key: value for key, value in os.environ.items() if key.startswith(_HANDED_ON + _CARDS)}
     for key in ("HOME", "TMPDIR", "BLENDER_USER_RESOURCES", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
         given[key] = str(home)
@@ -143,6 +144,7 @@ class Blender(Closing):
         assert self._process.stdout is not None
         pipe, rest = self._process.stdout.fileno(), b""
         while True:
+            # One limit for the whole import, not for each line.
             left = None if self._ends is None else max(self._ends - time.monotonic(), 0.0)
             if not select.select([pipe], [], [], left)[0]:
                 raise BlinkGLError(

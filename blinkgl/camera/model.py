@@ -157,6 +157,7 @@ class CameraModel(ABC):
             height=(y1 - y0) * scale,
             fx=self.fx * scale,
             fy=self.fy * scale,
+            # Pixel centres are whole numbers, so the edge at -0.5 is what is scaled.
             cx=(self.cx - x0 + 0.5) * scale - 0.5,
             cy=(self.cy - y0 + 0.5) * scale - 0.5,
         )
@@ -179,5 +180,6 @@ class CameraModel(ABC):
 def planes_of(left: float, right: float, top: float, bottom: float) -> np.ndarray:
     """Return (5, 3) inward unit normals of a pin-hole picture with these edges on the image plane, and of the plane
     through the centre."""
+    # x >= left z and so on: a plane through the camera's centre for each edge of the picture; the last one is z >= 0.
     planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
     return planes / np.linalg.norm(planes, axis=1, keepdims=True)

@@ -86,6 +86,7 @@ class PinHole(CameraModel):
     @property
     def near_corner(self) -> float:
         x, y = self._edge()
+        # The ray (x, y, 1) meets the near plane at near times its own length.
         return self.near * math.sqrt(1 + x * x + y * y)
 
     def frustum_planes(self) -> np.ndarray:

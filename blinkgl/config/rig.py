@@ -34,6 +34,7 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import Sensor
 from blinkgl.config.values import Position, Vector3
 from blinkgl.errors import ConfigError
+from blinkgl.types.poses import pose_of
 
 SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", "tracks")
 """Sections of a single camera's configuration that each sensor has."""
@@ -79,14 +80,13 @@ class PlaceConfig(Config):
 
         if self.matrix is not None:
             return rigid_matrix(self.matrix)
-        T = np.eye(4)
-        T[:3, 3] = self.position
+        turn = Rotation.identity()
         if self.euler is not None:
-            T[:3, :3] = Rotation.from_euler("xyz", self.euler, degrees=True).as_matrix()
+            turn = Rotation.from_euler("xyz", self.euler, degrees=True)
         elif self.quaternion is not None:
             w, x, y, z = self.quaternion
-            T[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-        return T
+            turn = Rotation.from_quat([x, y, z, w])
+        return pose_of(self.position, turn.as_matrix())
 
 
 def _sensor_name(name: str) -> str:

@@ -18,8 +18,9 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import check_assets as check_scene, panorama_of
 from blinkgl.scene.importing.mesh_files import dependencies
 from blinkgl.scene.motion.dynamics import engine_version
+from blinkgl.scene.reading import resolve
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
-from blinkgl.scene.worlds.pool import files_below, resolve
+from blinkgl.scene.worlds.pool import files_below
 from blinkgl.scene.worlds.random_world import pools
 from blinkgl.sequence.recorded import matching_folders, used_images
 

@@ -87,62 +87,71 @@ def run_dataset(
     plan = Plan.of(template, num)
     assets = check_assets(plan)
     folder = RunFolder(out)
-    with (
-        interruptible(signal.SIGTERM),
-        folder.locked(plan.tasks.splits),
-    ):  # batch systems and `docker stop` end a run like Ctrl-C
+    # Absolute: workers on other machines start in other folders, and a link may change during the run.
+    job = Job(str(out.resolve()), str(template.base.resolve()), plan.recipe_text(), num)
+    # Batch systems and `docker stop` end a run like Ctrl-C.
+    with interruptible(signal.SIGTERM), folder.locked(plan.tasks.splits):
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
-        missing = outcome.planned - outcome.found
-        # Absolute: workers on other machines start in other folders, and a link may change during the run.
-        job = Job(str(out.resolve()), str(template.base.resolve()), plan.recipe_text(), num)
         keep_logs = False
         try:
-            if missing:
-                hellos = executor.open(job)
-                for hello in hellos:
-                    _agree(hello, hellos[0]["environment"], digest(assets))
-                folder.check_environment(hellos[0]["environment"], mixed)
-                folder.begin(plan, assets, hellos[0]["environment"], num)
-            for name in outcome.damaged:
-                folder.put_away(name)
-            folder.sweep(plan)
-            if listener:
-                listener.begin(plan, outcome)
-            started = time.monotonic()
-            if missing:
-                _loop(plan, executor, folder, outcome, time_limit_s, listener)
-            outcome.elapsed_s = time.monotonic() - started
-            if not missing and not (out / INDEX).is_file():  # the run was killed after its last sequence
-                write_index(out)
+            if outcome.planned > outcome.found:
+                environment = _agreed(executor.open(job), digest(assets))
+                folder.check_environment(environment, mixed)
+                folder.begin(plan, assets, environment, num)
+            _make_missing(plan, executor, folder, outcome, time_limit_s, listener)
         except StartError:
             keep_logs = True
             raise
         finally:
             executor.close()
-            if not folder.begun:
-                if not keep_logs:
-                    folder.take_back_logs()
-            elif folder.in_place:
-                folder.sweep(plan)
-                with contextlib.suppress(OutputError):  # on a full disk the first error is the one to report
-                    # Deleted during the run; without it the recipe of the run would be unknown.
-                    if folder.read("run.json") is None:
-                        folder.begin(plan, assets, folder.environment, num)
-                folder.write_failures(outcome.set_aside, plan)
-                with contextlib.suppress(OutputError):
-                    write_index(out)
+            if not folder.begun and not keep_logs:
+                folder.take_back_logs()
+            elif folder.begun and folder.in_place:
+                _leave(plan, folder, outcome, assets, num)
             if listener:
                 listener.end(outcome)
         if outcome.set_aside and not (outcome.made or outcome.found):
             folder.forget(plan, keep_logs=outcome.surprises > 0)
-            reason = next(iter(outcome.set_aside.values()))
-            raise BlinkGLError(
-                reason
-                if outcome.planned == 1
-                else f"{reason} (all {outcome.planned} sequences failed, this is the first's reason)"
-            )
+            reason, others = next(iter(outcome.set_aside.values())), ""
+            if outcome.planned > 1:
+                others = f" (all {outcome.planned} sequences failed, this is the first's reason)"
+            raise BlinkGLError(reason + others)
     return outcome
+
+
+def _make_missing(
+    plan: Plan,
+    executor: Executor,
+    folder: RunFolder,
+    outcome: Outcome,
+    time_limit_s: float,
+    listener: Listener | None,
+) -> None:
+    """Make what is missing, in a folder without what was found damaged."""
+    for name in outcome.damaged:
+        folder.put_away(name)
+    folder.sweep(plan)
+    if listener:
+        listener.begin(plan, outcome)
+    started, missing = time.monotonic(), outcome.planned > outcome.found
+    if missing:
+        _loop(plan, executor, folder, outcome, time_limit_s, listener)
+    outcome.elapsed_s = time.monotonic() - started
+    if not missing and not (folder.out / INDEX).is_file():  # the run was killed after its last sequence
+        write_index(folder.out)
+
+
+def _leave(plan: Plan, folder: RunFolder, outcome: Outcome, assets: dict[str, str], num: int | None) -> None:
+    """Leave a run's folder as another run can go on with it."""
+    folder.sweep(plan)
+    with contextlib.suppress(OutputError):  # on a full disk the first error is the one to report
+        # Deleted during the run; without it the recipe of the run would be unknown.
+        if folder.read("run.json") is None:
+            folder.begin(plan, assets, folder.environment, num)
+    folder.write_failures(outcome.set_aside, plan)
+    with contextlib.suppress(OutputError):
+        write_index(folder.out)
 
 
 def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
@@ -225,6 +234,14 @@ def _loop(
             for number, (_, since) in running.items():
                 if now - since > time_limit_s:
                     executor.kill(number, f"took longer than the limit of {time_limit_s:g} s")
+
+
+def _agreed(hellos: list[Message], assets: str) -> dict[str, str]:
+    """Return the workers' common environment. Raises as :func:`_agree`."""
+    environment = hellos[0]["environment"]
+    for hello in hellos:
+        _agree(hello, environment, assets)
+    return environment
 
 
 def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> None:

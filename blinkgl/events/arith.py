@@ -37,6 +37,15 @@ def _bits_f64(v):
     return lambda v: np.float64(v).view(np.int64)
 
 
+@register_jitable
+def horner(v, coefficients):
+    """Return the polynomial of v, coefficients from the highest power down; one rounding for each product and sum."""
+    p = v * coefficients[0] + coefficients[1]
+    for k in range(2, len(coefficients)):
+        p = p * v + coefficients[k]
+    return p
+
+
 # --- natural logarithm in 32-bit fixed point -------------------------------------------------------------
 Q = 25
 """Fraction bits of fixed-point log intensity: resolution 2^-25 = 3.0e-8, range +-64."""
@@ -48,19 +57,19 @@ _Q_LN2 = _I(round(np.log(2.0) * Q_ONE))
 _Q_SCALE = _F(Q_ONE)
 # 0x3F3504F3 is the bit pattern of sqrt(1/2) in float32, whose fraction has 23 bits.
 _F1, _SQRT_HALF_BITS, _EXP23 = _F(1.0), _I(0x3F3504F3), _I(23)
-# Coefficients of p in log(1 + f) = f + f^2 p(f).
-_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (
+# Coefficients of p in log(1 + f) = f + f^2 p(f), the highest power first, as in all the polynomials below.
+LOG_32 = tuple(
     _F(c)
     for c in (
-        -0.4999999764977098,
-        0.33333330028354796,
-        -0.25000781239812697,
-        0.20001234461093456,
-        -0.16626645629127462,
-        0.14204855952571013,
-        -0.1312755565128765,
-        0.1272267278801096,
         -0.07673641501674025,
+        0.1272267278801096,
+        -0.1312755565128765,
+        0.14204855952571013,
+        -0.16626645629127462,
+        0.20001234461093456,
+        -0.25000781239812697,
+        0.33333330028354796,
+        -0.4999999764977098,
     )
 )
 
@@ -68,16 +77,8 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (
 @register_jitable
 def _log1p_reduced(f):
     """Return log(1 + f) for f in [sqrt(1/2) - 1, sqrt(2) - 1], float32, absolute error < 5e-8."""
-    # Horner: log(1 + f) = f + f^2 p(f), so that small f keep all their digits.
-    p = f * _A8 + _A7
-    p = p * f + _A6
-    p = p * f + _A5
-    p = p * f + _A4
-    p = p * f + _A3
-    p = p * f + _A2
-    p = p * f + _A1
-    p = p * f + _A0
-    return f + f * f * p
+    # log(1 + f) = f + f^2 p(f), so that small f keep all their digits.
+    return f + f * f * horner(f, LOG_32)
 
 
 @register_jitable
@@ -116,16 +117,16 @@ def log_f32(v: float) -> float:
 _LOG2E_32, _LN2_HI_32, _LN2_LO_32 = _F(1.4426950408889634), _F(0.693359375), _F(-2.12194440e-4)
 _ROUND_32 = _F(12582912.0)  # 1.5 * 2^23: adding and subtracting it rounds to the nearest integer
 # Chebyshev fit of e^r on |r| <= ln(2)/2; close to 1/n!.
-_E32_0, _E32_1, _E32_2, _E32_3, _E32_4, _E32_5, _E32_6 = (
+EXP_32 = tuple(
     _F(c)
     for c in (
-        1.0,
-        1.000000037716214,
-        0.5000000047117757,
-        0.16666415514653277,
-        0.04166635289677516,
-        0.008375126398153335,
         0.0013941108433972674,
+        0.008375126398153335,
+        0.04166635289677516,
+        0.16666415514653277,
+        0.5000000047117757,
+        1.000000037716214,
+        1.0,
     )
 )
 # Below e^-87 the result would become subnormal. 127 is the bias of the exponent of a float32.
@@ -140,12 +141,7 @@ def exp_f32(v: float) -> float:
     # is exact.
     n = _F(_F(v * _LOG2E_32 + _ROUND_32) - _ROUND_32)
     r = _F(_F(v - n * _LN2_HI_32) - n * _LN2_LO_32)
-    p = r * _E32_6 + _E32_5
-    p = p * r + _E32_4
-    p = p * r + _E32_3
-    p = p * r + _E32_2
-    p = p * r + _E32_1
-    p = p * r + _E32_0
+    p = horner(r, EXP_32)
     # 2^n is written straight into the exponent field.
     return _F(p * _I((_I(n) + _BIAS_32) << _EXP23).view(np.float32))
 
@@ -156,16 +152,16 @@ _D1, _D2, _HALF = _D(1.0), _D(2.0), _D(0.5)
 # The bit pattern of sqrt(1/2) in float64, whose fraction has 52 bits.
 _SQRT_HALF_BITS_64, _EXP52, _LN2_64 = _L(0x3FE6A09E667F3BCD), _L(52), _D(np.log(2.0))
 # Coefficients of p in ln m = 2 s + s^3 p(s^2), s = (m - 1)/(m + 1); close to 2/3, 2/5, 2/7, ...
-_B0, _B1, _B2, _B3, _B4, _B5, _B6 = (
+LOG_64 = tuple(
     _D(c)
     for c in (
-        0.666666666666667,
-        0.39999999999899505,
-        0.28571428625975487,
-        0.2222221113479508,
-        0.18182889125261723,
-        0.15331721600556042,
         0.14616449685043406,
+        0.15331721600556042,
+        0.18182889125261723,
+        0.2222221113479508,
+        0.28571428625975487,
+        0.39999999999899505,
+        0.666666666666667,
     )
 )
 
@@ -180,13 +176,7 @@ def log_f64(v: float) -> float:
     # ln m = 2 artanh(s) = 2 s + s^3 p(s^2): odd, so half as many terms.
     s = (m - _D1) / (m + _D1)
     z = s * s
-    p = z * _B6 + _B5
-    p = p * z + _B4
-    p = p * z + _B3
-    p = p * z + _B2
-    p = p * z + _B1
-    p = p * z + _B0
-    return exponent * _LN2_64 + (_D2 * s + s * z * p)
+    return exponent * _LN2_64 + (_D2 * s + s * z * horner(z, LOG_64))
 
 
 # log2(e), and ln 2 in two parts, the first with zeros at its end.
@@ -234,6 +224,7 @@ def _exp_reduced(r):
 def exp_f64(v: float) -> float:
     """Return exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it is exp(-700) ~ 1e-304."""
     v = np.maximum(v, _EXP_MIN_64)
+    # As exp_f32: e^v = 2^n e^r, n ln 2 in two parts, and 2^n straight into the exponent field.
     n = (v * _LOG2E_64 + _ROUND_64) - _ROUND_64
     r = (v - n * _LN2_HI_64) - n * _LN2_LO_64
     p = _exp_reduced(r)
@@ -255,31 +246,31 @@ def fall_f64(x: float) -> float:
     return p * _L((bits_f64(t) + _BIAS_64) << _EXP52).view(np.float64)
 
 
-# sin(pi/2 f) = f (s0 + s1 f^2 + ...) for |f| <= 1/2.
-_S0, _S1, _S2, _S3, _S4, _S5, _S6 = (
+# sin(pi/2 f) = f p(f^2) for |f| <= 1/2.
+SIN_64 = tuple(
     _D(c)
     for c in (
-        1.5707963267948966,
-        -0.6459640975062443,
-        0.07969262624604301,
-        -0.004681754132340976,
-        0.0001604411507421909,
-        -3.59864335298231e-06,
         5.633933781537854e-08,
+        -3.59864335298231e-06,
+        0.0001604411507421909,
+        -0.004681754132340976,
+        0.07969262624604301,
+        -0.6459640975062443,
+        1.5707963267948966,
     )
 )
-# cos(pi/2 f) = c0 + c1 f^2 + ... for |f| <= 1/2.
-_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7 = (
+# cos(pi/2 f) = p(f^2) for |f| <= 1/2.
+COS_64 = tuple(
     _D(c)
     for c in (
-        1.0,
-        -1.2337005501361697,
-        0.2536695079010467,
-        -0.02086348076331121,
-        0.0009192602741831558,
-        -2.520203677046026e-05,
-        4.710609726757823e-07,
         -6.321256869628588e-09,
+        4.710609726757823e-07,
+        -2.520203677046026e-05,
+        0.0009192602741831558,
+        -0.02086348076331121,
+        0.2536695079010467,
+        -1.2337005501361697,
+        1.0,
     )
 )
 _D4, _L1, _L2, _L3 = _D(4.0), _L(1), _L(2), _L(3)
@@ -294,19 +285,7 @@ def cos_sin_turn(u: float) -> tuple[float, float]:
     f = turns - nearest
     quadrant = _L(nearest) & _L3
     z = f * f
-    s = z * _S6 + _S5
-    s = s * z + _S4
-    s = s * z + _S3
-    s = s * z + _S2
-    s = s * z + _S1
-    s = (s * z + _S0) * f
-    c = z * _C7 + _C6
-    c = c * z + _C5
-    c = c * z + _C4
-    c = c * z + _C3
-    c = c * z + _C2
-    c = c * z + _C1
-    c = c * z + _C0
+    s, c = horner(z, SIN_64) * f, horner(z, COS_64)
     # In odd quadrants sine and cosine of the rest are exchanged.
     odd = (quadrant & _L1) * _D1  # blends rather than branches: exact, since odd is 0 or 1
     # The cosine is negative in quadrants 1 and 2, the sine in 2 and 3.

@@ -149,6 +149,7 @@ class Emulator(ABC):
                 value=self.height,
                 accepted=f"at most {MAX_CAUSE_ROWS} rows, or events without causes",
             )
+        # The first frame sets the reference of all pixels, whatever rows it says have changed.
         first, stop = (0, self.height) if rows is None or self.t_ns is None else rows
         # [first, stop) in pixels: the rows that may differ from the last frame's.
         self._changed = (max(0, first) * self.width, min(self.height, stop) * self.width)
@@ -246,13 +247,16 @@ class Emulator(ABC):
         threads = max(1, min(thread_count(), blocks // SHARE_BLOCKS))
         bands = 1 if threads == 1 else BANDS_PER_THREAD * threads
         edges = first_block + blocks * np.arange(bands + 1, dtype=np.int64) // bands
+        # Each block has its own share of the limit, so that results do not depend on the number of bands.
         share = max(BLOCK, self.config.max_events_per_step // self._blocks)
         progress = np.zeros((bands, 3), np.int64)  # next block, events so far, events cut
+        # A band that runs out of room keeps its place, and goes on there once the buffer has grown.
         progress[:, 0] = edges[:-1]
         while True:
             # The first room is for one event of every fourth pixel.
             packed = self._buffer.rows(bands, self.height * self.width // (4 * bands))
             run(kernel, bands, (edges, progress, share, packed, *arguments), threads)
+            # Every band has reached its end.
             if (progress[:, 0] >= edges[1:]).all():
                 break
             # A block emits at most its share, or one event per pixel; so this loop ends, and memory is bounded.
@@ -264,6 +268,7 @@ class Emulator(ABC):
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return all state besides configuration and seed, as plain arrays (copies)."""
         state = {name: np.array(getattr(self, name)) for name in self._state if getattr(self, name) is not None}
+        # Arrays alone: a state is saved as an npz without pickle.
         clock = [self.t_ns is not None, self.t_ns or 0, self.frames, self.saturated]
         return {"clock": np.array(clock, np.int64), "shape": np.array([self.height, self.width]), **state}
 

@@ -102,6 +102,7 @@ def _checked(emulator: Any) -> str:
     name = f"'{kind}'"
     required = [key for key, info in model.model_fields.items() if info.is_required()]
     unless(not required, "Config", f"has keys without a default: {', '.join(required)}")
+    # A class with abstract methods can be registered but never made: said here, not in the first run.
     for part in sorted(model.__abstractmethods__):
         unless(False, f"Config.{part}", "is missing")
     for sensor in _SOME_SENSORS:
@@ -113,6 +114,7 @@ def _checked(emulator: Any) -> str:
 
     for part in sorted(emulator.__abstractmethods__):
         unless(False, part, "is missing")
+    # The timeline and the judge call both before the first frame.
     response, twin = result("response", emulator.response, config), result("noiseless", emulator.noiseless, config)
     unless(isinstance(response, Response), "response", f"gives {response!r} and not a Response")
     known = (model, *(other.Config for other in EMULATORS.values()))

@@ -42,6 +42,7 @@ def take_part(taken: np.ndarray, start: int) -> int:
 
     A thread that starts at the same place every time finds its last data in its core's cache."""
     for k in range(taken.size):
+        # Threads begin at different parts, so they rarely ask for the same one.
         part = (start + k) % taken.size
         # The plain read spares the atomic exchange for parts that are taken already.
         if taken[part] == 0 and _exchange(taken, part, 1) == 0:

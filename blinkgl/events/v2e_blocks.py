@@ -294,6 +294,7 @@ def emit(
                 polarity = keys[key] & 1
                 key += 1
             if emitted < cap:
+                # A packed word (packing.py); the time is added below.
                 word = bits | polarity
                 if told:
                     # Parts of the change since the reference was taken, from which the cause is decided.
@@ -372,6 +373,7 @@ def _drawn_leak(nominal, jitter, seed, pixel, at_ns):
 def _time_of(keys, key, o):
     """Return the time of shot noise ``key``, ns from the interval's start; _NEVER_NS if it is not of the pixel at
     ``o``."""
+    # A key: the pixel from bit 42 up, the time from bit 1, the polarity in bit 0.
     if key < keys.size and keys[key] >> 42 == o:
         return (keys[key] >> 1) & _NANOSECONDS
     return _NEVER_NS

@@ -12,7 +12,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import V2eConfig
-from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, log_f32, log_f64, select
+from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, horner, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK
 from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_places, start_sizes
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters, rough_normal, uniform2
@@ -46,8 +46,8 @@ def settled(lag: float) -> float:
     return select(np.abs(lag) < SETTLED, _ZERO, lag)
 
 
-# (1 - e^-k)/k = 1 - k/2! + k^2/3! - ...
-_P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040))
+GROWTH_32 = tuple(_F(c) for c in (1 / 5040, -1 / 720, 1 / 120, -1 / 24, 1 / 6, -1 / 2, 1))
+"""Coefficients of (1 - e^-k)/k = 1 - k/2! + k^2/3! - ..., the highest power first."""
 
 
 @register_jitable
@@ -55,21 +55,10 @@ def decay(k: float) -> tuple[float, float]:
     """Return (e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
     # ``select`` computes both sides, so each is limited to its valid range.
     small = np.minimum(k, _HALF)
-    p = _gentle_growth(small)
+    p = horner(small, GROWTH_32)
     large = np.maximum(k, _HALF)
     e = exp_f32(-large)
     return select(k < _HALF, _ONE - small * p, e), select(k < _HALF, p, (_ONE - e) / large)
-
-
-@register_jitable
-def _gentle_growth(k):
-    """Return (1 - e^-k)/k for k < 1/2 by its Taylor series."""
-    p = k * _P6 + _P5
-    p = p * k + _P4
-    p = p * k + _P3
-    p = p * k + _P2
-    p = p * k + _P1
-    return p * k + _P0
 
 
 @register_jitable
@@ -282,14 +271,7 @@ def _start_of(
         offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
     if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
         return Start(offset, leak, dead_ns, age_ns, by_noise)
-    nominal_on, nominal_off = config.thresholds
-    shot = np.zeros(len(on))
-    if config.shot_noise_rate_hz and not config.photoreceptor_noise:
-        # Shot noise per second of both polarities: half the rate each, less in bright light, more at
-        # low thresholds.
-        level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
-        each = nominal_on / on.astype(np.float64) + nominal_off / off.astype(np.float64)
-        shot = 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
+    shot = _shots_per_s(config, intensity, on, off)
     moving = np.flatnonzero(leak > 0) if leak.size else np.empty(0, np.int64)
     # between: mean time from one event to the next, s.
     between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)
@@ -325,6 +307,17 @@ def _start_of(
         offset = np.where(often, by_noise, offset)
         age_ns[often] = 0
     return Start(offset, leak, dead_ns, age_ns, by_noise)
+
+
+def _shots_per_s(config: V2eConfig, intensity: np.ndarray, on: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Return shot noise per second of both polarities: half the rate each, less in bright light, more at low
+    thresholds."""
+    if not config.shot_noise_rate_hz or config.photoreceptor_noise:
+        return np.zeros(len(on))
+    nominal_on, nominal_off = config.thresholds
+    level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
+    each = nominal_on / on.astype(np.float64) + nominal_off / off.astype(np.float64)
+    return 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
 
 
 def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:

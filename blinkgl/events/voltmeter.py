@@ -229,6 +229,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         emitted, dead = 0, False
         # The first block of random numbers: V at the interval's start, the time of the first event, which of its two
         # roots. One more for each event that follows, and for each end that is drawn.
+        # 20 bits for the draws within a step, so that no two steps share a number.
         draw = np.uint64(v.step) << _U20
         last = draw + _MAX_DRAWS
         past, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)

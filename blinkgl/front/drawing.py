@@ -17,13 +17,14 @@ from blinkgl.front.runs import MAX_INDEX, Source, configured, scene_of
 from blinkgl.front.sections import OF_EVENTS, label_names, labels_tree
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelFrame, asked_for
+from blinkgl.machine.closing import Closing
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.srgb import to_srgb8
 
 _LATEST_S = 1e7
 
 
-class Renderer:
+class Renderer(Closing):
     """Draws one sequence's scene at any time. Holds OpenGL: ``with Renderer(scene) as renderer: renderer.image(0.2)``.
 
     source : :class:`Scene` or the result of :func:`load`.   index : number of the sequence.   quality : as of
@@ -46,12 +47,6 @@ class Renderer:
             gl = stack.enter_context(create_context(self.config.gl.backend, self.config.gl.device))
             self._renderer: Any = stack.enter_context(SceneRenderer(gl, self.scene, self.config.render))
             self._stack = stack.pop_all()
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Release OpenGL; every later use raises ConfigError."""

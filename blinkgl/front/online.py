@@ -10,6 +10,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import load
+from blinkgl.machine.closing import Closing
 from blinkgl.machine.extras import install
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob, stream_seed
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 MAX_WINDOW_MS = 60_000
 
 
-class OnlineSequences:
+class OnlineSequences(Closing):
     """Endless samples of a recipe, rendered by worker processes during their use; no file is kept.
 
         with OnlineSequences("recipe.yaml", window_ms=(5, 50), workers=2) as sequences:
@@ -145,12 +146,6 @@ class OnlineSequences:
     def close(self) -> None:
         """End the workers and remove all their files."""
         self.stream.close()
-
-    def __enter__(self) -> OnlineSequences:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _window_us(given: float | Sequence[float] | None) -> tuple[int, int] | None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -290,7 +291,7 @@ def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> 
     t = None if uvs is None else check.array(uvs, "Mesh.uvs", (len(v), 2), f"an array ({len(v)}, 2)").astype(np.float32)
     digest = content_hash(v.tobytes(), f.astype(np.int64).tobytes(), b"" if t is None else t.tobytes())
     with placed("Mesh.vertices", of=(AssetError,)):
-        return make_mesh(v, f, uvs=t, name="mesh", source_hash=digest, where="Mesh")
+        return replace(make_mesh(v, f, uvs=t, name="mesh", where="Mesh"), source_hash=digest)
 
 
 class Scene(Piece):

@@ -20,6 +20,7 @@ import moderngl
 
 from blinkgl.errors import GLError
 from blinkgl.gl.shader import ShaderLoader
+from blinkgl.machine.closing import Releasing
 
 # ---------------------------------------------------------------------------------------------------------------------
 # OSMesa (Mesa's off-screen software renderer) as a context object for moderngl.
@@ -134,7 +135,7 @@ class _EGLUnavailable(Exception):
         self.no_such_device = no_such_device
 
 
-class GLContext:
+class GLContext(Releasing):
     """A current OpenGL >= 4.3 core context with its programs and targets. Use it in ``with``, or call :meth:`release`.
 
     ctx        : the ``moderngl.Context``.
@@ -260,12 +261,6 @@ class GLContext:
                 self._raw.release()
                 self._raw = None
 
-    def __enter__(self) -> GLContext:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.release()
-
     def __repr__(self) -> str:
         return f"<GLContext {self.backend}:{self.device} {self.renderer}, OpenGL {self.version}>"
 
@@ -366,6 +361,7 @@ def _unbind_egl() -> ctypes.CDLL:
     lib.eglGetCurrentDisplay.restype = ctypes.c_void_p
     lib.eglGetCurrentContext.restype = ctypes.c_void_p
     lib.eglMakeCurrent.argtypes = [ctypes.c_void_p] * 4
+    # No display: no EGL context was ever current in this thread.
     display = lib.eglGetCurrentDisplay()
     if display:
         lib.eglMakeCurrent(display, None, None, None)

@@ -15,6 +15,7 @@ import moderngl
 import numpy as np
 
 from blinkgl.errors import GLError
+from blinkgl.machine.closing import Releasing
 
 if TYPE_CHECKING:
     from blinkgl.gl.context import GLContext
@@ -60,7 +61,7 @@ def checked_array(out: np.ndarray | None, shape: tuple[int, ...], dtype: np.dtyp
     return out
 
 
-class Target:
+class Target(Releasing):
     """A framebuffer of ``width`` x ``height`` px with colour textures and depth.
 
     colour : one key of :data:`FORMATS` per attachment, ``layout(location = i)`` in the fragment shader.
@@ -218,9 +219,3 @@ class Target:
         for resource in (self.fbo, *self.colour, self.depth):
             if resource is not None:
                 resource.release()
-
-    def __enter__(self) -> Target:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.release()

@@ -320,6 +320,7 @@ class ShaderLoader:
 
 def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
     """Return moderngl's error text as a ShaderError that names the user's files."""
+    # moderngl writes the stage above the driver's own log.
     stage = next((m[1] for m in map(_STAGE_HEADER.match, log.splitlines()) if m), None)
     name = next(iter(sources.values())).name
     first: ShaderError | None = None

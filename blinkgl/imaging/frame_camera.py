@@ -165,6 +165,7 @@ class FrameCamera:
         """Return the mean over the exposure, (H, W, 3) float64, 1 being white; the number of instants; the largest
         motion between two of them, px."""
         config, draw = self.config, self.renderer
+        # At both ends and in the middle: a pose's speed changes little within an exposure.
         times = np.linspace(exposure.start_ns, exposure.end_ns, SPEED_TIMES)
         speed = max(largest_speed(draw.velocity(int(t), SPEED_EVERY).view()) for t in times)
         points = self._points_needed(exposure.middle_ns)

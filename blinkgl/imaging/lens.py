@@ -37,6 +37,7 @@ def points(count: int, diameter: float) -> np.ndarray:
     Vogel's spiral, sqrt(k + 1/2) at k golden angles, in the order of the bit-reversed numbers: instants are taken in
     the order of time, so the lens point must not depend on time."""
     bits = max(1, (count - 1).bit_length())
+    # 0, 4, 2, 6, 1, … of eight: numbers that are not below ``count`` are left out.
     order = [int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits)]
     k = np.array([number for number in order if number < count], np.float64)
     # The square root gives every point the same area; pi (3 - sqrt(5)) is the golden angle.
@@ -46,13 +47,9 @@ def points(count: int, diameter: float) -> np.ndarray:
 
 def through(camera: CameraModel, point: np.ndarray, focus: float) -> CameraModel:
     """Return the pinhole camera at ``point`` (2,) of the lens, whose picture is aligned at depth ``focus``."""
-    a, b = (float(v) for v in point)
-    return _drawn(camera).from_lens_point(a, b, focus)
-
-
-def _drawn(camera: CameraModel) -> PinHole:
     assert isinstance(camera, PinHole)  # the renderer draws no other
-    return camera
+    a, b = (float(v) for v in point)
+    return camera.from_lens_point(a, b, focus)
 
 
 def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:

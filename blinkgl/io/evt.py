@@ -226,6 +226,7 @@ def _decode_evt2(words, masks, state, x, y, t, p):
                         bad = i
                         break
                     x[n], y[n], p[n] = column, word & 0x7FF, kind
+                    # From the top: wraps, 28 bits of TIME_HIGH, 6 bits of the word itself.
                     t[n] = (((wraps << 28) | high) << 6) | ((word >> 22) & 63)
                     n += 1
                 mask >>= 1
@@ -294,6 +295,7 @@ def _decode_evt3(words, state, x, y, t, p, mend):
             if high < 0:
                 untimed += 1
                 continue
+            # The time, from the top: wraps, 12 bits of TIME_HIGH, 12 bits of TIME_LOW.
             x[n], y[n], p[n] = word & 0x7FF, row, (word >> 11) & 1
             t[n] = (((wraps << 12) | high) << 12) | low
             n += 1

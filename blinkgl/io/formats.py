@@ -428,6 +428,7 @@ def convert(
                 value=reading.time_unit,
                 accepted="no --time-unit for them; --write-unit is the unit of text that is written",
             )
+        # Read beforehand: a writer is given DSEC's offset before the first event.
         first = next((int(e.t[0]) for e in file.chunks()), 0)
         shift = first if zero_time else 0
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.

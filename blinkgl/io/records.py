@@ -61,6 +61,7 @@ def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:
     ``limit`` bytes."""
     try:
         with open(open_regular(path), "rb") as file:
+            # One byte more than allowed tells a file that is too large without reading it whole.
             data = file.read(limit + 1)
         if len(data) > limit:
             raise AssetError("too large", where=str(path), accepted=f"at most {limit} bytes")
@@ -104,6 +105,7 @@ def sealed(record: Mapping[str, Any], default: Callable[[Any], Any] | None = Non
     """Return the JSON text of a record with a hash of itself: SHA-256 of the text with zeros in the hash's place."""
     text = json.dumps({**record, SEAL: _OPEN}, indent=1, sort_keys=True, default=default) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
+    # The hash has as many digits as the zeros: no byte moves.
     return text.replace(f'"{SEAL}": "{_OPEN}"', f'"{SEAL}": "{digest}"')
 
 
@@ -139,6 +141,7 @@ def _inside(name: str) -> str:
         raise ValueError("not a file name") from None
     if "\0" in name or min(sizes) == 0 or {".", ".."} & set(parts):
         raise ValueError("not a path inside the folder")
+    # Limits of file systems: 255 bytes a name; the whole path has to fit into 4096.
     if max(sizes) > 255 or sum(sizes) + len(sizes) > MAX_NAME_BYTES:
         raise ValueError("not a file name: too long")
     return name

@@ -55,6 +55,7 @@ def named_columns(names: Iterable[str], reading: EventReading) -> dict[str, str]
 def guessed_order(rows: np.ndarray) -> tuple[str, ...]:
     """Return the order of the columns of (N, 4) numbers without names: t x y p, unless p, the last column of -1, 0 and
     1 alone, or the rising one say another."""
+    # From the last: of a still x or y, which may be 0 or 1 alone, p is the one behind it.
     signs = [k for k in (3, 2, 1, 0) if np.isin(rows[:, k], (-1, 0, 1)).all()]
     p = signs[0] if signs else 3
     rising = [k for k in range(4) if k != p and (np.diff(rows[:, k]) >= 0).all()]

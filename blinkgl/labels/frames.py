@@ -28,6 +28,7 @@ class LabelRequest:
     @property
     def buffers(self) -> tuple[str, ...]:
         """Return the labels whose shader outputs must be drawn, in the order of the table."""
+        # In the table's order, not the request's: equal requests share one pass.
         drawn = {other for name in self.names for other in (name, *LABELS[name].needs)}
         return tuple(name for name, label in LABELS.items() if name in drawn and label.buffer)
 
@@ -89,6 +90,8 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
 def ending_within(intervals_ns: Iterable[int], before_ns: int, after_ns: int) -> list[int]:
     """Return the intervals that end in [before_ns, after_ns], with a tolerance of 1 µs: label times are rounded to ns,
     and a multiple of 1/30 s differs from that of the label interval."""
+    # Times of files are whole microseconds: an interval may end up to one beyond the sequence, and is then
+    # cut at its end.
     there = {min(max(ns, before_ns), after_ns) for ns in intervals_ns if before_ns - 1000 < ns < after_ns + 1000}
     return sorted(there - {0})
 

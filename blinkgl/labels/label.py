@@ -255,6 +255,7 @@ class Label:
 
     def wrong(self, value: Any, height: int, width: int) -> str | None:
         """Return what is wrong with the shape or number type of a value, in words; None: nothing."""
+        # Checked on every label: what `finish` of a plug-in gives has never been seen before.
         array = np.asarray(value)
         if array.shape[:2] != (height, width):
             return f"not {width}x{height} px: {array.shape}"
@@ -263,6 +264,7 @@ class Label:
             if self.channels is None
             else [(height, width, self.channels) if self.channels else (height, width)]
         )
+        # Only the kind of number matters here; :meth:`own` converts the width.
         kind = "" if self.dtype is None else np.dtype(self.dtype).kind
         if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
             said = f" {np.dtype(self.dtype)}" if kind else ""

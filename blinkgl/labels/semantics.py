@@ -99,6 +99,7 @@ class Semantics(Label):
 
 
 def _of(scene: Scene, categories: Categories, ids: np.ndarray) -> np.ndarray:
+    # Index 0 is the background, which has category 0.
     numbers = np.zeros(1 + max((obj.instance_id for obj in scene.objects), default=0), np.uint16)
     for obj in scene.objects:
         numbers[obj.instance_id] = category_of(obj, categories)

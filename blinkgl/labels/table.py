@@ -63,6 +63,7 @@ def _checked(label: Any) -> None:
         unless(not new or bool(label.about), "about", "is missing")
     unless(label.kind in KINDS, "kind", f"is {label.kind!r} and none of {', '.join(KINDS)}")
     _check_drawing(label, unless)
+    # Two labels may share a folder if their files have different endings.
     taken = {form.folder + "." + form.ending: other.name for other in LABELS.values() for form in other.forms}
     for form in label.forms:
         at = form.folder + "." + form.ending

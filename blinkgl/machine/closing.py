@@ -18,6 +18,19 @@ class Closing:
         self.close()
 
 
+class Releasing:
+    """Released at the end of its ``with``: what holds OpenGL's resources."""
+
+    def release(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
 class Finishing(Closing):
     """Finished at the end of its ``with``, or given up where that ends in an exception."""
 

@@ -26,6 +26,7 @@ def interruptible(*numbers: int) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    # ``inside`` is read by the thread below: it must not send a signal after the block has ended.
     main, inside, last = threading.get_ident(), True, signal.SIGINT
 
     def interrupt(number: int, _) -> None:
@@ -44,6 +45,8 @@ def interruptible(*numbers: int) -> Iterator[None]:
         else:
             hook_before(unraisable)
 
+    # An exception raised in a destructor or a callback of C code is reported here and lost: the interrupt
+    # is sent again.
     hook_before, sys.unraisablehook = sys.unraisablehook, unraisable
     before = {number: signal.signal(number, interrupt) for number in numbers}
     try:
@@ -70,5 +73,6 @@ def uninterrupted(*numbers: int) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        # Handlers are the former ones again, so each signal does what it would have done at once.
         for number in came:
             signal.raise_signal(number)

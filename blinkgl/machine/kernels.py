@@ -75,6 +75,7 @@ class _Cache(FunctionCache):
 
     def __init__(self, function: Callable):
         super().__init__(function)
+        # numba's own stamp covers only the kernel's file, and a kernel inlines functions of others.
         stamp = self._impl.locator.get_source_stamp(), _stamps_of_imports(function.__module__)
         self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, stamp)
 
@@ -131,6 +132,7 @@ def kernel(function: Callable | None = None, *, error_model: Literal["python", "
     error_model : "numpy" divides by zero as NumPy does, without a branch; "python" raises ZeroDivisionError."""
     if function is None:
         return lambda f: kernel(f, error_model=error_model)
+    # nogil: bands of a frame run in threads, and Python threads go on meanwhile.
     dispatcher: Any = numba.njit(nogil=True, error_model=error_model)(function)
     try:
         dispatcher._cache = _Cache(function)  # noqa: SLF001 - what njit(cache=True) does, with a class of its own

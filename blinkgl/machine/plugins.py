@@ -32,6 +32,7 @@ def load_plugins(files: Iterable[str | os.PathLike] = ()) -> None:
     Raises ConfigError: a file is missing, fails, or has the name of another."""
     started_with = filter(None, os.environ.get(_VARIABLE, "").split(os.pathsep))
     for path in [Path(file).absolute() for file in (*started_with, *files)]:
+        # Workers inherit the variable and are given the files, too: each is loaded once.
         if _PATHS.get(path.stem) == path:
             continue
         if not path.is_file():
@@ -45,7 +46,9 @@ def load_plugins(files: Iterable[str | os.PathLike] = ()) -> None:
         sys.modules[spec.name] = module  # where pydantic looks up the names of annotations
         _guarded(str(path), lambda: spec.loader.exec_module(module))  # noqa: B023
         _PATHS[path.stem] = path
+        # The manifest names 64 bits of the sum: enough to tell two versions of a file apart.
         _LOADED[path.stem] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    # Processes that are started from here load the same files before their first job.
     os.environ[_VARIABLE] = os.pathsep.join(map(str, _PATHS.values()))
     for point in entry_points(group=GROUP):
         if point.name not in _LOADED:

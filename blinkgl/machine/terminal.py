@@ -32,6 +32,7 @@ def plain_console(**options: Any) -> Console:
     control characters, in tables too. For style pass a ``rich.text.Text`` or ``style=``. In a pipe or a file, lines are
     not wrapped, so that words can be searched."""
     console = _Console(markup=False, emoji=False, **options)
+    # A file or a pipe has no width: rich would wrap lines at 80 columns, which a script would have to join.
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _NO_END
     return console

@@ -20,7 +20,7 @@ _CANDIDATES = 6  # candidate positions for each requested sample
 
 Sample = WindowSample | StreamSample
 Cut = Callable[[SensorSimulation, StreamJob, str, int, np.random.Generator], Iterator[Sample]]
-"""(sequence, job, name of the sequence, largest number of samples, random generator) -> samples."""
+"""(sequence, job, name of the sequence, number of wanted samples, random generator) -> samples, perhaps more."""
 
 
 def windows(
@@ -48,9 +48,6 @@ def windows(
             None if backward is None else backward.valid,
             f"{name}/{t}us+{span}us",
         )
-        wanted -= 1
-        if wanted == 0:
-            return
 
 
 def streams(
@@ -59,6 +56,7 @@ def streams(
     """Yield runs of ``job.steps`` consecutive windows."""
     events = sequence.gather()
     for start, span in _places(sequence, job, job.steps, wanted, dice):
+        # steps windows have steps + 1 edges; the flow of each leads from its first edge to its last.
         edges = start + span * np.arange(job.steps + 1, dtype=np.int64)
         parts = [events.window(int(a), int(b)) for a, b in pairwise(edges)]
         if min(len(part) for part in parts) < job.min_events:
@@ -68,9 +66,6 @@ def streams(
         if not _moves_as_asked(job, flow[valid], valid[0].size, parts):
             continue
         yield StreamSample(tuple(parts), edges, flow, valid, f"{name}/{start}us+{job.steps}x{span}us")
-        wanted -= 1
-        if wanted == 0:
-            return
 
 
 CUTS: dict[str, Cut] = {"windows": windows, "streams": streams}
@@ -78,6 +73,7 @@ CUTS: dict[str, Cut] = {"windows": windows, "streams": streams}
 
 def _moves_as_asked(job: StreamJob, flow: np.ndarray, pixels: int, parts: list[Events]) -> bool:
     """Return whether there is flow, not too long, and with enough events per px."""
+    # Every seventh pixel suffices for a median.
     lengths = np.hypot(*flow[::7].T)
     if not len(lengths) or np.median(lengths) > job.max_flow:
         return False
@@ -114,6 +110,7 @@ def drawn_spans(
             where="time.duration",
             accepted="a longer one, or shorter window_ms",
         )
+    # Log-uniform: as many between 5 and 10 ms as between 50 and 100.
     spans = np.rint(np.exp(rng.uniform(np.log(window_us[0]), np.log(longest), count))).astype(np.int64)
     spans = np.clip(spans, window_us[0], longest)
     # + 1, as the latest start is among those that are drawn.

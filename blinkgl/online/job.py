@@ -52,6 +52,8 @@ class StreamJob(Job):
 
     def slot_of_all(self, slot: int) -> int:
         """Return the number in the whole stream of a slot of this process."""
+        # Blocks of MIX slots are dealt to the processes in turn: slot k of block b is number k of block b *
+        # world + rank.
         block, place = divmod(slot, MIX)
         return self.block_of_all(block) * MIX + place
 
@@ -62,6 +64,7 @@ def _plan(recipe: str, base: str, split: str) -> Plan:
     of_split = [g for g in RunTemplate(tree, Path(base)).groups if g.enabled and _split_of(g) == split]
     if not of_split:
         raise ConfigError(f"the recipe has no sequences of split '{split}'", where="output.split")
+    # Groups of other splits stay in the recipe, disabled: numbers and seeds of sequences count them.
     if "groups" in tree:
         names = {group.name for group in of_split}
         for name, group in tree["groups"].items():

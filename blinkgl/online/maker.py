@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ class SlotMaker(Maker):
         job, began, made, failures, barren, last, tried = self.job, time.process_time(), 0, 0, 0, "", 0
         slot = job.slot_of_all(number)
         while made < job.samples and barren < TRIES:
+            # Later tries take sequences whose numbers no slot begins with.
             tried, before = tried + 1, made
             index = slot + (tried - 1) * _APART
             group = self._group(slot, tried)
@@ -59,8 +61,8 @@ class SlotMaker(Maker):
                 name = sequence_name(config.output, index).split("/")[1]
                 asked = SequenceRequest(config, index, Path(job.base), labels=False)
                 with simulate_sequence(asked, self.gl) as sequence:
-                    dice = self._dice(slot, tried, 1)
-                    for sample in CUTS[job.kind](sequence.alone, job, name, job.samples - made, dice):
+                    wanted, dice = job.samples - made, self._dice(slot, tried, 1)
+                    for sample in islice(CUTS[job.kind](sequence.alone, job, name, wanted, dice), wanted):
                         sample.write(sample_file(Path(job.out), number, made))
                         made += 1
             except Exception as error:  # noqa: BLE001 - whatever it is, the next sequence goes on

@@ -89,6 +89,7 @@ def read_sample(path: Path) -> WindowSample | StreamSample:
     name = str(arrays["name"])
     if "times" in arrays:
         events = _events(arrays, "all")
+        # All windows lie in one array, one after the other, and counts says where each ends.
         ends = np.cumsum(arrays["counts"])
         windows = tuple(
             Events(*(getattr(events, c)[start:end] for c in _COLUMNS))
@@ -120,4 +121,5 @@ def _save(path: Path, **arrays: Any) -> None:
     temporary = path.with_suffix(f".{os.getpid()}")
     with open(temporary, "wb") as file:
         np.savez(file, **arrays)
+    # A reader in another process sees the whole file or none.
     os.replace(temporary, path)

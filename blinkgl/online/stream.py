@@ -154,6 +154,7 @@ class SampleStream(Closing):
 
     def _place(self, n: int) -> tuple[int, int]:
         """Return slot and item of sample n: the samples of a block, shuffled."""
+        # Samples of MIX slots are shuffled together, so that neighbours in a batch are of different sequences.
         block, place = divmod(n, self.block)
         mixed = int(_order(self.job.seed, self.job.block_of_all(block), self.block)[place])
         return block * MIX + mixed // self.job.samples, mixed % self.job.samples
@@ -163,6 +164,7 @@ class SampleStream(Closing):
         # The mark comes first: a missing sample without a mark would be awaited for ever.
         path.with_suffix(_GONE).touch()
         path.unlink(missing_ok=True)
+        # With a thread it is the thread that advances, and other processes only leave marks.
         if self._thread is None and os.getpid() == self._owner:
             self._advance()
 
@@ -228,6 +230,7 @@ class SampleStream(Closing):
         try:
             while not self._stop:
                 self._advance()
+                # At most ``ahead`` blocks beyond the one that is being taken, which bounds the files on disk.
                 while executor.free() and (again or self._next < self._base + MIX * (1 + self._ahead)):
                     slot, attempt = again.pop() if again else (self._next, 1)
                     self._next = max(self._next, slot + 1)

@@ -196,17 +196,13 @@ def calibrate_events(
     else:
         clip, before = _of_scene(events, frames, size, reading, base, keys, starts, seed, say)
         notes, warnings = _of_frames(clip, reading)
+    # The first half is fitted, the second only judged: a fit must not see what it is judged by.
     half = (clip.intervals + 1) // 2
     halves = ((0, half), (half, clip.intervals))
     found = Search([(clip, half)], base, seed, lambda done: say("fitting", done))
-    if before is not None:
-        found.undetermined.update(before.undetermined)
-        keys, start = before.keys, before.place
-    else:
-        keys = found.responding(keys)
-        start = found.roughly(keys, starts) if keys else np.empty(0)
-    found.run(keys, start)
+    _fit(found, before, keys, starts)
     say("judging", 1.0)
+    # Another seed than the search's, so that it is not judged by the noise that it has fitted.
     streams = [clip.simulate(one, seed + 1) for one in (base, found.config())]
     judged = [_judged(clip, stream, halves) for stream in streams]
     return Calibration(
@@ -228,6 +224,17 @@ def calibrate_events(
         clip.gamma,
         warnings,
     )
+
+
+def _fit(search: Search, before: Search | None, keys: list[str], starts: int) -> None:
+    """Fit the keys, from where the search ``before`` ended; None: from the best of ``starts``."""
+    if before is not None:
+        search.undetermined.update(before.undetermined)
+        keys, start = before.keys, before.place
+    else:
+        keys = search.responding(keys)
+        start = search.roughly(keys, starts) if keys else np.empty(0)
+    search.run(keys, start)
 
 
 def _judged(clip: Clip, stream: Events, halves: tuple[tuple[int, int], tuple[int, int]]) -> tuple[Judged, Judged]:
@@ -291,6 +298,7 @@ def judge_half(recorded: GroupSums, simulated: GroupSums, told: float = float("n
     a, b = total(own), total(other)
     products, pixels, alike = other[6:9]
     norm = np.sqrt(products[1] * products[2])
+    # Fewer pixels than 400 say little about a rate of a fraction of a hertz.
     hz = lambda parts: float(parts[4].sum() / (pixels[1] * recorded.seconds.sum())) if pixels[1] >= 400 else np.nan
     return Judged(
         int(b.sum()),
@@ -331,6 +339,7 @@ def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
             if next(iter(file.frames()), None) is not None:
                 return recording
     except AssetError as error:
+        # A format without frames is no error here: the message below says what to give.
         if "needs the package aedat" in error.problem or "damaged" in error.problem:
             raise
     raise EventDataError(

@@ -325,6 +325,7 @@ def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
     for i in range(len(t)):
         r, c = y[i], x[i]
         counts[r, c] += 1
+        # +1 for ON, -1 for OFF: the sum follows the change of the logarithm.
         sums[r, c] += 2 * np.int32(p[i]) - 1
         now = t[i] - origin
         if last[r, c] >= 0:
@@ -426,6 +427,7 @@ def histogram_distance(a: np.ndarray, b: np.ndarray) -> float:
 def spanned(times: np.ndarray, start: int, stop: int) -> np.ndarray:
     """Return the indices of the intervals between times (µs) that [start, stop) spans: the first may begin a little
     earlier, the last end a little later."""
+    # A quarter of an interval: a recording is seldom cut where its frames are.
     slack = np.diff(times) // 4
     return np.flatnonzero((times[:-1] >= start - slack) & (times[1:] <= stop + slack))
 

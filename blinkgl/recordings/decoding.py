@@ -74,6 +74,7 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
         gamma = codes.transfer
     if gamma is None and codes.origin == "video":
         gamma = "srgb"  # made for viewing
+    # Grey whole numbers of the sensor's size are its own; all others are meant for viewing.
     if gamma is None and integers:
         own = codes.own if codes.own is not None and first.shape == codes.own.size else None
         gamma = assumed = own.gamma if own else "srgb"
@@ -111,6 +112,7 @@ class Decoder:
         if dtype not in self._tables:
             most = 2 ** (8 * dtype.itemsize) - 1
             black, white = self._levels or (0, most)
+            # Codes below black are noise about it; above white there may be highlights.
             code = np.maximum((np.arange(most + 1, dtype=np.float64) - black) / (white - black), 0)
             self._tables[dtype] = self._curve(code).astype(np.float32)
         return self._tables[dtype]
@@ -121,6 +123,7 @@ class Decoder:
         table, step = self.table(dtype), max(1, round((white - black) / 255))
 
         def distance(luminance: float) -> float:
+            # The table rises, so the code of a luminance is where it would be inserted.
             at = int(np.clip(np.searchsorted(table, luminance), step, len(table) - 1))
             return float(table[at] - table[at - step]) * 255 * step / (white - black) or 1e-12
 

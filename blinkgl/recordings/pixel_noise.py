@@ -127,41 +127,16 @@ def fit_pixels_of(
     say = progress or (lambda *_: None)
     height, width = size
     looked = np.ones(height * width, bool) if used is None else np.asarray(used, bool).reshape(-1)
-    events = events.part(looked[events.pixel(width)])
-    if len(events) < 2 * LEAST_EVENTS:
-        raise _too_few(name, len(events) // 2)
-    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
-    middle = (t0 + t1) // 2
-    halves = [events.window(t0, middle), events.window(middle, t1)]
-    if min(map(len, halves)) < LEAST_EVENTS:
-        raise _too_few(name, min(map(len, halves)))
-    seconds = ((middle - t0) / 1e6, (t1 - middle) / 1e6)
+    halves, seconds = _halves(events.part(looked[events.pixel(width)]), name)
     pixel = halves[0].pixel(width)
     counts = np.bincount(pixel, minlength=height * width)
-    undetermined: dict[str, str] = {}
     say("counts of pixels", 0.1)
     dead = _dead_time(halves[0], pixel, counts, seconds[0])
     law = _Counts(counts[looked], seconds[0], dead)
-    plain = law.fit(False, False)
-    say("counts of pixels", 0.3)
-    hot = law.fit(True, False)
-    say("counts of pixels", 0.5)
-    # Where the counts without answers have no hump of hot pixels that one with answers has, the first is no start.
-    answered = max(law.fit(True, True, hot.at), law.fit(True, True), key=lambda found: found.likelihood)
-    say("counts of pixels", 0.8)
-    if answered.likelihood - hot.likelihood < WORTH:
-        answered = hot
-    # Without hot pixels, answers are tried alone: each of the two must be worth it by itself.
-    if hot.likelihood - plain.likelihood < WORTH:
-        alone = law.fit(False, True, plain.at)
-        answered = alone if alone.likelihood - plain.likelihood >= WORTH else plain
+    answered = law.best(say)
     values, uncertainty = answered.values, answered.uncertainty
-    if not answered.hot:
-        undetermined["hot_fraction"] = "one law of rates says as much as two"
     if dead:
         values["refractory_us"] = 1e6 * dead
-    else:
-        undetermined["refractory_us"] = "no pixel fires so often that it would show"
     is_hot = law.hot_chance(answered, counts) > 0.5
     if answered.hot:
         found, spread = _preferences(halves[0], pixel, counts, is_hot)
@@ -170,36 +145,62 @@ def fit_pixels_of(
     first_on = float((halves[0].p[~is_hot[pixel]] > 0).mean()) if (~is_hot[pixel]).any() else 0.5
     if answered.answers:
         share = values.pop("share")
-        spread = uncertainty.pop("share")
         delay, wide, first_on = _delays(halves[0], pixel, counts, seconds[0])
-        seen = _seen(delay, wide, seconds[0])
-        # Answers after the end are lost; those of noise before the beginning are single events.
-        q = min(share / max(seen + share * (seen - 1.0), 1e-3), 1.0)
+        q = _answered(share, _seen(delay, wide, seconds[0]))
         values |= {"answered": q, "answer_ms": 1e3 * delay, "answer_spread_decades": wide}
-        uncertainty["answered"] = spread * q / share
-    else:
-        undetermined["answered"] = "events of a pixel are as many as if none answered another"
+        uncertainty["answered"] = uncertainty.pop("share") * q / share
     values["on_share"] = float(np.clip(first_on, 0.0, 1.0))
     config = PixelsConfig(**{key: _within(key, value) for key, value in values.items()})
     say("judging", 0.9)
+    # As long as the half that was not fitted, with another seed: the law is judged, not its draws.
     noise = PixelNoise(config, height, width, seed + 1)
     noise.step(Events.empty(), 0)
-    # As long as the half that was not fitted, with another seed: the law is judged, not its draws.
-    made = noise.step(Events.empty(), t1 - middle)
+    made = noise.step(Events.empty(), round(1e6 * seconds[1]))
     made = made.part(looked[made.pixel(width)])
-    ours, theirs = (np.bincount(e.pixel(width), minlength=height * width) for e in (made, halves[1]))
+    numbers = [one.pixel(width) for one in (halves[1], made)]
+    fired = [np.bincount(of, minlength=height * width) for of in numbers]
     return PixelFit(
         name,
         size,
         config,
         {key: value for key, value in uncertainty.items() if value > 0},
-        undetermined,
+        _undetermined(answered, dead),
         len(halves[1]),
         len(made),
-        (theirs[theirs > 0], ours[ours > 0]),
-        (_gaps(halves[1], halves[1].pixel(width)), _gaps(made, made.pixel(width))),
+        (fired[0][fired[0] > 0], fired[1][fired[1] > 0]),
+        (_gaps(halves[1], numbers[0]), _gaps(made, numbers[1])),
         seconds,
     )
+
+
+def _halves(events: Events, name: str) -> tuple[list[Events], tuple[float, float]]:
+    """Return the events of both halves of the recording's time, and their lengths, s. Raises EventDataError: too few
+    in one."""
+    if len(events) < 2 * LEAST_EVENTS:
+        raise _too_few(name, len(events) // 2)
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    middle = (t0 + t1) // 2
+    halves = [events.window(t0, middle), events.window(middle, t1)]
+    if min(map(len, halves)) < LEAST_EVENTS:
+        raise _too_few(name, min(map(len, halves)))
+    return halves, ((middle - t0) / 1e6, (t1 - middle) / 1e6)
+
+
+def _undetermined(law: _Found, dead: float) -> dict[str, str]:
+    """Return why keys could not be determined."""
+    why = {
+        "hot_fraction": (law.hot, "one law of rates says as much as two"),
+        "refractory_us": (dead, "no pixel fires so often that it would show"),
+        "answered": (law.answers, "events of a pixel are as many as if none answered another"),
+    }
+    return {key: said for key, (known, said) in why.items() if not known}
+
+
+def _answered(share: float, seen: float) -> float:
+    """Return the share of events that are answered, of the one that shows and the fraction of answers that is
+    ``seen``."""
+    # Answers after the end are lost; those of noise before the beginning are single events.
+    return min(share / max(seen + share * (seen - 1.0), 1e-3), 1.0)
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -341,6 +342,23 @@ class _Counts:
         self._mean = float(counts.mean())
         self._busiest = float(np.sort(counts)[-max(len(counts) // 1000, 1)])
         self._kept: dict[int, np.ndarray] = {}
+
+    def best(self, say: Callable[[str, float], None]) -> _Found:
+        """Return the simplest law that each of its parts, hot pixels and answers, makes likelier by :data:`WORTH`."""
+        plain = self.fit(False, False)
+        say("counts of pixels", 0.3)
+        hot = self.fit(True, False)
+        say("counts of pixels", 0.5)
+        # Where the counts without answers have no hump of hot pixels that one with answers has, the first is no start.
+        answered = max(self.fit(True, True, hot.at), self.fit(True, True), key=lambda found: found.likelihood)
+        say("counts of pixels", 0.8)
+        if answered.likelihood - hot.likelihood < WORTH:
+            answered = hot
+        # Without hot pixels, answers are tried alone: each of the two must be worth it by itself.
+        if hot.likelihood - plain.likelihood < WORTH:
+            alone = self.fit(False, True, plain.at)
+            answered = alone if alone.likelihood - plain.likelihood >= WORTH else plain
+        return answered
 
     def _of_rates(self, q: float) -> np.ndarray:
         """(expected counts, bins) probabilities; ``q``: share of events that are answered. In between a few shares they

@@ -385,15 +385,19 @@ def file_to_events(
         video, done = shown and stack.enter_context(shown), 0
         for step in steps:
             if video is not None:
-                video.panels[0].add_events(step.events)
-                if video.panels[0].due(step.t_ns // 1000):
-                    video.frame(step.t_ns // 1000, step.luminance())
+                _show(video, step)
             out.append(step.events)
             if progress is not None and report.frames > done:
                 done = report.frames
                 progress(report, min(done / frames.count, 1.0) if frames.count else None)
         out.t_end_us = report.last_ns // 1000
     return report
+
+
+def _show(video: PreviewWriter, step: Step) -> None:
+    video.panels[0].add_events(step.events)
+    if video.panels[0].due(step.t_ns // 1000):
+        video.frame(step.t_ns // 1000, step.luminance())
 
 
 def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | dict) -> None:

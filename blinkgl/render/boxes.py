@@ -16,12 +16,14 @@ from blinkgl.render.casting import vertices_at
 from blinkgl.render.moment import cam_from_obj
 from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.types.boxes import Boxes, no_boxes
+from blinkgl.types.poses import pose_of
 
 
 def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -> Boxes:
     """Return the boxes of the objects in front of the camera at t_ns. ids : (H, W) uint32 visible instances."""
     camera, T_world_cam = scene.camera, scene.camera_path.pose(t_ns)
     shown = extents(ids, 1 + max((obj.instance_id for obj in scene.objects), default=0))
+    # Edges of the picture: pixel centres are whole numbers.
     whole = np.array([-0.5, -0.5, camera.width - 0.5, camera.height - 0.5])
     rows = []
     for obj in scene.objects:
@@ -49,8 +51,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
             continue
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         # The box has the object's axes; its origin is the box's middle.
-        middle = np.eye(4)
-        middle[:3, 3] = 0.5 * (low + high)
+        middle = pose_of(0.5 * (low + high))
         # The part of the box in the picture, and its area relative to the whole.
         inside = np.clip(amodal.reshape(2, 2), whole[:2], whole[2:])
         area = np.prod(amodal[2:] - amodal[:2])

@@ -104,17 +104,13 @@ class StillCanvas(Canvas):
             # Rectangles are in px of the image, the target may be finer.
             fine = rectangle.scaled(pass_.samples.grid)
             painter.gl.ctx.scissor = (fine.x0, fine.y0, fine.x1 - fine.x0, fine.y1 - fine.y0)
-            # Restore first, then draw what touches the rectangle, under the scissor.
-            self._restore(fine)
+            # Restore the static picture's colour and depth first, then draw what touches the rectangle, under the
+            # scissor.
+            self._picture.copy_into(self.target, (fine.x0, fine.y0, fine.x1, fine.y1), depth=True)
             pass_.paint(painter, shot, [item for item, place in movers if place.meets(rectangle)])
         painter.gl.ctx.scissor = None
         painter.stats.frames += 1
         return self.frame(shot, stale)
-
-    def _restore(self, rectangle: Rectangle) -> None:
-        """Copy the static picture's colour and depth into the target, inside the rectangle (px of the targets)."""
-        edges = (rectangle.x0, rectangle.y0, rectangle.x1, rectangle.y1)
-        self._picture.copy_into(self.target, edges, depth=True)
 
     def release(self) -> None:
         if self._picture is not None:

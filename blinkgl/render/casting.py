@@ -28,8 +28,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from blinkgl.camera import CameraModel
+from blinkgl.render.moment import cam_from_obj, cam_from_obj_rate
 from blinkgl.render.raycast import Forest, Holes, build_tree, join_trees, nearest_tree
 from blinkgl.scene.types import Mesh, Part, Scene, SceneObject
+from blinkgl.types.recent import Recent
 
 # A visibility ray ends this much (relative) before its target point, so that the point does not hide itself: far above
 # the rounding of a hit (1e-15), far below any visible separation of two surfaces.
@@ -108,11 +110,8 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None) -> Hits:
     found = hit[:, 0] >= 0
     ids = np.array([obj.instance_id for obj, _ in parts] + [0], np.int32)
     local = np.full((len(xy), 3), np.nan)
-    for p, rows in by_part(hit[:, 0]):
-        mesh = parts[p][1].mesh
-        corners = vertices_at(mesh, t_ns)[mesh.faces[hit[rows, 1]]]
-        local[rows] = np.einsum("nc,nck->nk", bary[rows], corners)
-    return Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
+    hits = Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
+    return replace(hits, local=local_at(scene, hits, t_ns))
 
 
 def rays_of(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
@@ -126,34 +125,26 @@ def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
     """Return object-local positions at a time, (V, 3) float64; the last few are kept. Read only."""
     if mesh.deformer is None:
         return np.asarray(mesh.vertices, np.float64)
-    kept = _shapes.setdefault(mesh, {})
-    if t_ns not in kept:
-        kept[t_ns] = mesh.deformer.positions(mesh, t_ns)
-        # The oldest shape goes; dictionaries keep the order of insertion.
-        while len(kept) > KEPT:
-            kept.pop(next(iter(kept)))
-    return kept[t_ns]
+    return _shapes.setdefault(mesh, Recent(KEPT)).of(t_ns, lambda: mesh.deformer.positions(mesh, t_ns))
 
 
 def _forest(scene: Scene, t_ns: int) -> Forest:
-    kept = _forests.setdefault(scene, {})
     # One forest for all times, unless a shape deforms.
     key = t_ns if any(obj.deforms for obj in scene.objects) else None
-    if key not in kept:
-        parts = scene_parts(scene)
-        trees = []
-        for _, part in parts:
-            if part.mesh.deformer is not None:
-                trees.append(build_tree(vertices_at(part.mesh, t_ns), part.mesh.faces))
-                continue
-            if part.mesh not in _trees:
-                _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
-            trees.append(_trees[part.mesh])
-        sides = [part.side(t_ns) for _, part in parts]
-        kept[key] = join_trees(trees, sides, [_holes_of(part) for _, part in parts])
-        while len(kept) > KEPT:
-            kept.pop(next(iter(kept)))
-    return kept[key]
+    return _forests.setdefault(scene, Recent(KEPT)).of(key, lambda: _planted(scene, t_ns))
+
+
+def _planted(scene: Scene, t_ns: int) -> Forest:
+    parts = [part for _, part in scene_parts(scene)]
+    trees = []
+    for part in parts:
+        if part.mesh.deformer is not None:
+            trees.append(build_tree(vertices_at(part.mesh, t_ns), part.mesh.faces))
+            continue
+        if part.mesh not in _trees:
+            _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
+        trees.append(_trees[part.mesh])
+    return join_trees(trees, [part.side(t_ns) for part in parts], [_holes_of(part) for part in parts])
 
 
 def _holes_of(part: Part) -> Holes | None:
@@ -181,7 +172,7 @@ def nearest(
     forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
-    relative = [_relative_pose(camera_pose, obj.path.pose(t_ns)) for obj, _ in scene_parts(scene)]
+    relative = [cam_from_obj(camera_pose, obj.path.pose(t_ns)) for obj, _ in scene_parts(scene)]
     axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
     # The camera's centre in each object's axes, -R^T t.
     origins = np.array([-m[:3, :3].T @ m[:3, 3] for m in relative]).reshape(-1, 3)
@@ -210,14 +201,6 @@ def by_part(part: np.ndarray) -> list[tuple[int, np.ndarray]]:
     return [(int(p), np.flatnonzero(part == p)) for p in np.unique(part) if p >= 0]
 
 
-def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """Return the (4, 4) inv(camera) @ body of rigid poses."""
-    m = np.eye(4)
-    m[:3, :3] = camera[:3, :3].T @ body[:3, :3]
-    m[:3, 3] = camera[:3, :3].T @ (body[:3, 3] - camera[:3, 3])
-    return m
-
-
 def _relative_change(scene: Scene, obj: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
     """Return (3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
     c0, c1 = scene.camera_path.pose(t0_ns), scene.camera_path.pose(t1_ns)
@@ -233,13 +216,8 @@ def _relative_change(scene: Scene, obj: SceneObject, t0_ns: int, t1_ns: int) -> 
 
 def _relative_rate(scene: Scene, obj: SceneObject, t_ns: int) -> np.ndarray:
     """Return (3, 4) dM/dt in 1/s: the analytic twist of the body relative to the moving camera."""
-    c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
-    b, db = obj.path.pose(t_ns), obj.path.derivative(t_ns)
-    rate = np.empty((3, 4))
-    # The product rule on C^T B and on C^T (b - c).
-    rate[:, :3] = dc[:3, :3].T @ b[:3, :3] + c[:3, :3].T @ db[:3, :3]
-    rate[:, 3] = dc[:3, :3].T @ (b[:3, 3] - c[:3, 3]) + c[:3, :3].T @ (db[:3, 3] - dc[:3, 3])
-    return rate
+    camera, body = ((path.pose(t_ns), path.derivative(t_ns)) for path in (scene.camera_path, obj.path))
+    return cam_from_obj_rate(*camera, *body)[:3]
 
 
 def applied(scene: Scene, hits: Hits, matrix_of: Callable[[SceneObject], np.ndarray]) -> np.ndarray:
@@ -258,20 +236,18 @@ def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors
         obj, part = scene_parts(scene)[p]
         if part.mesh.deformer is not None:
             corners = vectors_of(part.mesh)[part.mesh.faces[hits.triangle[rows]]]
+            # The mean of the corners' vectors, with barycentric weights.
             moved = np.einsum("nc,nck->nk", hits.bary[rows], corners)
             out[rows] += moved @ relative_pose_at(scene, obj, t_ns)[:3, :3].T
 
 
 def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
-    """Return object-local positions of the hit points at another time, (N, 3)."""
-    out = hits.local
+    """Return object-local positions of the hit points at another time, (N, 3); nan where nothing is hit."""
+    parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
     for p, rows in by_part(hits.part):
-        mesh = scene_parts(scene)[p][1].mesh
-        if mesh.deformer is not None:
-            out = out.copy() if out is hits.local else out
-            out[rows] = np.einsum(
-                "nc,nck->nk", hits.bary[rows], vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
-            )
+        mesh = parts[p][1].mesh
+        corners = vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
+        out[rows] = np.einsum("nc,nck->nk", hits.bary[rows], corners)
     return out
 
 
@@ -352,12 +328,13 @@ def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
         points = rays_of(scene.camera, hits.xy) * hits.depth[:, None]
+        # The chain rule: the projection's derivative at the point, (2, 3), times its rate in the camera's axes.
         return np.einsum("nij,nj->ni", scene.camera.jacobian(points), rate)
 
 
 def relative_pose_at(scene: Scene, obj: SceneObject, t_ns: int) -> np.ndarray:
     """Return T_cam_obj at t_ns, (4, 4)."""
-    return _relative_pose(scene.camera_path.pose(t_ns), obj.path.pose(t_ns))
+    return cam_from_obj(scene.camera_path.pose(t_ns), obj.path.pose(t_ns))
 
 
 def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:

@@ -4,12 +4,13 @@ expensive, and a few thousand pixels in many places represent its errors."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from blinkgl.gl import GLContext
+from blinkgl.machine.closing import Releasing
 from blinkgl.render.frames import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
@@ -38,7 +39,7 @@ def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray
     return mask
 
 
-class Cutouts:
+class Cutouts(Releasing):
     """Luminance of rectangles of a scene's picture; each pixel is the mean of ``scale`` x ``scale`` samples on a
     regular grid. A context manager; it is called with times.   samples : settings of each sample."""
 
@@ -49,10 +50,7 @@ class Cutouts:
         self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), samples)
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def release(self) -> None:
         self._renderer.release()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:

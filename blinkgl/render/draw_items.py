@@ -258,6 +258,7 @@ def draw_items(scene: Scene) -> list[DrawItem]:
     ]
     for part, item in enumerate(items):
         item.part = part
+    # Stable: within a layer the scene's order stays, which decides between equal depths.
     items.sort(key=lambda item: item.layer)
     for number, item in enumerate(items):
         item.number = number

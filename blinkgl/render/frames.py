@@ -69,6 +69,7 @@ def merged(rectangles: list[Rectangle]) -> list[Rectangle]:
     result: list[Rectangle] = []
     for rectangle in rectangles:
         while (other := next((r for r in result if r.meets(rectangle)), None)) is not None:
+            # The union may meet a third one, hence the loop.
             result.remove(other)
             rectangle = rectangle.union(other)
         result.append(rectangle)

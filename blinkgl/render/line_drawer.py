@@ -51,6 +51,7 @@ class LineDrawer:
             if self._crossings is not None:
                 self._crossings.release()
             self._rows = np.zeros((2 * rows, ROW, CROSSING), np.float32)
+            # A crossing is eight floats: two texels of four.
             self._crossings = self.gl.ctx.texture((2 * ROW, 2 * rows), 4, dtype="f4")
             self._crossings.filter = moderngl.NEAREST, moderngl.NEAREST
         self._rows.reshape(-1, CROSSING)[: len(crossings)] = crossings

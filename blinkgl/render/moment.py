@@ -8,14 +8,15 @@ passes.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.camera.drawing import seen_through
+from blinkgl.types.recent import Recent
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
@@ -114,23 +115,6 @@ class Rates(NamedTuple):
     T_world_obj: np.ndarray
 
 
-class _once:
-    """``functools.cached_property`` without the lock that it has up to Python 3.11, which doubles the cost of a
-    lookup."""
-
-    def __init__(self, compute: Callable[[Any], Any]):
-        self.compute, self.__doc__ = compute, compute.__doc__
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, instance: Any, owner: type) -> Any:
-        if instance is None:
-            return self
-        value = instance.__dict__[self.name] = self.compute(instance)
-        return value
-
-
 class Moment:
     """All objects of a scene at t_ns. Values are computed when they are first used, and only once.
 
@@ -160,51 +144,51 @@ class Moment:
         other.__dict__["dT_world_cam"] = np.zeros((4, 4)) if dT_world_cam is None else dT_world_cam
         return other
 
-    @_once
+    @cached_property
     def dT_world_cam(self) -> np.ndarray:
         """Return d(T_world_cam)/dt, (4, 4) float64, 1/s."""
         return self._stage.camera_path.derivative(self.t_ns)
 
-    @_once
+    @cached_property
     def T_cam_obj(self) -> np.ndarray:
         return cam_from_obj(self.T_world_cam, self.T_world_obj)
 
-    @_once
+    @cached_property
     def mvp(self) -> np.ndarray:
         """Return clip_from_obj, (n, 4, 4) float64."""
         return self.view.projection @ self.T_cam_obj
 
-    @_once
+    @cached_property
     def mvp_columns(self) -> np.ndarray:
         """Return :attr:`mvp` as GLSL stores it, column by column, (n, 4, 4) float32."""
         return np.ascontiguousarray(self.mvp.swapaxes(1, 2), np.float32)
 
-    @_once
+    @cached_property
     def texture_from_obj(self) -> np.ndarray:
         """Return (n, 4, 4) float32, row by row: from the object's axes to coordinates and depth, each in [0, 1] times
         w, of a texture that holds a picture of this moment."""
         return np.ascontiguousarray(_TEXTURE_FROM_CLIP @ self.mvp, np.float32)
 
-    @_once
+    @cached_property
     def rates(self) -> Rates:
         dT_world_obj = self._stage.bodies.rates(self.t_ns)
         dT_cam_obj = cam_from_obj_rate(self.T_world_cam, self.dT_world_cam, self.T_world_obj, dT_world_obj)
         return Rates(self.view.projection @ dT_cam_obj, dT_world_obj)
 
-    @_once
+    @cached_property
     def centres(self) -> np.ndarray:
         """Return the centres of the items' bounding spheres, camera axes, (m, 3) float64."""
         T = self.T_cam_obj[self._stage.item_object]
         return (T[:, :3, :3] @ self._stage.item_centre[..., None])[..., 0] + T[:, :3, 3]
 
-    @_once
+    @cached_property
     def inverse_depths(self) -> np.ndarray:
         """Return ``inverse_depths`` of guard.glsl, (m, 2) uint32, a uvec2 per item."""
         if self.view.projection[3, 3]:  # parallel rays: w is 1 everywhere
             return np.tile(inverse_depth_bits(np.ones(1), np.zeros(1), 1.0), (len(self._stage.items), 1))
         return inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
 
-    @_once
+    @cached_property
     def visible(self) -> list[DrawItem]:
         """Return the items whose bounding sphere meets the view frustum: objects front to back, then ground, then
         sky."""
@@ -212,11 +196,11 @@ class Moment:
         if not stage.items:
             return []
         # All planes of the frustum contain the camera's centre, so n . c is the signed distance of a sphere's centre.
-        inside = (self.centres @ self.view.frustum.T >= -stage.item_radius[:, None]).all(axis=1).tolist()
+        inside = np.all(self.centres @ self.view.frustum.T >= -stage.item_radius[:, None], axis=1)
         nearest = self.centres[:, 2] - stage.item_radius
         # lexsort sorts by its last key first: by layers, then by depth.
         order = np.lexsort((nearest, stage.item_layer))
-        return [stage.items[i] for i in order if inside[i]]
+        return [stage.items[i] for i in order[inside[order]]]
 
     def parts_of(self, object_index: int) -> list[DrawItem]:
         """Return all items of one object, visible or not."""
@@ -248,28 +232,23 @@ class Bodies:
         self.paths: list[PosePath] = [o.path for o in scene.objects]
         self.moving = [i for i, path in enumerate(self.paths) if not path.is_static]
         self._start = np.stack([p.pose(scene.t0_ns) for p in self.paths]) if self.paths else np.zeros((0, 4, 4))
-        self._poses: OrderedDict[int, np.ndarray] = OrderedDict()
-        self._rates: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._poses: Recent[int, np.ndarray] = Recent(KEPT)
+        self._rates: Recent[int, np.ndarray] = Recent(KEPT)
 
     def poses(self, t_ns: int) -> np.ndarray:
         """Return T_world_obj, (n, 4, 4) float64."""
-        return self._kept(self._poses, t_ns, self._start, lambda path: path.pose(t_ns))
+        return self._poses.of(t_ns, lambda: self._made(self._start, lambda path: path.pose(t_ns)))
 
     def rates(self, t_ns: int) -> np.ndarray:
         """Return d(T_world_obj)/dt, (n, 4, 4) float64, 1/s."""
-        return self._kept(self._rates, t_ns, np.zeros_like(self._start), lambda path: path.derivative(t_ns))
+        start = np.zeros_like(self._start)
+        return self._rates.of(t_ns, lambda: self._made(start, lambda path: path.derivative(t_ns)))
 
-    def _kept(
-        self, kept: OrderedDict[int, np.ndarray], t_ns: int, start: np.ndarray, of: Callable[[PosePath], np.ndarray]
-    ) -> np.ndarray:
-        if (found := kept.get(t_ns)) is not None:
-            return found
-        made = kept[t_ns] = start.copy()
+    def _made(self, start: np.ndarray, of: Callable[[PosePath], np.ndarray]) -> np.ndarray:
+        made = start.copy()
         # Rows of objects that do not move keep the values in ``start``.
         for i in self.moving:
             made[i] = of(self.paths[i])
-        if len(kept) > KEPT:
-            kept.popitem(last=False)
         return made
 
 
@@ -282,16 +261,14 @@ class Moments:
     def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies | None = None):
         self.bodies = bodies or Bodies(scene)
         self.stage, self.view = Stage(scene, items, self.bodies), View.of(seen_through(scene.camera))
-        self._kept: OrderedDict[int, Moment] = OrderedDict()
+        self._kept: Recent[int, Moment] = Recent(KEPT)
 
     def at(self, t_ns: int) -> Moment:
-        if (moment := self._kept.get(t_ns)) is not None:
-            return moment
-        stage, T_world_obj = self.stage, self.bodies.poses(t_ns)
-        moment = self._kept[t_ns] = Moment(t_ns, self.view, stage.camera_path.pose(t_ns), T_world_obj, stage)
-        if len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
-        return moment
+        return self._kept.of(t_ns, lambda: self._moment(t_ns))
+
+    def _moment(self, t_ns: int) -> Moment:
+        stage = self.stage
+        return Moment(t_ns, self.view, stage.camera_path.pose(t_ns), self.bodies.poses(t_ns), stage)
 
     def look_through(self, camera: CameraModel) -> None:
         """Use another camera on the same path from now on."""

@@ -9,6 +9,7 @@ crowded picture. Objects thinner than a pixel can pass between four pixels, so n
 from __future__ import annotations
 
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.machine.kernels import kernel
 from blinkgl.render import casting
@@ -71,6 +72,25 @@ def near_thin(ids: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 @kernel(error_model="numpy")
+def _nearness(depth):
+    """Return 1/Z once per pixel instead of once per sample: a point has four of these, and divisions dominate."""
+    nearness = np.empty(depth.shape)
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            nearness[y, x] = 1.0 / np.float64(depth[y, x]) if depth[y, x] > 0 else 0.0
+    return nearness
+
+
+@register_jitable
+def _on_surface(four, ax, ay, inverse):
+    """Return whether a point of this 1/Z is on the surface through the four pixels around it, and that is not steep."""
+    n00, n01, n10, n11 = four
+    between = (1.0 - ay) * ((1.0 - ax) * n00 + ax * n01) + ay * ((1.0 - ax) * n10 + ax * n11)
+    steep = max(n00, n01, n10, n11) - min(n00, n01, n10, n11) > _STEEP * inverse
+    return not (abs(between - inverse) > _SAME * inverse or steep)
+
+
+@kernel(error_model="numpy")
 def judged_by_samples(
     flow: np.ndarray,
     z_there: np.ndarray,
@@ -88,26 +108,19 @@ def judged_by_samples(
     near : depth of the near plane; nothing before it is drawn at t'.
 
     HIDDEN: outside the image, before the near plane, or all four pixels around the new position show other, nearer
-    objects.
-    SEEN: all four show the point's own object, nothing thin is near (:func:`near_thin`), and their depths, interpolated
-    in 1/Z (exact on a plane, in the outermost half pixel, too), are the point's and differ little. UNDECIDED: the rest.
+    objects. SEEN: all four show the point's own object, nothing thin is near (:func:`near_thin`), and their depths,
+    interpolated in 1/Z (exact on a plane), are the point's and differ little. UNDECIDED: the rest.
     """
     height, width = valid.shape
-    thin = near_thin(ids_there, depth_there)
+    thin, nearness = near_thin(ids_there, depth_there), _nearness(depth_there)
     verdict = np.zeros((height, width), np.uint8)
-    # 1/Z once per pixel instead of once per sample: a point has four of these, and divisions dominate this loop.
-    nearness = np.empty((height, width))
-    for y in range(height):
-        for x in range(width):
-            nearness[y, x] = 1.0 / np.float64(depth_there[y, x]) if depth_there[y, x] > 0 else 0.0
     last_x, last_y = max(width - 2, 0), max(height - 2, 0)
     for y in range(height):
         for x in range(width):
             if not valid[y, x]:
                 continue
             # Where the point is at t'; pixel centres are at integers.
-            xt = np.float64(x) + flow[y, x, 0]
-            yt = np.float64(y) + flow[y, x, 1]
+            xt, yt = np.float64(x) + flow[y, x, 0], np.float64(y) + flow[y, x, 1]
             if not (-0.5 <= xt < width - 0.5 and -0.5 <= yt < height - 0.5) or z_there[y, x] < near:
                 verdict[y, x] = HIDDEN
                 continue
@@ -125,10 +138,8 @@ def judged_by_samples(
                 and ids_there[y1, x0] == own
                 and ids_there[y1, x1] == own
             ):
-                n00, n01, n10, n11 = nearness[y0, x0], nearness[y0, x1], nearness[y1, x0], nearness[y1, x1]
-                between = (1.0 - ay) * ((1.0 - ax) * n00 + ax * n01) + ay * ((1.0 - ax) * n10 + ax * n11)
-                steep = max(n00, n01, n10, n11) - min(n00, n01, n10, n11) > _STEEP * inverse
-                if abs(between - inverse) > _SAME * inverse or steep or thin[y0, x0]:
+                four = nearness[y0, x0], nearness[y0, x1], nearness[y1, x0], nearness[y1, x1]
+                if thin[y0, x0] or not _on_surface(four, ax, ay, inverse):
                     verdict[y, x] = UNDECIDED
                 continue
             # Otherwise hidden, unless some pixel shows its own object or something that is not nearer.

@@ -22,6 +22,7 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.gl import GLContext
 from blinkgl.labels import LABELS, LabelFrame, LabelRequest
+from blinkgl.machine.closing import Releasing
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, StillCanvas
@@ -48,12 +49,13 @@ from blinkgl.render.passes import (
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 from blinkgl.scene.types import Scene
+from blinkgl.types.recent import Recent
 
 if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
 
 
-class Renderer:
+class Renderer(Releasing):
     """Draws one scene. It holds GL resources: use it as a context manager or call :meth:`release`.
 
     scene : as it is drawn, for frames and ground truth: at the configured level of detail, without triangles that are
@@ -109,12 +111,6 @@ class Renderer:
         # The shadow of a moving object also changes surfaces at rest.
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
         self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand)
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
 
     def release(self) -> None:
         if self.gl.released:  # everything was released with the context
@@ -202,6 +198,7 @@ class Renderer:
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
         frame = done.get(pass_)
         if frame is None:
+            # Another sensor of the rig has drawn it for this time.
             if pass_.common and (last := self._last.get(pass_)) is not None and pass_.serves(last.moment, moment):
                 done[pass_] = last
                 return last
@@ -285,7 +282,7 @@ class Labels:
     def __init__(self, renderer: Renderer, camera: PinHole | None = None):
         self._renderer, self._view = renderer, None if camera is None else View.of(camera)
         self.scene = renderer.scene if camera is None else renderer.scene.with_camera(camera)
-        self._kept: dict[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = {}
+        self._kept: Recent[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = Recent(KEPT)
 
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
         """Return the label frame; see :meth:`Renderer.labels`."""
@@ -305,8 +302,7 @@ class Labels:
         leading = {ns: self.frame(t_ns, each, t_ns + ns, None) for ns in request.intervals_ns} if each else {}
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:
-            frame = self._drawn(names, t_ns, ends)
-            drawn = {name: frame.read(name) for name in names}
+            drawn = _read(self._drawn(names, t_ns, ends), names)
         values: dict[str, Any] = {}
         for name in request:
             if LABELS[name].anti_aliased:
@@ -349,11 +345,8 @@ class Labels:
 
     def _buffers(self, t_ns: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Return buffers of these labels at a time, as the shader wrote them."""
-        key = (t_ns, names)
-        if key not in self._kept:
-            frame = self._drawn(names, t_ns, {})
-            self._kept[key] = {name: frame.read(name) for name in names}
-            # Neighbouring labels use the same moments; the oldest is dropped first.
-            while len(self._kept) > KEPT:
-                self._kept.pop(next(iter(self._kept)))
-        return self._kept[key]
+        return self._kept.of((t_ns, names), lambda: _read(self._drawn(names, t_ns, {}), names))
+
+
+def _read(frame: Frame, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    return {name: frame.read(name) for name in names}

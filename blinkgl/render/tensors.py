@@ -88,6 +88,7 @@ class TextureReader:
         with self._torch.cuda.device(self.device):
             made = self._pinned.to(self.device, non_blocking=True)
             self._sent = self._torch.cuda.Event()
+            # Signalled once the copy on this stream is done with the pinned memory.
             self._sent.record()
         return made
 

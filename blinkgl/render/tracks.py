@@ -75,7 +75,7 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     """Return for the points of ``hits`` at a time: (N, 2) px, 0 behind the camera; (N, 3) world; (N,) depth; (N,) bool
     visible."""
     camera = scene.camera
-    there = replace(hits, local=_local(scene, hits, t_ns))
+    there = replace(hits, local=casting.local_at(scene, hits, t_ns))
     moved = casting.applied(scene, there, lambda obj: casting.relative_pose_at(scene, obj, t_ns))
     world = casting.applied(scene, there, lambda obj: obj.path.pose(t_ns))
     depth = moved[:, 2].copy()
@@ -88,16 +88,6 @@ def places(scene: Scene, hits: Hits, t_ns: int) -> tuple[np.ndarray, np.ndarray,
     return xy, world, depth, seen
 
 
-def _local(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
-    """Return object-local positions at t_ns, (N, 3), of any part."""
-    out, parts = np.full((len(hits.hit), 3), np.nan), casting.scene_parts(scene)
-    for p in np.unique(hits.part):
-        rows, mesh = hits.part == p, parts[p][1].mesh
-        corners = casting.vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
-        out[rows] = np.einsum("nc,nck->nk", hits.bary[rows], corners)
-    return out
-
-
 _ARRAYS = ("xy", "hit", "depth", "instance", "part", "triangle", "front", "bary", "local")
 
 
@@ -108,6 +98,7 @@ def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray,
     columns = min(width, max(1, round(np.sqrt(points * width / height))))
     rows = min(height, max(1, points // columns))
     columns = min(width, max(1, points // rows))
+    # Pixels at the middles of equal cells.
     x = np.floor((np.arange(columns) + 0.5) * width / columns)
     y = np.floor((np.arange(rows) + 0.5) * height / rows)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

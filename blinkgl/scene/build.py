@@ -14,11 +14,12 @@ from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
+from blinkgl.scene.reading import existing
 from blinkgl.scene.rig import Rig, Sensor
 from blinkgl.scene.types import Fog, Scene
 from blinkgl.scene.worlds.explicit import check_primitive, explicit_scene
 from blinkgl.scene.worlds.from_file import scene_from_file
-from blinkgl.scene.worlds.pool import SPLITS, resolve
+from blinkgl.scene.worlds.pool import SPLITS
 from blinkgl.scene.worlds.random_world import pools, random_world
 
 
@@ -148,5 +149,5 @@ def panorama_of(light: LightConfig) -> str | None:
 
 
 def _exists(path: str | None, base: Path, where: str, what: str) -> None:
-    if path is not None and not resolve(path, base).is_file():
-        raise ConfigError("no such file", where=where, value=path, accepted=what)
+    if path is not None:
+        existing(path, base, where, what)

@@ -29,6 +29,7 @@ from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
 from blinkgl.scene.types import Lamp, Light, Panorama
+from blinkgl.types.poses import pose_of
 
 MAX_LAMPS = 32
 """Largest number of lamps of a scene: every lit pixel evaluates each."""
@@ -44,9 +45,7 @@ def lamp_pose(position: ArrayLike = (0.0, 0.0, 0.0), shines: ArrayLike = (0.0, 0
     # Any axis that is not nearly parallel to z.
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), position
-    return T
+    return pose_of(position, np.stack([x, np.cross(z, x), z], axis=1))
 
 
 def _scaled(color: Sequence[float] | np.ndarray, factor: float) -> tuple[float, float, float]:
@@ -84,6 +83,7 @@ def shadowing(light: Light) -> tuple[int, ...]:
 def quadric_of(light: Light) -> np.ndarray:
     """Return the light of the surroundings per channel, (3, 4, 4), for :func:`ambient`; world axes."""
     one = np.zeros((4, 4))
+    # The quadric n^T Q n with n = (x, y, z, 1): a constant, and half of the linear term on either side of the diagonal.
     one[3, 3] = 0.5
     one[2, 3] = one[3, 2] = 0.25  # 0.5 + 0.5 n_z
     sky = light.sky * np.asarray(light.sky_color, np.float64)[:, None, None] * one
@@ -107,6 +107,7 @@ def ambient(quadric: np.ndarray, normal: np.ndarray, quartic: np.ndarray | None 
     1) Q (n, 1) per channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals.   quartic : (3, 9,
     9), a form of the nine products of two coordinates, which is added."""
     n = np.concatenate([normal, np.ones((*normal.shape[:-1], 1))], axis=-1)
+    # n^T Q n of each channel.
     sums = np.einsum("...i,cij,...j->...c", n, quadric, n)
     if quartic is not None:
         pairs = np.einsum("...i,...j->...ij", normal, normal).reshape(*normal.shape[:-1], 9)

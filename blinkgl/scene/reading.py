@@ -7,9 +7,28 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 
 MAX_BYTES = 2_000_000_000
+
+
+def resolve(path: str, base: Path) -> Path:
+    """Return a path of the YAML: ``~`` expanded, relative to the YAML file's folder."""
+    return base / Path(path).expanduser()  # an absolute path stays
+
+
+def existing(path: str, base: Path, where: str, accepted: str) -> Path:
+    """Return :func:`resolve` of a file that exists. Raises ConfigError, which names the key ``where``."""
+    file = resolve(path, base)
+    if not file.is_file():
+        raise ConfigError("no such file", where=where, value=path, accepted=accepted)
+    return file
+
+
+def limit_faces(count: int, most: int, where: str) -> None:
+    """Raise AssetError when a mesh has more than ``most`` faces."""
+    if count > most:
+        raise AssetError("the mesh has too many faces", where=where, value=count, accepted=f"at most {most}")
 
 
 @contextmanager

@@ -424,6 +424,7 @@ class Scene:
     fog: Fog | None = None
 
     def __post_init__(self) -> None:
+        # Their paths follow the first sensor, so that no motion of the rig brings the sky nearer.
         if any(obj.at_infinity for obj in self.objects):
             sky = self.rig.path_of_sky()
             placed = tuple(replace(obj, path=sky) if obj.at_infinity else obj for obj in self.objects)

@@ -21,6 +21,7 @@ from blinkgl.config.over_time import ImuConfig, imu_times
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath
 from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.types.poses import pose_of
 
 # Half of the time over which velocities are differenced.
 _HALF_NS = 20_000
@@ -49,10 +50,7 @@ class Inertial:
 
 def place_of(config: ImuConfig) -> np.ndarray:
     """Return T_cam_imu, (4, 4)."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", config.rotation, degrees=True).as_matrix()
-    T[:3, 3] = config.position
-    return T
+    return pose_of(config.position, Rotation.from_euler("xyz", config.rotation, degrees=True).as_matrix())
 
 
 def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.random.Generator) -> Inertial:
@@ -94,6 +92,7 @@ def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.nd
     twist = 0.5 * (turning - turning.swapaxes(1, 2))
     second = np.array([_second(body, t)[:3, 3] for t in times])
     rate = np.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]], axis=1)
+    # An accelerometer at rest measures the force that holds it, minus gravity.
     return rate, np.einsum("nij,nj->ni", R_body_world, second - gravity)
 
 

@@ -27,7 +27,7 @@ from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.decoding import Codes
 from blinkgl.recordings.simulation import FrameUse, SimulationReport, Step, stepped, timed
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.worlds.pool import resolve
+from blinkgl.scene.reading import resolve
 from blinkgl.sequence.given_flow import factor_that_fits
 from blinkgl.sequence.request import GroundTruth, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.sensor import SensorSimulation

@@ -22,6 +22,7 @@ from typing import Any
 
 from blinkgl.errors import ConfigError
 from blinkgl.gl import GLContext, create_context
+from blinkgl.machine.closing import Closing
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, generator
 from blinkgl.scene.build import sequence_scene
@@ -70,7 +71,7 @@ def _rendered(
         yield RenderedSequence(request, camera, seen, renderer)
 
 
-class Simulation:
+class Simulation(Closing):
     """A sequence of one camera or several. Iterate over it once: its items, in time order, each with the name of its
     ``sensor``; items of one time are in the order of the sensors. It holds OpenGL until its end, however the loop ends,
     or that of its ``with`` block.
@@ -104,12 +105,6 @@ class Simulation:
         if name.startswith("_") or not self.members:
             raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
         return getattr(self.members[0], name)
-
-    def __enter__(self) -> Simulation:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Release OpenGL. May be called repeatedly."""

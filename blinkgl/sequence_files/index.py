@@ -58,6 +58,7 @@ def made_folders(root: str | Path) -> Iterator[Path]:
     if (root / MANIFEST).is_file():
         yield root
         return
+    # A set has its sequences in its own folder, or below one folder a split.
     for pattern in ("*", "*/*"):
         for manifest in sorted(root.glob(f"{pattern}/{MANIFEST}")):
             of_rig = pattern == "*/*" and is_rig_folder(manifest.parent.parent)

@@ -50,6 +50,7 @@ class Panels:
         factor = min(1.0, _MAX_PANEL_HEIGHT / height)
         if height < 200:  # whole pixels, with room for the captions
             factor = max(2, min(_MAX_PANEL_HEIGHT // height, math.ceil(_LEAST_PANEL_WIDTH / width)))
+        # Video with halved chroma needs even sides.
         self._panel = (max(2, round(width * factor / 2) * 2), max(2, round(height * factor / 2) * 2))  # (w, h), even
         self._ticks, self._t0_us = Ticks(t0_us, rate_hz), t0_us
         self._slow = rate_hz / fps
@@ -86,6 +87,7 @@ class Panels:
         speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
         speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
         if speed.size:
+            # The scale follows larger motion at once and smaller slowly, so that colours do not flicker.
             self._flow_max = max(0.95 * self._flow_max, float(np.percentile(speed, 95)))
         nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # keeps edges sharp
         shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0

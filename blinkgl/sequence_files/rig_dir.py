@@ -115,6 +115,7 @@ _TOLERANCE = 1e-3
 
 def write_lens(writer: SequenceWriter, camera: CameraModel) -> None:
     """Write all of them into a sequence in progress."""
+    # The same numbers in three forms: DSEC's map and YAML, and Kalibr's chain.
     one = Calibrated(camera)
     writer.external(RECTIFY_MAP, partial(write_rectify_map, rectify_map=rectify_map(camera), codec=writer.codec))
     writer.text(CAM_TO_CAM, cam_to_cam_yaml([one]))

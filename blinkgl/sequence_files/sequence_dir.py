@@ -286,6 +286,7 @@ class SequenceWriter:
 
     def _submit(self, task: Callable[[], None]) -> None:
         self._check()
+        # Bounds the frames that wait to be written, and with them the memory.
         self._slots.acquire()
         self._pool.submit(task).add_done_callback(self._done)
 

@@ -22,12 +22,11 @@ def _c(name: str) -> float:
     return float(getattr(arith, name))
 
 
-_LOG32 = [_c(f"_A{k}") for k in range(8, -1, -1)]  # highest power first, for Horner's scheme
-_EXP32 = [_c(f"_E32_{k}") for k in range(6, -1, -1)]
-_LOG64 = [_c(f"_B{k}") for k in range(6, -1, -1)]
+# Highest power first, for Horner's scheme.
+_LOG32, _EXP32, _LOG64, _SIN, _COS = (
+    list(map(float, one)) for one in (arith.LOG_32, arith.EXP_32, arith.LOG_64, arith.SIN_64, arith.COS_64)
+)
 _EXP64 = [_c(f"_X{k}") for k in range(13)]
-_SIN = [_c(f"_S{k}") for k in range(6, -1, -1)]
-_COS = [_c(f"_C{k}") for k in range(7, -1, -1)]
 _ROOT_BITS_32, _ROOT_BITS_64 = int(_c("_SQRT_HALF_BITS")), 0x3FE6A09E667F3BCD
 _Q_LN2, _Q_SCALE, _LN2_32, _LN2_64 = int(_c("_Q_LN2")), _c("_Q_SCALE"), _c("_LN2_32"), _c("_LN2_64")
 _LOG2E_32, _LN2_HI_32, _LN2_LO_32 = _c("_LOG2E_32"), _c("_LN2_HI_32"), _c("_LN2_LO_32")

@@ -58,6 +58,7 @@ def crossing_ns(part: Tensor, whole: Tensor, dt_ns: Any, longest_ns: int) -> Ten
     if longest_ns < _LONG_NS:
         return torch.div(part * dt_ns, whole, rounding_mode="trunc")
     # Schoolbook division: no product reaches 2^63.
+    # dt = 2^20 high + low: first the quotient of the upper part, then its rest together with the lower one.
     high, low = dt_ns >> 20, dt_ns & 0xFFFFF
     ahead = part * high
     quotient = torch.div(ahead, whole, rounding_mode="trunc")
@@ -353,6 +354,7 @@ class TensorEsim(Batch):
                 self._count_cut(env, alive & ~within)
                 alive = alive & within
                 emitted.index_add_(0, slots, alive.to(torch.int64))
+            # Number of the pixel in the whole batch, and the polarity in bit 0.
             word = (flat << 1) | polarity
             found.append(Found(word[alive], torch.div(after[alive], 1000, rounding_mode="trunc")))
             # The next thresholds, drawn once per level and numbered by the levels passed.

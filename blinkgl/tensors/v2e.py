@@ -35,7 +35,7 @@ from blinkgl.tensors.waves import Parts, Rows, Shots, Step, add_curves, wake, wa
 _SLOPE, _DARK, _SETTLED = (float(getattr(model, name)) for name in ("_SLOPE", "DARK", "SETTLED"))
 _SMALLEST_K = float(vars(model)["_SMALLEST_K"])
 # The coefficients of the highest power first, as horner takes them.
-_GROWTH = [float(getattr(model, f"_P{k}")) for k in range(6, -1, -1)]
+_GROWTH = list(map(float, model.GROWTH_32))
 _TABLE_LOW, _TABLE_PER, _TABLE_LAST = float(np.float32(TABLE_LOW)), float(np.float32(1 / TABLE_STEP)), TABLE_SIZE - 2
 _NOT_YET_NS = 2**62
 _INF = float("inf")

@@ -270,6 +270,7 @@ def waves(
         if shots is not None:
             _let_shots_come_first(r, shots, v)
         fires = r["fires"]
+        # Number of the pixel in the whole batch, and the polarity in bit 0.
         word = (r["flat"] << 1) | r["polarity"]
         cause = _cause_bits(r) if has.causes else word
         after = torch.div(r["at_ns"] + v.start_ns, 1000, rounding_mode="trunc")

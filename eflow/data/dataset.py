@@ -72,10 +72,13 @@ class Mixture:
                 for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
                     pass_, place = divmod(n, size)
                     picks.append((source, n if self.endless[source] else int(self._order(source, pass_)[place])))
+            # First numbers of spawn keys: 0 for the mixture, 1 for passes over a source, 2 for the augmentation of a
+            # draw.
             order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(
                 len(picks)
             )
             picks = [picks[i] for i in order]
+            # Endless sources give their samples in order, so their places in the mixture take them by number.
             for source in np.flatnonzero(self.endless):
                 places = [i for i, (picked, _) in enumerate(picks) if picked == source]
                 for i, n in zip(places, sorted(picks[i][1] for i in places), strict=True):
@@ -157,6 +160,7 @@ class FlowDataset(Dataset):
     def __getitem__(self, key: Key | int) -> dict | None:
         if isinstance(key, Key):
             return self._drawn(key)
+        # Endless sources are empty intervals here, which "right" steps over.
         source = int(np.searchsorted(self._starts, key, side="right")) - 1
         sample = self._with_events(self.sources[source][int(key - self._starts[source])])
         return None if sample is None else self._tensors(sample, None)
@@ -165,6 +169,7 @@ class FlowDataset(Dataset):
         """Return the sample of a draw, or the next one of its source that can be trained on."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(2, key.epoch, key.position)))
         source = self.sources[key.source]
+        # The next sample of an endless source belongs to its next draw.
         tries = 1 if is_endless(source) else min(len(source), MOST_TRIES)
         for step in range(tries):
             sample = source[key.index if is_endless(source) else (key.index + step) % len(source)]
@@ -270,6 +275,7 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
     out = {**sample, **{k: resize(sample[k]) for k in ("old", "new") if k in sample}}
     if "flow" in sample:
+        # Sizes are whole, so the factor of an axis is a little off the one that was drawn.
         ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]
         if sample["valid"].float().mean() < SPARSE:
             resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="nearest-exact")[0]

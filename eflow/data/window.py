@@ -65,6 +65,7 @@ class Window:
         at = np.searchsorted(self.t, t[order], side="right") + np.arange(len(t))
         there = np.ones(len(self.t) + len(t), bool)
         there[at] = False
+        # The rest keep their order, around the places of the new events.
         columns = []
         for old, new in ((self.x, x), (self.y, y), (self.t, t), (self.p, p)):
             column = np.empty(len(there), old.dtype)

@@ -60,10 +60,12 @@ class _Cloud:
                 value=len(x),
                 accepted=f"at least {LEAST_EVENTS}",
             )
+        # Rectified events may lie outside the picture, so numbers of pixels begin below 0.
         pixel = np.rint(y).astype(np.intp) * width + np.rint(x).astype(np.intp)
         counts = np.bincount(pixel - pixel.min())
         cold = counts[pixel - pixel.min()] <= HOT * counts[counts > 0].mean()
         x, y, s = x[cold], y[cold], s[cold]
+        # Rounded up, so that no more than the most are left.
         every = -(-len(x) // MOST_EVENTS)
         return cls(x[::every], y[::every], s[::every], height, width)
 
@@ -124,12 +126,14 @@ def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -
     shape = (math.ceil(cloud.height / unit + 2 * edge), math.ceil(cloud.width / unit + 2 * edge))
     total, slope, point = 0.0, np.zeros((len(cloud.x), 2)), np.empty((len(cloud.x), 2))
     for time, weight in TIMES:
+        # Warped to one time: x' = x - (s - time) flow, in coarser pixels and inside of the border.
         share = cloud.s - time
         x, y = (cloud.x - share * flow[0]) / unit + edge, (cloud.y - share * flow[1]) / unit + edge
         votes = np.zeros(shape)
         vote(x, y, votes)
         image = ndimage.gaussian_filter(votes, blur, mode="constant", truncate=3)
         down, right = np.diff(image, axis=0), np.diff(image, axis=1)
+        # Differences of neighbours: the gradient without a kernel of its own.
         total += weight * ((down**2).sum() + (right**2).sum())
         back = np.zeros(shape)  # derivative by the blurred image, then by the votes: a Gaussian filter is self-adjoint
         back[1:] += down
@@ -137,6 +141,7 @@ def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -
         back[:, 1:] += right
         back[:, :-1] -= right
         slope_at(x, y, ndimage.gaussian_filter(2 * back, blur, mode="constant", truncate=3), point)
+        # dx'/dflow = -(s - time) / unit, by the chain rule.
         slope -= (weight / unit) * share[:, None] * point
     return total, slope
 
@@ -169,6 +174,7 @@ def sharpest_length(windows: list[Window], flow: np.ndarray) -> tuple[float, str
         cloud = _Cloud.of(windows, height, width)
     except EventDataError:
         return 1.0, "too few events"
+    # The flow is over the last window, and the cloud spans both.
     spans = (windows[-1].t1 - windows[0].t0) / (windows[-1].t1 - windows[-1].t0)
     at = flow[np.rint(cloud.y).astype(np.intp), np.rint(cloud.x).astype(np.intp)].astype(np.float64) * spans
     values = np.array([sharpness(cloud, (f * at[:, 0], f * at[:, 1]), BLURS_PX[-1])[0] for f in LENGTHS])
@@ -217,12 +223,14 @@ def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarra
     x, y, s = cloud.x[keep] / coarse, cloud.y[keep] / coarse, cloud.s[keep] - 0.5
     shape = (math.ceil(cloud.height / coarse) + 2, math.ceil(cloud.width / coarse) + 2)
     reach = most / coarse
+    # Three lengths an octave: the optimisation that follows bridges the rest.
     lengths = np.concatenate([[0.0], np.geomspace(0.5, max(reach, 0.6), max(2, math.ceil(3 * math.log2(2 + reach))))])
     best, top = np.zeros(2), -1.0
     for length in lengths:
         ways = max(1, math.ceil(4 * math.pi * min(length, 4)))  # half a coarse pixel apart for short translations
         for turn in 2 * math.pi * np.arange(ways) / ways:
             shift = length * np.array([math.cos(turn), math.sin(turn)])
+            # Warped to the middle of the span; a border of one pixel catches what rounds out of the picture.
             image = np.zeros(shape)
             vote(x - s * shift[0] + 1, y - s * shift[1] + 1, image)
             value = (image**2).sum()
@@ -272,6 +280,7 @@ class ContrastMaximisation:
         wanted = np.broadcast_to(whole, (len(cloud.x), 2)).copy()
         starts = [np.zeros(field.basis[0].shape[1]), self._fit(field, wanted, everywhere)]
         if self.field != "translation":
+            # Parts of a 3 x 3 grid, so that a field that turns or grows starts near what each part does.
             column = np.minimum((cloud.x * 3 / cloud.width).astype(int), 2)
             row = np.minimum((cloud.y * 3 / cloud.height).astype(int), 2)
             used = np.zeros(len(cloud.x), bool)
@@ -291,6 +300,7 @@ class ContrastMaximisation:
     @staticmethod
     def _from(cloud: _Cloud, field: _Field, start: np.ndarray) -> tuple[np.ndarray, float]:
         p, value = start, -math.inf
+        # From coarse to fine: each maximum is the next start.
         for blur in BLURS_PX:
             p, value = _climb(cloud, field, p, blur, 30)
         return p, value

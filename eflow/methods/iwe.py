@@ -40,6 +40,7 @@ def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -
             continue
         column, row = int(fx), int(fy)
         a, b = x[i] - fx, y[i] - fy
+        # d/da and d/db of (1-a)(1-b) p + a(1-b) q + (1-a)b r + ab s.
         p, q = image[row, column], image[row, column + 1]
         r, s = image[row + 1, column], image[row + 1, column + 1]
         out[i, 0] = (q - p) * (1 - b) + (s - r) * b

@@ -1,6 +1,7 @@
 """A recipe small enough to be made many times, and helpers to look at what came of it."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -8,6 +9,11 @@ import time
 from pathlib import Path
 
 import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.reader import to_yaml
+from blinkgl.io.records import sealed
+from blinkgl.sequence_files.sequence_dir import digest_of
 
 RECIPE = {
     "seed": 11,
@@ -43,6 +49,14 @@ def recipe_file(folder: Path, **changes) -> Path:
     path = folder / "recipe.yaml"
     path.write_text(yaml.safe_dump({**RECIPE, **changes}))
     return path
+
+
+def generated(folder: Path, config: dict | str) -> Path:
+    """``folder`` with a run.yaml and, in ``out``, the data set that `generate` makes of it."""
+    path = folder / "run.yaml"
+    path.write_text(config if isinstance(config, str) else to_yaml(config), encoding="utf-8")
+    assert run(["generate", str(path), "--out", str(folder / "out")]) == 0
+    return folder
 
 
 def tree(out: Path) -> dict[str, str]:
@@ -122,3 +136,12 @@ class Listener:
     @property
     def errors(self) -> list[str]:
         return [message["error"] for _, message in self.messages if message["kind"] == "failed"]
+
+
+def forge(folder: Path, name: str = "", **changes) -> None:
+    """Bring the manifest in line with what was done to a file, as a bug in the writer would; change what it says."""
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    if name:
+        manifest["files"][name] = digest_of(folder / name)
+    path.write_text(sealed({**manifest, **changes}))

@@ -16,6 +16,7 @@ from blinkgl.cli import run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.event_labels import BLOCK, EventLabelsReader, EventLabelsWriter
 from blinkgl.types.events import TRUTH
+from runs import generated
 
 CONFIG = """
 camera: {width: 48, height: 36}
@@ -29,10 +30,7 @@ scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: fals
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("told")
-    (folder / "c.yaml").write_text(CONFIG.replace("EMULATOR", "esim"))
-    assert run(["generate", str(folder / "c.yaml"), "--out", str(folder / "d")]) == 0
-    return folder / "d"
+    return generated(tmp_path_factory.mktemp("told"), CONFIG.replace("EMULATOR", "esim")) / "out"
 
 
 def sequence_of(root: Path) -> Path:
@@ -101,9 +99,7 @@ scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: fals
 
 
 def test_causes_from_the_run_to_the_report(tmp_path, capsys):
-    (tmp_path / "c.yaml").write_text(CONFIG_CAUSES_OF_SEQUENCES)
-    out = tmp_path / "d"
-    assert run(["generate", str(tmp_path / "c.yaml"), "--out", str(out)]) == 0
+    out = generated(tmp_path, CONFIG_CAUSES_OF_SEQUENCES) / "out"
     assert "by cause" in capsys.readouterr().out
     path = next(out.rglob("manifest.json"))
     manifest = json.loads(path.read_text())

@@ -24,6 +24,7 @@ from blinkgl.io.images import read_ids
 from blinkgl.io.intervals import read_intervals
 from blinkgl.labels import LABELS, Flows, LabelRequest
 from blinkgl.report.collect import collect
+from runs import generated
 
 MS = 1_000_000
 RUN = {
@@ -45,10 +46,7 @@ ASKED = [-20 * MS, 10 * MS, 50 * MS, 100 * MS]
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("intervals")
-    (folder / "run.yaml").write_text(to_yaml(RUN), encoding="utf-8")
-    assert run(["generate", str(folder / "run.yaml"), "--out", str(folder / "out")]) == 0
-    return folder
+    return generated(tmp_path_factory.mktemp("intervals"), RUN)
 
 
 def folder_of(made: Path) -> Path:
@@ -158,10 +156,7 @@ RUN_SHOWN_LABELS = {
 
 @pytest.fixture(scope="module")
 def made_of_shown_labels(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("shown")
-    (folder / "run.yaml").write_text(to_yaml(RUN_SHOWN_LABELS), encoding="utf-8")
-    assert run(["generate", str(folder / "run.yaml"), "--out", str(folder / "out")]) == 0
-    return folder
+    return generated(tmp_path_factory.mktemp("shown"), RUN_SHOWN_LABELS)
 
 
 def test_written_and_verified(made_of_shown_labels):

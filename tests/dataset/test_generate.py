@@ -25,6 +25,7 @@ from blinkgl.io.flow import read_flow
 from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.images import read_image
 from blinkgl.render.passes import Luminance
+from runs import generated
 
 SMALL = {
     "seed": 4,
@@ -223,10 +224,7 @@ RUN = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lenses")
-    (folder / "run.yaml").write_text(to_yaml(RUN), encoding="utf-8")
-    assert run(["generate", str(folder / "run.yaml"), "--out", str(folder / "out")]) == 0
-    return folder / "out"
+    return generated(tmp_path_factory.mktemp("lenses"), RUN) / "out"
 
 
 def test_verify_knows_the_lens(made, tmp_path):

@@ -14,6 +14,7 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.imu import read_imu
 from blinkgl.io.tracks import read_tracks
+from runs import generated
 
 CONFIG = """
 camera: {width: 48, height: 36}
@@ -28,10 +29,7 @@ scene: {kind: random, pool: {primitives: [cuboid]}, textures: {photographs: fals
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("over_time")
-    (folder / "c.yaml").write_text(CONFIG)
-    assert run(["generate", str(folder / "c.yaml"), "--out", str(folder / "d")]) == 0
-    return folder / "d"
+    return generated(tmp_path_factory.mktemp("over_time"), CONFIG) / "out"
 
 
 def sequence_of(root: Path) -> Path:

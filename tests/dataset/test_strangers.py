@@ -3,7 +3,6 @@
 import contextlib
 import html
 import io
-import json
 import os
 import re
 import shutil
@@ -24,11 +23,11 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import encode_png
-from blinkgl.io.records import inside, sealed
+from blinkgl.io.records import inside
 from blinkgl.layouts import export_layout
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.report import page
-from blinkgl.sequence_files.sequence_dir import digest_of
+from runs import forge
 
 LABELS = {"flow": ["forward", "backward"], "depth": True, "boxes": True, "images": True, "ids": True}
 ONE = {**TINY, "labels": LABELS, "tracks": {"points": 20}, "images": {"exposure_us": 5000, "bits": 10}}
@@ -67,15 +66,6 @@ def one(sets, tmp_path) -> Path:
 def rig(sets, tmp_path) -> Path:
     shutil.copytree(sets["rig"].parents[1], tmp_path / "set")
     return tmp_path / "set/train/sequence_000000"
-
-
-def forge(sequence: Path, file: str = "", **changes) -> None:
-    """Bring the manifest in line with a changed file, and change what it says."""
-    path = sequence / "manifest.json"
-    manifest = json.loads(path.read_text())
-    if file:
-        manifest["files"][file] = digest_of(sequence / file)
-    path.write_text(sealed({**manifest, **changes}))
 
 
 def said(*arguments) -> list[str]:

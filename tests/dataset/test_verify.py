@@ -22,8 +22,8 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.records import sealed
-from blinkgl.sequence_files.sequence_dir import digest_of, manifest_problems, verify_sequence
-from runs import NAMES, recipe_file
+from blinkgl.sequence_files.sequence_dir import manifest_problems, verify_sequence
+from runs import NAMES, forge, recipe_file
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +36,6 @@ def sound(tmp_path_factory) -> Path:
 @pytest.fixture
 def data(sound, tmp_path) -> Path:
     return Path(shutil.copytree(sound, tmp_path / "data"))
-
-
-def forge(folder: Path, name: str, **changes) -> None:
-    """Brings the manifest in line with what was done to a file, as a bug in the writer would."""
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    if name:
-        manifest["files"][name] = digest_of(folder / name)
-    path.write_text(sealed({**manifest, **changes}))
 
 
 def drop(sequence: Path, name: str) -> None:

@@ -25,13 +25,6 @@ from eflow.train import train  # noqa: E402
 from small_recipe import RECIPE, asked, said  # noqa: E402
 
 
-@pytest.fixture(scope="module")
-def recipe(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("online") / "recipe.yaml"
-    path.write_text(yaml.safe_dump(RECIPE))
-    return path
-
-
 def test_the_same_samples_whoever_renders_them_though_a_worker_is_killed(recipe):
     """Inline, from another beginning, and by two processes, one of which is killed: the n-th sample is the n-th."""
     count = 2 * MIX * 2  # two blocks of eight sequences, two samples each

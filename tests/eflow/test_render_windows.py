@@ -14,14 +14,7 @@ from eflow.cli import run  # noqa: E402
 from eflow.data.online import open_online  # noqa: E402
 from eflow.data.pool import PoolSource, render_pool  # noqa: E402
 from eflow.data.sources import open_source  # noqa: E402
-from small_recipe import RECIPE, asked, said  # noqa: E402
-
-
-@pytest.fixture(scope="module")
-def recipe(tmp_path_factory):
-    path = tmp_path_factory.mktemp("pool") / "recipe.yaml"
-    path.write_text(yaml.safe_dump(RECIPE))
-    return path
+from small_recipe import asked, said  # noqa: E402
 
 
 @pytest.fixture(scope="module")

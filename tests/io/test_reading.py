@@ -53,16 +53,14 @@ def as_text(path, names, columns):
     path.write_text("\n".join(lines) + "\n")
 
 
+def as_root(path, names, columns, group="/"):
+    with h5py.File(path, "w") as file:
+        for name, column in zip(names, columns):
+            file[f"{group}{name}"] = column
+
+
 def as_h5(path, names, columns):
-    with h5py.File(path, "w") as file:
-        for name, column in zip(names, columns):
-            file[f"events/{name}"] = column
-
-
-def as_root(path, names, columns):
-    with h5py.File(path, "w") as file:
-        for name, column in zip(names, columns):
-            file[name] = column
+    as_root(path, names, columns, "events/")
 
 
 def as_mat73(path, names, columns):

@@ -166,18 +166,9 @@ class _Pixel:
         result = plain
         for part, size, other in zip(parts, sizes, others, strict=True):
             result += part * (other / size - plain) if size > 0 else 0.0
-        # Creases: towards the pixels on their other side, if these are of the same surface.
-        if towards.any():
-            level = (SAME if bent > 0 else COVER * self.pixel) * own
-            towards /= np.hypot(*towards)
-            total, beyond = 0.0, 0.0
-            for dx, dy in _AROUND:
-                weight = max((dx * towards[0] + dy * towards[1]) / max(dx * dx + dy * dy, 1) - 0.3, 0.0)
-                if weight > 0 and abs(self._depth(x + dx, y + dy) - own) < level:
-                    total += weight
-                    beyond += weight * self._light(x + dx, y + dy)
-            if total > 0:
-                result += min(abs(creases), 1 - parts.sum()) * (beyond / total - plain)
+        level = (SAME if bent > 0 else COVER * self.pixel) * own
+        if towards.any() and (beyond := self._beyond(x, y, own, towards, level)) is not None:
+            result += min(abs(creases), 1 - parts.sum()) * (beyond - plain)
         if len(lines) < 2:
             return result
         # What no centre shows is a surface between them: one of those in front.
@@ -188,6 +179,18 @@ class _Pixel:
         mean, least, most = float(np.mean(values)), min(plain, *values), max(plain, *values)
         accuracy = (most - least) / SAMPLES
         return min(max(result, mean - accuracy, least), mean + accuracy, most)
+
+    def _beyond(self, x: int, y: int, own: float, towards: np.ndarray, level: float) -> float | None:
+        """Return the mean of the pixels on the other side of creases, in a direction, that are of the same surface:
+        whose depth is within ``level`` of its ``own``. None: there is none."""
+        towards = towards / np.hypot(*towards)
+        total, beyond = 0.0, 0.0
+        for dx, dy in _AROUND:
+            weight = max((dx * towards[0] + dy * towards[1]) / max(dx * dx + dy * dy, 1) - 0.3, 0.0)
+            if weight > 0 and abs(self._depth(x + dx, y + dy) - own) < level:
+                total += weight
+                beyond += weight * self._light(x + dx, y + dy)
+        return beyond / total if total > 0 else None
 
     def _sample(self, x: int, y: int, k: int, lines: list[_Line], between: float | None) -> float | None:
         """Return the value at the k-th place in the pixel: the mean of the centres around that no line cuts off, by
@@ -260,16 +263,20 @@ class _Pixel:
             known = abs(front_depth - depth) < SAME * depth or horizon
             front, back = self._light(*there), self._light(*other)
         if not known:
-            # Narrower than a pixel: search along the line, one pixel at a time, to both ends.
-            onwards = np.array([left[1], -left[0]]) / max(abs(left))
-            for k in range(2 * ALONG):
-                steps = (k % 2 * 2 - 1) * (k // 2 + 2)
-                at = (math.floor(x + 0.5 + steps * onwards[0]), math.floor(y + 0.5 + steps * onwards[1]))
-                expected = depth + steps * further
-                if abs(self._depth(*at) - expected) < SAME * expected:
-                    return self._light(*at), back, inside
-            return None
-        return front, back, inside
+            # Narrower than a pixel.
+            front = self._along(x, y, depth, left, further)
+        return None if front is None else (front, back, inside)
+
+    def _along(self, x: int, y: int, depth: float, left: np.ndarray, further: float) -> float | None:
+        """Return what is in front along a line, one pixel at a time, to both ends; None: nothing is."""
+        onwards = np.array([left[1], -left[0]]) / max(abs(left))
+        for k in range(2 * ALONG):
+            steps = (k % 2 * 2 - 1) * (k // 2 + 2)
+            at = (math.floor(x + 0.5 + steps * onwards[0]), math.floor(y + 0.5 + steps * onwards[1]))
+            expected = depth + steps * further
+            if abs(self._depth(*at) - expected) < SAME * expected:
+                return self._light(*at)
+        return None
 
 
 def _turn(turn: float, on_left: bool) -> float:

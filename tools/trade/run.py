@@ -17,7 +17,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import write_whole
 from blinkgl.machine.bench import machine_line
-from blinkgl.tools.trade.measure import ENOUGH, QUICK, Bench, Options
+from blinkgl.tools.trade.measure import ENOUGH, QUICK, Bench, Level, Options
 from blinkgl.tools.trade.settings import SIZES, Setting, design, pareto_front
 
 COLUMNS = (
@@ -93,18 +93,7 @@ def trade(
             results = bench.measure(mine)
             levels = bench.judge(results, bench.speeds())
             rows += [{**r.to_dict(), "width": bench.width, "height": bench.height} for r in results]
-            sizes[size or "full"] = {
-                "width": bench.width,
-                "height": bench.height,
-                "judged_pixels": int(bench.mask.sum()),
-                "tiles": len(bench.tiles),
-                "t0_us": bench.t0_ns // 1000,
-                "t1_us": bench.t1_ns // 1000,
-                "clip_s": bench.duration_s,
-                "emulator": bench.emulator.model_dump(),
-                "levels": [level.to_dict() for level in levels],
-                "converged": levels[-1].converged,
-            }
+            sizes[size or "full"] = _of_size(bench, levels)
         machine = machine_line(gl.renderer)
     main = rows[0]["size"]  # sizes are different data sets: the front uses only the largest
     best = {r["name"] for r in pareto_front([r for r in rows if r["size"] == main], cost, "voxel")}
@@ -128,6 +117,22 @@ def trade(
         "sizes": sizes,
         "settings": rows,
         "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost]) if r["on_front"]],
+    }
+
+
+def _of_size(bench: Bench, levels: list[Level]) -> dict[str, Any]:
+    """Return what is measured at one size, and how its reference converges, as plain data."""
+    return {
+        "width": bench.width,
+        "height": bench.height,
+        "judged_pixels": int(bench.mask.sum()),
+        "tiles": len(bench.tiles),
+        "t0_us": bench.t0_ns // 1000,
+        "t1_us": bench.t1_ns // 1000,
+        "clip_s": bench.duration_s,
+        "emulator": bench.emulator.model_dump(),
+        "levels": [level.to_dict() for level in levels],
+        "converged": levels[-1].converged,
     }
 
 

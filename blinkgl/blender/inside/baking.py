@@ -64,6 +64,7 @@ class Clock:
 
     def go(self, frame: float) -> None:
         """Evaluate the scene at a frame, or between two."""
+        # Frames are counted finer while it bakes; Blender takes the rest as a subframe.
         whole, part = divmod(frame * self.per, 1)
         self.scene.frame_set(int(whole), subframe=part)
         self.graph = bpy.context.evaluated_depsgraph_get()
@@ -125,6 +126,7 @@ def sample(clock: Clock, path: Path) -> tuple[set[str], dict[str, set[str]]]:
     NaN where it is not seen.
 
     Return (owners that are broken, owners of each object's name)."""
+    # At whole frames and between them, where exporters interpolate.
     halves = 2 * (clock.last - clock.first)
     # Multiples of the golden ratio lie evenly over the clip; two steps make a frame.
     some = {round((0.618033988749895 * k % 1) * halves) for k in range(SAMPLES)} | {0, halves}
@@ -276,6 +278,7 @@ def bake(clock: Clock, owners: set[str], room: float) -> tuple[list[Track], dict
     keep_out(clock, owners - reasons.keys() | {track.name for track in baked})
     for track in baked:
         there = np.isin(frames, track.seen)
+        # Where it appears or disappears; the first frame always counts.
         turns = np.flatnonzero(np.diff(there, prepend=not there[0]))
         # A little early, so that what float32 makes of the time is not after it.
         at = [max(clock.seconds(frames[k]) * (1 - 1.2e-7) - 1e-6, 0.0) for k in turns]

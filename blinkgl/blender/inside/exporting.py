@@ -69,6 +69,7 @@ def open_file(source: Path, fps: float | None) -> None:
     }
     usd = lambda path: operators.usd_import(filepath=path, import_textures_mode="IMPORT_PACK", set_frame_range=True)
     ending = source.suffix.lower()
+    # The user's start-up file would add its own camera, light and cube.
     operators.read_factory_settings(use_empty=True)
     # Independent of the defaults: text blocks marked 'register' and drivers' expressions are never run.
     bpy.context.preferences.filepaths.use_scripts_auto_execute = False
@@ -223,11 +224,13 @@ def has_plain_colour(material: Any) -> bool:
     surface = links[0].from_node
     colour = surface.inputs["Base Color" if surface.type == "BSDF_PRINCIPLED" else "Color"]
     paint = colour.links[0].from_node if colour.links else None
+    # A plain colour, unless its nodes are animated.
     if paint is None or paint.type in ("VERTEX_COLOR", "RGB"):
         return material.node_tree.animation_data is None
     if paint.type != "TEX_IMAGE" or paint.projection != "FLAT":
         return False
     where = paint.inputs["Vector"].links
+    # Mappings become KHR_texture_transform.
     while where and where[0].from_node.type == "MAPPING":
         where = where[0].from_node.inputs["Vector"].links
     still = paint.image is None or paint.image.source in ("FILE", "GENERATED")
@@ -318,6 +321,7 @@ def counts(tree: dict) -> dict[str, int]:
 def steady(clock: Clock, objs: list[Any]) -> None:
     """Give lights with key frames the greatest energy that they have at nine times."""
     keyed = [obj for obj in objs if obj.type == "LIGHT" and obj.data.animation_data is not None]
+    # glTF's lights are constant: the brightest of nine times stands for the whole.
     best = dict.fromkeys(keyed, (0.0, 1.0, 1.0, 1.0))
     for k in range(9 if keyed else 0):
         clock.go(clock.first + k * (clock.last - clock.first) / 8)
@@ -327,6 +331,36 @@ def steady(clock: Clock, objs: list[Any]) -> None:
     for obj, (energy, *colour) in best.items():
         obj.data.animation_data_clear()
         obj.data.energy, obj.data.color = energy, colour
+
+
+def written(
+    job: dict, out: Path, say: Callable[..., None], clock: Clock, broken: set[str], owners: dict, figures: bool
+) -> tuple[dict[str, int], list[Track], dict[str, str]]:
+    """Write ``out`` until it plays as Blender shows it: what differs is baked, and more of it at each round. Return the
+    counts of the file, the baked tracks, and why others are not baked."""
+    tracks: list[Track] = []
+    tried, reasons = set(broken), {}
+    for number in range(ROUNDS):
+        say(doing="writing the GLB")
+        found = export(clock, out, job["clips"], tracks)
+        if not found["meshes"] and not figures:  # a clip for another's figure
+            raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
+        if job["clips"] or not owners:
+            break
+        say(compare=clock.per)
+        verdict = json.loads(sys.stdin.readline())
+        differ = {owner for name in verdict["differs"] for owner in owners.get(name, {name})} - tried
+        denser = 1 if clock.simulated else verdict["denser"]
+        if number == ROUNDS - 1 or not (differ or denser > 1):
+            break
+        clock.stretch(clock.per * denser)
+        say(doing=f"baking {len(differ)} objects")
+        room = 1e6 * job["bake_mb"] - sum(track.size for track in tracks)
+        more, why = bake(clock, differ, room)
+        tracks, reasons, tried = tracks + more, reasons | why, tried | differ
+        if denser == 1 and tried == broken | why.keys():
+            break
+    return found, tracks, reasons
 
 
 def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
@@ -353,28 +387,8 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     failed: dict[str, str] = {}
     for place, what, instead in (("material.materials", "gather_material", NO_MATERIAL), ("mesh", "gather_mesh", None)):
         forgive(place, what, instead, failed)
-    tracks: list[Track] = []
-    tried, reasons = set(broken), {}
-    for number in range(ROUNDS):
-        say(doing="writing the GLB")
-        found = export(clock, out, job["clips"], tracks)
-        if not found["meshes"] and not any(obj.type == "ARMATURE" for obj in objs):  # a clip for another's figure
-            raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
-        if job["clips"] or not owners:
-            break
-        say(compare=clock.per)
-        verdict = json.loads(sys.stdin.readline())
-        differ = {owner for name in verdict["differs"] for owner in owners.get(name, {name})} - tried
-        denser = 1 if clock.simulated else verdict["denser"]
-        if number == ROUNDS - 1 or not (differ or denser > 1):
-            break
-        clock.stretch(clock.per * denser)
-        say(doing=f"baking {len(differ)} objects")
-        room = 1e6 * job["bake_mb"] - sum(track.size for track in tracks)
-        more, why = bake(clock, differ, room)
-        tracks, reasons, tried = tracks + more, reasons | why, tried | differ
-        if denser == 1 and tried == set(broken) | why.keys():
-            break
+    figures = any(obj.type == "ARMATURE" for obj in objs)
+    found, tracks, reasons = written(job, out, say, clock, set(broken), owners, figures)
     lines += [f"'{name}' cannot be exported, it is left out or plain ({why})" for name, why in sorted(failed.items())]
     cameras = [obj for obj in objs if obj.type == "CAMERA" and obj.data.type != "PANO"]
     scene.frame_set(scene.frame_start)

@@ -137,6 +137,7 @@ class Programs(dict["Kind", Uniforms]):
         pass_, lighting = self._pass, self._painter.lighting
         light = lighting.defines(kind, pass_.one_channel, getattr(pass_, "shadows", ())) if pass_.lit else {}
         foggy = {"FOG": 1} if pass_.lit and self._painter.scene.fog is not None else {}
+        # One program for each kind of item; unused features are not even compiled.
         defines = pass_.defines(kind) | kind.defines(pass_.lit) | light | foggy
         program = self._painter.gl.program(pass_.program, defines)
         uniforms = self[kind] = self._painter.uniforms(program)

@@ -75,6 +75,7 @@ class Gather(ScreenPass):
             texture.filter, texture.repeat_x, texture.repeat_y = (LINEAR, LINEAR), False, False
             lens.slopes(*shot.size).use(_FREE_UNIT + 3)
             uniforms["slopes"].value = _FREE_UNIT + 3
+        # Units below hold what is gathered, one for each output.
         lens.places(*shot.size).use(_FREE_UNIT + 2)
         uniforms["places"].value = _FREE_UNIT + 2
         uniforms["flat_size"].value = lens.flat.width, lens.flat.height

@@ -56,10 +56,6 @@ class Luminance(_Luminance):
     shadows: tuple[ShadowMap, ...] = ()
     still: ClassVar[bool] = True
 
-    @property
-    def depth(self) -> bool | str:
-        return "texture" if self.samples.edges else True
-
     outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
@@ -101,10 +97,6 @@ class Colour(Shaded):
     shadows: tuple[ShadowMap, ...] = ()
     program: ClassVar[str] = "colour.glsl"
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
-
-    @property
-    def depth(self) -> bool | str:
-        return "texture" if self.samples.edges else True
 
     def background(self, scene: Scene) -> tuple[float, ...]:
         return (scene.backdrop,) * 3

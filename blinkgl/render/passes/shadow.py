@@ -105,6 +105,10 @@ class Shaded(ScenePass):
     def inputs(self) -> tuple[Input, ...]:
         return tuple(Input(name, map_, DEPTH_BUFFER) for name, map_ in zip(_SAMPLERS, self.shadows))
 
+    @property
+    def depth(self) -> bool | str:
+        return "texture" if self.samples.edges else True
+
     def bind(self, uniforms: Uniforms, shot: Shot) -> None:
         for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
             if name in uniforms:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from blinkgl.errors import AssetError
 from blinkgl.scene.shapes.sweep import filled
 from blinkgl.scene.types import Deformer, Mesh, Scene
+from blinkgl.types.poses import pose_of
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
@@ -27,7 +28,6 @@ def make_mesh(
     normals: np.ndarray | None = None,
     uvs: np.ndarray | None = None,
     name: str = "",
-    source_hash: str = "",
     where: str | None = None,
     uv_size: float | None = None,
     project_degenerate: bool = False,
@@ -48,8 +48,7 @@ def make_mesh(
     project_degenerate : also project when the given coordinates cannot carry a texture (:func:`uvs_degenerate`). They
         are kept otherwise, because palette textures use exactly such coordinates.
     log : gets a line for each repair.
-    source : gets (W,) int64, the index of the given vertex of each of the mesh's; then no two of different origin are
-    joined.
+    source : gets (W,) int64, the index of the given vertex of each of the mesh's: none of different origin are joined.
 
     Faces without area are dropped and unused vertices removed; no face is turned round. Raises :class:`AssetError`
     (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, no faces.
@@ -77,9 +76,7 @@ def make_mesh(
         corner_normals = normals[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     corners = None if source is None else origin[faces]
-    mesh, first = _from_corners(
-        vertices[faces], corner_normals, corner_uvs, corners, name=name, source_hash=source_hash
-    )
+    mesh, first = _from_corners(vertices[faces], corner_normals, corner_uvs, corners, name=name)
     if source is not None and corners is not None:
         source.append(corners.ravel()[first])
     return mesh
@@ -240,6 +237,13 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> bool:
     return bool(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 >= -noise)
 
 
+def corner_angles(corners: np.ndarray) -> np.ndarray:
+    """Return the (F, 3) angles at the corners, (F, 3, 3), of triangles, rad."""
+    to_next = np.roll(corners, -1, axis=1) - corners
+    to_previous = np.roll(corners, 1, axis=1) - corners
+    return np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
+
+
 def crease_normals(
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -252,10 +256,7 @@ def crease_normals(
     of one smoothing group, 0: of none."""
     cross = _face_cross(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
-    corners = vertices[faces]
-    to_next = np.roll(corners, -1, axis=1) - corners
-    to_previous = np.roll(corners, 1, axis=1) - corners
-    angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
+    angle = corner_angles(vertices[faces])
 
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
     count = len(faces)
@@ -382,9 +383,7 @@ def _transformed(mesh: Mesh, linear: np.ndarray, shift: np.ndarray) -> Deformer 
     """Return the mesh's deformer under an affine map."""
     if mesh.deformer is None:
         return None
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = linear, shift
-    return mesh.deformer.transformed(matrix)
+    return mesh.deformer.transformed(pose_of(shift, linear))
 
 
 def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
@@ -418,6 +417,18 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
     )
 
 
+def quartered(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges, (E, 2), and the faces, (4 F, 3), of triangles that are split into four.
+
+    The vertex in the middle of edge e is number ``count`` + e."""
+    # Each undirected edge gets one new vertex, however many faces share it.
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    edges, middle = np.unique(pairs, axis=0, return_inverse=True)
+    a, b, c = faces.T
+    ab, bc, ca = (middle.reshape(-1, 3) + count).T
+    return edges, np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+
+
 def subdivided(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
     """Return the same surface with smaller triangles: each is split into four until no edge is longer than ``edge``, or
     there would be more than ``max_faces``."""
@@ -426,21 +437,16 @@ def subdivided(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
         if longest <= edge or 4 * len(mesh.faces) > max_faces:
             return mesh
-        # Each undirected edge gets one new vertex, however many faces share it.
-        pairs = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-        edges, middle = np.unique(pairs, axis=0, return_inverse=True)
+        edges, faces = quartered(mesh.faces, len(mesh.vertices))
         halfway = lambda values, edges=edges: np.concatenate([values, values[edges].mean(axis=1, dtype=np.float64)])
         normals = halfway(mesh.normals.astype(np.float64))
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        a, b, c = mesh.faces.T
-        ab, bc, ca = (middle.reshape(-1, 3) + len(mesh.vertices)).T
-        faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3).astype(np.int32)
         # The normals of old vertices stay bitwise the same.
         normals[: len(mesh.vertices)] = mesh.normals
         mesh = replace(
             mesh,
             vertices=halfway(mesh.vertices),
-            faces=faces,
+            faces=faces.astype(np.int32),
             normals=normals.astype(np.float32),
             uvs=halfway(mesh.uvs).astype(np.float32),
             colours=None if mesh.colours is None else halfway(mesh.colours).astype(np.float32),

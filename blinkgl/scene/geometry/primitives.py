@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from blinkgl.config.primitives import PRIMITIVES, PrimitiveKind
 from blinkgl.errors import AssetError
-from blinkgl.scene.geometry.meshes import closedness, make_mesh, weld
+from blinkgl.scene.geometry.meshes import closedness, make_mesh, quartered, weld
 from blinkgl.scene.shapes.gait import CLIPS
 from blinkgl.scene.types import Deformer, Mesh
 
@@ -212,12 +211,16 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 
 
-def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -> Surface:
+def _rim(radius: float, z: float, segments: int) -> np.ndarray:
+    """Return the (segments, 3) corners of a regular polygon at height ``z``."""
+    angle = 2 * math.pi * np.arange(segments) / segments
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
+
+
+def _disc(radius: float, z: float, up: bool, segments: int) -> Surface:
     """Return a flat cap with the texture's inscribed disc, seen from outside."""
-    angle = turn + 2 * math.pi * np.arange(segments) / segments
-    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
     # A fan round the middle.
-    positions = np.concatenate([[[0.0, 0.0, z]], rim])
+    positions = np.concatenate([[[0.0, 0.0, z]], _rim(radius, z, segments)])
     # A lower cap is seen from below, where x is mirrored.
     side = 1.0 if up else -1.0
     uvs = np.stack([0.5 + 0.5 * side * positions[:, 0] / radius, 0.5 - 0.5 * positions[:, 1] / radius], axis=1)
@@ -342,16 +345,9 @@ def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     )
     # Every edge gets a vertex on the sphere, every triangle becomes four.
     for _ in range(subdivisions):
-        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
-        unique, index = np.unique(edges, axis=0, return_inverse=True)
-        middle = points[unique].sum(axis=1)
-        mid = len(points) + index.reshape(-1, 3)
+        edges, faces = quartered(faces, len(points))
+        middle = points[edges].sum(axis=1)
         points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
-        a, b, c = faces.T
-        ab, bc, ca = mid.T
-        faces = np.stack(
-            [np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))], axis=1
-        ).reshape(-1, 3)
     mesh = make_mesh(points, faces, normals=points, name="icosphere")
     return radius * mesh.vertices, mesh.normals, mesh.uvs, mesh.faces
 
@@ -420,24 +416,17 @@ def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings
 @primitive
 def prism(sides: int = 6, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Upright prism over a regular polygon of circumradius ``radius``, flat-shaded; the texture once on each side."""
-    angle = 2 * math.pi * np.arange(sides + 1) / sides
-    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
-    # The sine of 2 pi is not exactly 0, and the rim has to close.
-    rim[-1] = rim[0]
-    walls = [square(rim[i], rim[i + 1] - rim[i], (0, 0, height), 1, 1) for i in range(sides)]
+    rim = _rim(radius, -height / 2, sides)
+    walls = [square(a, b - a, (0, 0, height), 1, 1) for a, b in zip(rim, np.roll(rim, -1, axis=0))]
     return join([*walls, _disc(radius, height / 2, True, sides), _disc(radius, -height / 2, False, sides)])
 
 
 @primitive
 def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Pyramid over a regular polygon, flat-shaded; each side has the texture's triangle."""
-    angle = 2 * math.pi * np.arange(sides + 1) / sides
-    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
-    # The sine of 2 pi is not exactly 0, and the rim has to close.
-    rim[-1] = rim[0]
-    tip = np.array([0, 0, height / 2])
+    rim, tip = _rim(radius, -height / 2, sides), np.array([0, 0, height / 2])
     walls = []
-    for a, b in itertools.pairwise(rim):
+    for a, b in zip(rim, np.roll(rim, -1, axis=0)):
         normal = np.cross(b - a, tip - a)
         walls.append(
             (

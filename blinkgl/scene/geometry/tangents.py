@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from blinkgl.scene.geometry.meshes import corner_angles
 from blinkgl.scene.types import Mesh
 
 _kept: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
@@ -39,13 +40,10 @@ def _of_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 def _tangents(mesh: Mesh) -> np.ndarray:
     along, area = _of_faces(mesh)
     n = mesh.normals.astype(np.float64)
-    corners = mesh.vertices[mesh.faces]
+    angles = corner_angles(mesh.vertices[mesh.faces])
     sums, sign = np.zeros((len(n), 3)), np.zeros(len(n))
-    for k in range(3):
-        # Weighted by the angle at the corner, as normals are.
-        a, b = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
-        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
-        at = mesh.faces[:, k]
+    # Weighted by the angle at the corner, as normals are.
+    for at, angle in zip(mesh.faces.T, angles.T):
         flat = along - n[at] * (along * n[at]).sum(axis=1, keepdims=True)
         length = np.linalg.norm(flat, axis=1, keepdims=True)
         unit = np.divide(flat, length, out=np.zeros_like(flat), where=length > 0)

@@ -14,6 +14,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.meshes import faces_with_area
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.parts import RawMesh, transformed
+from blinkgl.scene.reading import existing
 from blinkgl.scene.shapes.clips import PATHS, Clip, Playing, Track
 from blinkgl.scene.shapes.skeleton import Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin
@@ -124,6 +125,7 @@ class Animation:
         whole = self.document.morph_weights(node, max(len(positions), 1))
         # Entry 1 of a cubic key is its value; 0 and 2 are tangents.
         values = [t.values[:, 1] if t.values.ndim == 3 else t.values for t in mine]
+        # Targets whose weight is always 0 would cost memory on the card.
         used = np.flatnonzero(np.any([whole != 0, *(np.abs(v).max(axis=0) > 0 for v in values)], axis=0))
         if not len(used):
             return None
@@ -171,11 +173,7 @@ def _source(document: gltf.Document, file: str | None, base: Path, where: str) -
     """Return the document with the clips: ``document``, or another file."""
     if file is None:
         return document
-    path = Path(file).expanduser()
-    path = path if path.is_absolute() else base / path
-    if not path.is_file():
-        raise ConfigError("no such file", where=where, value=file, accepted="a gltf or glb file")
-    return gltf.read(path, materials=False)
+    return gltf.read(existing(file, base, where, "a gltf or glb file"), materials=False)
 
 
 def meshes_at_rest(document: gltf.Document, node: int) -> tuple[list[RawMesh], np.ndarray]:

@@ -24,7 +24,7 @@ from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.importing.gltf_file import MAX_NODES, Node, buffers_of, index_of, item, needs, nodes_of, parse
 from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE_EXTENSIONS, Materials
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
-from blinkgl.scene.reading import Omissions, contents, reading
+from blinkgl.scene.reading import Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
 from blinkgl.scene.types import Material
@@ -465,6 +465,4 @@ def _check_faces(document: Document, max_faces: int) -> None:
                 # A strip or a fan has a triangle for every corner after the second.
                 total += max(corners, vertices) // (3 if primitive.get("mode", 4) == 4 else 1)
             per_mesh[node.mesh] = total
-    total = sum(per_mesh[n.mesh] for n in document.nodes.values() if n.shows)
-    if total > max_faces:
-        raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+    limit_faces(sum(per_mesh[n.mesh] for n in document.nodes.values() if n.shows), max_faces, where)

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.reading import contents, reading
+from blinkgl.types.poses import pose_of
 
 
 def parse(data: bytes, where: str) -> tuple[dict, bytes]:
@@ -188,11 +189,8 @@ class Node:
         """Return the rest transform to the parent, (4, 4)."""
         if self.matrix is not None:
             return self.matrix
-        T = np.eye(4)
         # R diag(scale): the scale multiplies the columns.
-        T[:3, :3] = Rotation.from_quat(self.rotation).as_matrix() * self.scale
-        T[:3, 3] = self.translation
-        return T
+        return pose_of(self.translation, Rotation.from_quat(self.rotation).as_matrix() * self.scale)
 
 
 def nodes_of(tree: dict, where: str) -> dict[int, Node]:

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from blinkgl.errors import AssetError
 
+# Bounds are far above those of any real file: what is beyond them is damage.
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 Size = Annotated[int, Field(ge=0, le=2**53)]
 # A larger value has the wrong unit, and products of a few of them overflow.

@@ -24,7 +24,7 @@ from blinkgl.scene.importing.gltf_file import buffer_contents
 from blinkgl.scene.importing.obj import read_obj
 from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.importing.ply import read_ply
-from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, reading
+from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
@@ -88,9 +88,7 @@ def load_asset(
     where = str(path)
     with reading("mesh", where):
         found, digest = _found(path, max_faces, max_bytes, keep_materials, max_texture, source_hash, up, play)
-        total = sum(len(raw.faces) for raw in found.raws)
-        if total > max_faces:
-            raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+        limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, where)
         has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
         common = {"name": path.stem, "where": where, "source_hash": digest, "log": found.log}
         parts = tuple(
@@ -130,8 +128,10 @@ def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, 
     if suffix not in MESH_SUFFIXES:
         raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
     data = contents(path, "mesh", max_bytes=max_bytes)
+    # A .gltf file is only its JSON: the buffers beside it decide about the mesh, too.
     digest = source_hash or content_hash(data, *dependencies(path, data))
     is_gltf = suffix in (".glb", ".gltf")
+    # Only glTF's standard says which axis is up.
     turn = Z_UP if up == "y" or (up == "auto" and is_gltf) else None
     if is_gltf:
         document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=materials)
@@ -195,6 +195,12 @@ def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh |
     skins = [deformer for deformer in changing if isinstance(deformer, Skin)]
     one = joined(skins) if len(skins) == len(meshes) else None
     return None if one is None else replace(whole, deformer=one)
+
+
+def sides_of(material: Material, wanted: bool | None) -> bool | None:
+    """Return whether both sides of a part are drawn: what the file says (None: it says nothing), unless ``wanted`` says
+    otherwise."""
+    return material.both_sides if material.both_sides is None or wanted is None else wanted
 
 
 def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:

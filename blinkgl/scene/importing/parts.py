@@ -97,7 +97,6 @@ def part_of(
         normals=raw.normals,
         uvs=raw.uvs,
         name=name,
-        source_hash=source_hash,
         where=where,
         uv_size=uv_size,
         # Degenerate coordinates that select from a palette work with the file's own texture, but with no other.
@@ -106,6 +105,7 @@ def part_of(
         source=source,
         crease_degrees=0.0 if raw.flat else CREASE_DEGREES,
     )
+    mesh = replace(mesh, source_hash=source_hash)
     if source is None:
         return Part(mesh, material)
     index = source[0]

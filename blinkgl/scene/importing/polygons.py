@@ -15,7 +15,7 @@ from blinkgl.scene.geometry.meshes import MAX_COORDINATE, crease_normals, weld
 from blinkgl.scene.geometry.polygons import triangulate
 from blinkgl.scene.importing.gltf_file import inside
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
-from blinkgl.scene.reading import Omissions, contents
+from blinkgl.scene.reading import Omissions, contents, limit_faces
 from blinkgl.scene.surfaces.images import content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
 
@@ -77,6 +77,7 @@ def raw_meshes(
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
     kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
     # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
+    # One raw mesh for each material and for each of the two kinds of coordinates; faces keep the file's order.
     order, raws = np.argsort(kind, kind="stable"), []
     for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():
         (number, bare), corners, tint = divmod(int(kind[chosen[0]]), 2), triangles[chosen].ravel(), None
@@ -92,9 +93,7 @@ def raw_meshes(
 
 
 def _check(given: Polygons, max_faces: int, where: str) -> None:
-    total = int(np.maximum(given.sizes - 2, 0).sum())
-    if total > max_faces:
-        raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+    limit_faces(int(np.maximum(given.sizes - 2, 0).sum()), max_faces, where)
     if (most := int(given.sizes.max(initial=0))) > MAX_CORNERS:
         raise AssetError(
             "a polygon has too many corners", where=where, value=most, accepted=f"at most {MAX_CORNERS}, or triangles"

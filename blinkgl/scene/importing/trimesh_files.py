@@ -14,7 +14,7 @@ import trimesh
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.parts import RawMesh, tinted, transformed
 from blinkgl.scene.importing.polygons import Polygons, raw_meshes
-from blinkgl.scene.reading import MAX_BYTES, Omissions
+from blinkgl.scene.reading import MAX_BYTES, Omissions, limit_faces
 from blinkgl.srgb import linear_from_srgb
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings are of no use to a user
@@ -52,6 +52,7 @@ def _raw_mesh(mesh: trimesh.Trimesh, wanted: bool) -> RawMesh:
         return RawMesh(vertices, faces)
     codes = np.asarray(mesh.visual.face_colors)[:, :3] / 255
     material, tint = tinted(None, linear_from_srgb(np.repeat(codes, 3, axis=0)))
+    # Colours belong to faces, so no two share a vertex.
     apart = np.arange(faces.size).reshape(-1, 3)
     return RawMesh(vertices[faces.ravel()], apart, None, None, material, colours=tint)
 
@@ -84,7 +85,7 @@ def _check_stl(data: bytes, max_faces: int, where: str) -> None:
         claimed = int(np.frombuffer(data[80:84], "<u4")[0])
         # Binary when the size fits; ASCII begins with 'solid' (some binary files do, too, so the size comes first).
         if data.lstrip()[:5].lower() != b"solid" or len(data) == 84 + 50 * claimed:
-            _limit(claimed, max_faces, where)
+            limit_faces(claimed, max_faces, where)
             if len(data) < 84 + 50 * claimed:
                 raise AssetError(
                     f"the mesh is truncated: {claimed} faces need {84 + 50 * claimed} bytes",
@@ -92,21 +93,17 @@ def _check_stl(data: bytes, max_faces: int, where: str) -> None:
                     value=len(data),
                 )
             return
-    _limit(data.count(b"facet normal"), max_faces, where)
-
-
-def _limit(faces: int, max_faces: int, where: str) -> None:
-    if faces > max_faces:
-        raise AssetError("the mesh has too many faces", where=where, value=faces, accepted=f"at most {max_faces}")
+    limit_faces(data.count(b"facet normal"), max_faces, where)
 
 
 def _check_3mf(data: bytes, max_faces: int, where: str) -> None:
     """Check what the archive says about its sizes before anything is unpacked."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(info.file_size for info in archive.infolist())
+    # XML packs to a tenth; more than a hundred times is a bomb.
     if size > MAX_BYTES or size > 100 * len(data):
         raise AssetError("the mesh is too large when it is unpacked", where=where, value=f"{size / 1e6:.0f} MB")
-    _limit(_model_of(data).count(b"<triangle "), max_faces, where)
+    limit_faces(_model_of(data).count(b"<triangle "), max_faces, where)
 
 
 def _model_of(data: bytes) -> bytes:

@@ -70,7 +70,7 @@ def _solid(points: np.ndarray) -> Shape:
     middle, axes, extent = _framed(points)
     if extent[2] < 0.005 * extent[0]:
         return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
-    hull, volume = _hull(points)
+    hull, volume = hull_of(points)
     ball = 4 / 3 * math.pi * radii.max() ** 3
     # The hull's corners lie on a sphere, which it nearly fills.
     if np.ptp(np.linalg.norm(hull - centre, axis=1)) < 1e-4 * radii.max() and volume > 0.9 * ball:
@@ -81,11 +81,11 @@ def _solid(points: np.ndarray) -> Shape:
     return Shape("MESH", vertices=hull)
 
 
-def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
+def hull_of(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the convex hull's vertices (V, 3) and its volume."""
     try:
         hull = ConvexHull(points)
-    except (QhullError, ValueError):
+    except (QhullError, ValueError):  # flat or too few: all of them
         return np.unique(points, axis=0), 0.0
     return points[hull.vertices], float(hull.volume)
 

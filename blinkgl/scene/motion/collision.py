@@ -32,8 +32,8 @@ from dataclasses import dataclass, replace
 
 import fcl
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
+from blinkgl.scene.motion.body_shapes import hull_of
 from blinkgl.scene.motion.paths import CutPath
 from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.shapes.sweep import sweep
@@ -164,7 +164,7 @@ class _Body:
         self.radius = float(np.linalg.norm(used - self.centre, axis=1).max()) + self.pad
         self.arm = float(np.linalg.norm(self.centre))
         self.reach = float(np.linalg.norm(used, axis=1).max())
-        self.hull = _hull(used)
+        self.hull, _ = hull_of(used)
         self.is_static = self.path.is_static
         self.planes = None
         # A static body's faces are transformed to world coordinates once.
@@ -373,13 +373,6 @@ def _heights(planes: np.ndarray, body: _Body, T: np.ndarray) -> np.ndarray:
     return (local @ body.hull.T).min(axis=1) + planes[:, :3] @ T[:3, 3] - planes[:, 3] - body.pad
 
 
-def _hull(points: np.ndarray) -> np.ndarray:
-    try:
-        return points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # flat or too few: all of them
-        return np.unique(points, axis=0)
-
-
 def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """Return the (P, 4) face planes of a convex mesh, both sides of a flat one; None when it is neither."""
     corners = vertices[faces]
@@ -390,6 +383,7 @@ def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> n
     if not keep.any():
         return None
     normals = normals[keep] / length[keep, None]
+    # n . x = d for the plane's points, with d from one corner.
     planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, corners[keep, 0])])
     extent = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
     # Coplanar triangles have one plane: compared to 1e-6, offsets relative to the extent.

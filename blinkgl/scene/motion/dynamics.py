@@ -46,6 +46,7 @@ from blinkgl.scene.motion.paths import HermitePath, StaticPath
 from blinkgl.scene.motion.piecewise import thin
 from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.types import Dynamics, SceneObject
+from blinkgl.types.poses import pose_of
 
 IMPACT_S = 1.6e-3
 """Duration of an impact, s: longer is softer. At a low rate it lasts ``LEAST_STEPS`` steps, which is longer."""
@@ -216,7 +217,7 @@ class _World:
                 if weighed:
                     density = unit * (_HEAVY * heaviest if body.role == "pusher" else body.mass) / body.volume
             # A moving body's origin is its centre of mass.
-            frame = T if body.role == "fixed" else _shifted(-body.centre)
+            frame = T if body.role == "fixed" else pose_of(-body.centre)
             for k, shape in enumerate(body.shapes):
                 name, dynamic = f"{number} {k}", body.role == "dynamic"
                 self._geometry(spec, holder, name, shape.moved(frame), body.config, body.radius, dynamic, density)
@@ -476,9 +477,3 @@ class _Record:
 
 def _times(steps: np.ndarray, t0_ns: int, rate: float) -> np.ndarray:
     return t0_ns + np.rint(steps * (1e9 / rate)).astype(np.int64)
-
-
-def _shifted(by: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = by
-    return T

@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion import piecewise
 from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.types.poses import pose_of
 
 # Rounding in the bounds' own arithmetic is of order 1e-15; this margin keeps them upper bounds.
 _BOUND_MARGIN = 1.0 + 1e-9
@@ -204,10 +205,7 @@ class CutPath:
         self.path, self.t_cut_ns = path, int(t_cut_ns)
         self.t0_ns = min(path.t0_ns, self.t_cut_ns)
         self.t1_ns = min(path.t1_ns, self.t_cut_ns)
-
-    @property
-    def is_static(self) -> bool:
-        return self.path.is_static or self.t_cut_ns <= self.path.t0_ns
+        self.is_static = path.is_static or self.t_cut_ns <= path.t0_ns
 
     def pose(self, t_ns: int) -> np.ndarray:
         return self.path.pose(min(int(t_ns), self.t_cut_ns))
@@ -294,9 +292,7 @@ class AffinePath:
 
     def pose(self, t_ns: int) -> np.ndarray:
         matrix, _ = self._motion(min(max(int(t_ns), self.t0_ns), self.t1_ns))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = nearest_rotation(matrix[:3, :3]), matrix[:3, 3]
-        return T @ self._local
+        return pose_of(matrix[:3, 3], nearest_rotation(matrix[:3, :3])) @ self._local
 
     def derivative(self, t_ns: int) -> np.ndarray:
         D = np.zeros((4, 4))
@@ -343,12 +339,8 @@ class OffsetPath:
 
     def __init__(self, path: PosePath, T_body_offset: ArrayLike):
         self.path, self.T_body_offset = path, rigid(T_body_offset)
-        self.t0_ns, self.t1_ns = path.t0_ns, path.t1_ns
+        self.t0_ns, self.t1_ns, self.is_static = path.t0_ns, path.t1_ns, path.is_static
         self._arm = float(np.linalg.norm(self.T_body_offset[:3, 3]))
-
-    @property
-    def is_static(self) -> bool:
-        return self.path.is_static
 
     def pose(self, t_ns: int) -> np.ndarray:
         return self.path.pose(t_ns) @ self.T_body_offset
@@ -369,11 +361,7 @@ class SharedOriginPath:
     """A body that stays at another's position without rotating with it: the sky around a camera."""
 
     def __init__(self, path: PosePath):
-        self.path, self.t0_ns, self.t1_ns = path, path.t0_ns, path.t1_ns
-
-    @property
-    def is_static(self) -> bool:
-        return self.path.is_static
+        self.path, self.t0_ns, self.t1_ns, self.is_static = path, path.t0_ns, path.t1_ns, path.is_static
 
     def pose(self, t_ns: int) -> np.ndarray:
         return self.poses(np.array([t_ns], np.int64))[0]

@@ -255,22 +255,22 @@ class Turn(Deformer):
         along = self._angle(t_ns) * self._turned(np.broadcast_to(self.share[0], arm.shape), angles)
         return n * (1 + (shear * along).sum(axis=1))[:, None] - along * (shear * n).sum(axis=1)[:, None]
 
+    def _last_row(self, angle: float) -> np.ndarray:
+        out = np.zeros((4, 4))
+        out[3, 0] = angle
+        return out
+
     def numbers(self, t_ns: int) -> np.ndarray:
         # The shader's four rows: axis, pivot, share, and the angle, its rate or its change.
-        out = np.zeros((4, 4))
+        out = self._last_row(self._angle(t_ns))
         out[0, :3], out[1, :3], out[2] = self.axis, self.pivot, [*self.share[0], self.share[1]]
-        out[3, 0] = self._angle(t_ns)
         return out
 
     def rates(self, t_ns: int) -> np.ndarray:
-        out = np.zeros((4, 4))
-        out[3, 0] = self._rate(t_ns)
-        return out
+        return self._last_row(self._rate(t_ns))
 
     def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
-        out = np.zeros((4, 4))
-        out[3, 0] = self.angle * self.beat.sine_change(t_ns, there_ns)
-        return out
+        return self._last_row(self.angle * self.beat.sine_change(t_ns, there_ns))
 
 
 class Twist(Turn):

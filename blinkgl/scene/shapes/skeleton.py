@@ -9,13 +9,13 @@ of a file (:mod:`~blinkgl.scene.shapes.clips`), or a formula.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.machine.kernels import kernel
+from blinkgl.types.recent import Recent
 
 _KEPT = 4
 
@@ -87,7 +87,8 @@ class Skeleton:
             raise ValueError("a skeleton's parents come before their children")
         self.motion = motion
         self.fixed = np.tile(np.eye(4), (count, 1, 1)) if fixed is None else np.array(fixed, np.float64)
-        self._kept: OrderedDict[int, tuple[np.ndarray, np.ndarray]] = OrderedDict()
+        # Positions, rates and the vertex stage use the same few times in a row.
+        self._kept: Recent[int, tuple[np.ndarray, np.ndarray]] = Recent(_KEPT)
 
     @property
     def is_static(self) -> bool:
@@ -96,14 +97,12 @@ class Skeleton:
     def at(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Return ((n, 4, 4), (n, 4, 4)) float64: each joint's transform to the object's frame, and its rate, 1/s. The
         last few are kept; do not write to them."""
-        # Positions, rates and the vertex stage use the same few times in a row.
-        if t_ns not in self._kept:
-            world, rate = np.empty((2, len(self.parents), 4, 4))
-            _world(self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
-            self._kept[t_ns] = world, rate
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[t_ns]
+        return self._kept.of(t_ns, lambda: self._at(t_ns))
+
+    def _at(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        world, rate = np.empty((2, len(self.parents), 4, 4))
+        _world(self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
+        return world, rate
 
 
 @kernel(error_model="numpy")

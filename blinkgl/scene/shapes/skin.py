@@ -179,6 +179,7 @@ class Skin(Deformer):
 
     def _blend(self, matrices: np.ndarray) -> np.ndarray:
         """Return the vertices' blends, (V, 3, 4), of (m, 4, 4)."""
+        # Sum over a vertex' joints k of w_k J_k, without the last row, which is (0, 0, 0, 1).
         return np.einsum("vk,vkij->vij", self.weights, matrices[:, :3][self.joints])
 
     def mirrored(self, t_ns: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from blinkgl.machine.kernels import kernel
 
 if TYPE_CHECKING:
-    from blinkgl.scene.types import Deformer, Mesh
+    from blinkgl.scene.types import Deformer, Mesh, Part
 
 _SAMPLES = 32
 """Smallest number of times at which a shape is sampled to find its bounds."""
@@ -165,9 +165,9 @@ def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:
     return mesh.normals if mesh.deformer is None else mesh.deformer.normals(mesh, t_ns)
 
 
-def gait(meshes: Iterable[Mesh]) -> tuple[str, float]:
-    """Return (orientation, units/s) of the motion of one object's meshes: of the first that has any."""
-    for mesh in meshes:
-        if mesh.deformer is not None and mesh.deformer.locomotion != "free":
-            return mesh.deformer.locomotion, mesh.deformer.speed
+def gait(parts: Iterable[Part]) -> tuple[str, float]:
+    """Return (orientation, units/s) of the motion of one object's parts: of the first that has any."""
+    for deformer in (part.mesh.deformer for part in parts):
+        if deformer is not None and deformer.locomotion != "free":
+            return deformer.locomotion, deformer.speed
     return "free", 0.0

@@ -61,6 +61,7 @@ def define_of(glsl: str) -> str:
 def includes() -> dict[str, str]:
     """Return texts by their include name: deforms.glsl, and deform/NAME.glsl of those with their own source."""
     sources = {deformer.glsl: deformer.source for deformer in DEFORMERS.values()}
+    # Only the shape that a program is compiled for is included.
     lines = [
         line for name in sources for line in (f"#ifdef {define_of(name)}", f'#include "deform/{name}.glsl"', "#endif")
     ]

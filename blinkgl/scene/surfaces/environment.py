@@ -147,6 +147,7 @@ def quartic(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tup
     )  # moments of degree 4, which include the lower ones
     # For light from d it is 9/4pi P4(n.d), P4(c) = (35 c^4 - 30 c^2 + 3) / 8 (the addition theorem), and d.d = 1.
     one = np.eye(3).ravel()
+    # Contractions by the identity turn d.d into 1: moments of degree 2, then the whole flux.
     second = M @ one
     total = second @ one
     mixed = np.einsum("ci,j->cij", second, one)

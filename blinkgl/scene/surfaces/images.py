@@ -302,6 +302,7 @@ def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.
     The panorama's middle column is in direction +x, and longitude grows to the right, i.e. clockwise from above.
     """
     height, width = panorama.shape[:2]
+    # Texel centres of a side from -1 to 1.
     s = ((np.arange(size) + 0.5) / size * 2 - 1) * (1 + margin)
     right, down = np.meshgrid(s, s)
     padded = np.concatenate([panorama[:, -2:], panorama, panorama[:, :2]], axis=1)  # interpolated across the seam

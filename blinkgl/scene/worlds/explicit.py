@@ -25,7 +25,8 @@ from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
-from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset
+from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset, sides_of
+from blinkgl.scene.importing.polygons import texture_of
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.curves import path_along_curve
@@ -33,16 +34,17 @@ from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath, smoothed
 from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.motion.trajectories import look_rotation
-from blinkgl.scene.reading import contents
+from blinkgl.scene.reading import contents, existing
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.sweep import gait
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Gloss, Map, Mask, Material, Mesh, Part, Scene, SceneObject, Texture
-from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
+from blinkgl.types.poses import pose_of
 
+_IMAGE = "an image file"
 _PROCEDURAL_SIZE = 1024
 # A camera (OpenCV axes) that looks along the world's +x with z up.
 _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
@@ -136,8 +138,7 @@ def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: 
     parts = []
     for part in asset.parts:
         worn = part.material if material is None else material
-        sides = part.material.both_sides  # of a file, or None
-        sides = sides if sides is None or config.both_sides is None else config.both_sides
+        sides = sides_of(part.material, config.both_sides)
         if material is not None and material.both_sides is not None:
             sides = material.both_sides
         worn = replace(worn, unlit=worn.unlit or config.light.unlit, both_sides=sides)
@@ -155,7 +156,7 @@ def _object_path(
     way = item.way
     if way is None:
         return motion_path(item, t0_ns, t1_ns, where, base, log=log)
-    speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
+    speed = way.speed or gait(parts)[1] or 1.0
     form = {"closed": way.closed, "level": way.level, "start": way.start}
     return path_along_curve(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
 
@@ -188,12 +189,11 @@ def trajectory_path(
     body."""
     from blinkgl.io.trajectories import PoseFile, read_trajectory
 
-    file = resolve(config.file, base)
-    if not file.is_file():
-        raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a trajectory")
+    file = existing(config.file, base, f"{where}.file", "a trajectory")
     form = None if config.form == "auto" else config.form
     declared = PoseFile(form, config.columns, config.time_unit, config.maps_from, config.axes, config.rate)
     t_ns, poses = read_trajectory(file, declared, log)
+    # From the file's clock to the scene's.
     t_ns = t_ns - (t_ns[0] - t0_ns if config.start is None else round(config.start * 1e9))
     if t_ns[0] > t0_ns or t_ns[-1] < t1_ns:
         raise ConfigError(
@@ -239,10 +239,7 @@ def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
 
     if not isinstance(given, str):
         return rigid_matrix(given)
-    file = resolve(given, base)
-    if not file.is_file():
-        raise ConfigError("no such file", where=f"{where}.T_body_sensor", value=given, accepted="EuRoC's sensor.yaml")
-    return read_place_on_body(file)
+    return read_place_on_body(existing(given, base, f"{where}.T_body_sensor", "EuRoC's sensor.yaml"))
 
 
 _BEYOND = 8
@@ -258,18 +255,16 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
     up.
     look_at : a camera's z axis (x level), an object's x axis (y level) points there.
     """
-    T = np.eye(4)
-    T[:3, 3] = config.position
     if config.look_at is not None:
         R = look_rotation(np.subtract(config.look_at, config.position))
-        T[:3, :3] = R if camera else np.column_stack([R[:, 2], -R[:, 0], -R[:, 1]])
+        axes = R if camera else np.column_stack([R[:, 2], -R[:, 0], -R[:, 1]])
     elif config.quaternion is not None:
         w, x, y, z = config.quaternion
-        T[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+        axes = Rotation.from_quat([x, y, z, w]).as_matrix()
     else:
         turn = Rotation.from_euler("xyz", config.euler or (0, 0, 0), degrees=True)
-        T[:3, :3] = (turn * _LEVEL_CAMERA if camera else turn).as_matrix()
-    return T
+        axes = (turn * _LEVEL_CAMERA if camera else turn).as_matrix()
+    return pose_of(config.position, axes)
 
 
 def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
@@ -309,12 +304,8 @@ def _asset(
         wears = own_materials and name not in memory and config.primitive in COATS
         material = Material(coat(config.primitive, config.parameters.get("coat", 0))) if wears else Material()
         return Asset(name, mesh.source_hash, (Part(mesh, material),))
-    where = f"scene.meshes.{name}"
-    path = resolve(config.file, base)
-    if not path.is_file():
-        raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
     return load_asset(
-        path,
+        existing(config.file, base, f"scene.meshes.{name}.file", "a mesh file"),
         max_faces=max_faces,
         uv_size=config.uv_size,
         keep_materials=own_materials,
@@ -331,7 +322,7 @@ def _material(
     maps: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> Material:
     if config.texture is not None:
-        texture = _texture(resolve(config.texture, base), config.max_size, f"{where}.texture", config.texture)
+        texture = texture_of(existing(config.texture, base, f"{where}.texture", _IMAGE), config.max_size)
     elif config.procedural is not None:
         texture = procedural_texture(config.procedural, config.seed, min(config.max_size, _PROCEDURAL_SIZE))
     elif config.photograph is not None:
@@ -343,7 +334,8 @@ def _material(
                 value=config.photograph,
                 accepted="one of: " + ", ".join(bundled) if bundled else f"run {install('scikit-image')}",
             )
-        texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
+        texture = texture_of(bundled[config.photograph], config.max_size)
+    # glTF's convention: green is roughness, blue is metallic, each times the material's number.
     rough = _map(config, "metallic_roughness_map", base, where, maps)
     shines = config.metallic > 0 or config.roughness < 1 or rough is not None
     plain = texture, config.color, config.uv_scale, config.unlit, config.both_sides
@@ -365,7 +357,7 @@ def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping
     given = getattr(config, key)
     if given is None:
         return None
-    data = _image(resolve(given, base), f"{where}.{key}", given)
+    data = contents(existing(given, base, f"{where}.{key}", _IMAGE), "image")
     decode = decode_image if key == "emission_map" else decode_numbers
     pixels = decode(data, config.max_size, f"{where}.{key}: {given}")
     return Map(Texture(pixels, Path(given).name, content_hash(data)))
@@ -377,7 +369,7 @@ def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.
     if alpha is None and config.mask is None:
         return None
     if alpha is None:
-        data = _image(resolve(config.mask, base), f"{where}.mask", config.mask)
+        data = contents(existing(config.mask, base, f"{where}.mask", _IMAGE), "image")
         said = f"{where}.mask: {config.mask}"
         alpha = decode_alpha(data, config.max_size, said)
         if alpha is None:
@@ -390,14 +382,3 @@ def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.
             accepted=f"a mask with a value above it; the largest value is {alpha.max() / 255:.3g}",
         )
     return Mask(alpha, cutoff=config.cutoff) if alpha.min() < 255 * config.cutoff else None
-
-
-def _image(path: Path, where: str, given: str) -> bytes:
-    if not path.is_file():
-        raise ConfigError("no such file", where=where, value=given, accepted="an image file")
-    return contents(path, "image")
-
-
-def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
-    data = _image(path, where, given)
-    return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

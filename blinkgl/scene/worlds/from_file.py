@@ -25,22 +25,20 @@ from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import AffinePath, StaticPath, nearest_rotation
 from blinkgl.scene.motion.pose_path import PosePath
-from blinkgl.scene.reading import reading
+from blinkgl.scene.reading import existing, reading
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Light, Part, Scene, SceneObject
 from blinkgl.scene.worlds.explicit import motion_path
-from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.sky import with_environment
+from blinkgl.types.poses import pose_of
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
 
 
 def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path) -> Scene:
     """Return the scene of ``scene: {kind: file}``."""
-    path = resolve(config.path, base)
-    if not path.is_file():
-        raise ConfigError("no such file", where="scene.path", value=config.path, accepted="a gltf or glb file")
+    path = existing(config.path, base, "scene.path", "a gltf or glb file")
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise ConfigError("not a glTF scene", where="scene.path", value=config.path, accepted="a .gltf or .glb file")
     camera_path = (
@@ -167,10 +165,7 @@ def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(matrix).all():
         raise AssetError("a node's transform is not finite", where="scene", value=matrix.tolist())
     rotation = nearest_rotation(linear)
-    T, A = np.eye(4), np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation, matrix[:3, 3]
-    A[:3, :3] = rotation.T @ linear
-    return T, A
+    return pose_of(matrix[:3, 3], rotation), pose_of(axes=rotation.T @ linear)
 
 
 def _parts(
@@ -241,6 +236,7 @@ def _with_lights(
     found = document.lights()
     if not found:
         raise ConfigError("the file has no lights", where="scene.lights", value="file", accepted="config")
+    # The configuration's own lamps come first; of the file's, the brightest fill the rest.
     room = MAX_LAMPS - len(light.lamps)
     kept = sorted(found, key=lambda node: -found[node]["intensity"] * max(found[node]["color"]))[:room]
     if len(found) > room:
@@ -266,6 +262,7 @@ def _camera_node(document: gltf.Document, name: str | int | None) -> int:
                 where=document.where,
                 value=n.camera,
             )
+        # A camera may be asked for by its own name or its node's; the first of several wins.
         names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
         names.setdefault(n.name, i)
     order = list(found)

@@ -21,7 +21,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.machine.extras import install
 from blinkgl.scene.geometry.random_primitives import random_primitive, random_primitive_hash
 from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
-from blinkgl.scene.reading import MAX_BYTES, contents
+from blinkgl.scene.reading import MAX_BYTES, contents, resolve
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
@@ -244,12 +244,6 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
 def _same_content(entry: Entry, found: str) -> None:
     if found != entry.source_hash:
         raise ChangedAsset(entry.file)
-
-
-def resolve(path: str, base: Path) -> Path:
-    """Return a path of the YAML: ``~`` expanded, relative to the YAML file's folder."""
-    path = Path(path).expanduser()
-    return path if path.is_absolute() else base / path
 
 
 def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str) -> list[Path]:

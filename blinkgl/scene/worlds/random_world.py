@@ -27,7 +27,7 @@ from blinkgl.rng import Role, generator
 from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import grid
-from blinkgl.scene.importing.mesh_files import Asset
+from blinkgl.scene.importing.mesh_files import Asset, sides_of
 from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
 from blinkgl.scene.motion.body_shapes import Barrier
 from blinkgl.scene.motion.collision import resolve_collisions
@@ -42,6 +42,7 @@ from blinkgl.scene.surfaces.images import SKY_SIDES
 from blinkgl.scene.types import Lamp, Light, Material, Mesh, Part, Scene, SceneObject
 from blinkgl.scene.worlds.pool import Pool, object_pool, texture_pool
 from blinkgl.scene.worlds.sky import Panorama, drawn_panorama, panorama_light, panorama_sky, sky_box
+from blinkgl.types.poses import pose_of
 
 _PLACEMENTS = 300  # positions tried for an object before it is left out
 _CAMERA_PATHS = 6  # camera paths tried until one is free of collisions; the last is cut at its collision
@@ -76,7 +77,7 @@ def random_world(
     dice = rng, rng_texture, rng_shape
     placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
     # Objects with their own motion are not thrown.
-    lifeless = [one.name for one in placed if _gait(one.parts)[0] == "free"]
+    lifeless = [one.name for one in placed if gait(one.parts)[0] == "free"]
     bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
     room = _Room(config, floor, placed, T_cam, clearance)
     for k, one in enumerate(placed):
@@ -94,6 +95,7 @@ def random_world(
         random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, room.for_camera(), clearance, target, T_cam)
         for _ in range(_CAMERA_PATHS)
     )
+    # Bodies of the engine are left to it: their collisions are its own.
     kept, camera_path = _resolved(scene_objects, set(bodies), camera_paths, clearance, t0_ns, t1_ns, log)
     kept, dynamics = _fallen(config, kept, bodies, (camera_path, clearance), floor, t0_ns, t1_ns, log)
     return Scene(
@@ -162,21 +164,21 @@ def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
     backdrop, panorama = [], None
     if config.sky:
         parts, panorama = _sky(config.sky, textures, rng_texture, split, base, log)
-        backdrop.append(("sky", "sky", parts, _shift(floor)))
+        backdrop.append(("sky", "sky", parts, pose_of((0, 0, floor))))
     if config.ground:
         size = config.ground.size or (config.sky.size if config.sky else 4 * config.region.width)
         mesh = grid(width=size, depth=size, subdivisions=config.ground.subdivisions)
         repeats = size / _log_uniform(rng_texture, config.ground.tile)
         texture = textures.draw(rng_texture, split, log)
         material = Material(texture, uv_scale=(repeats, repeats), unlit=config.light.unlit)
-        backdrop.append(("ground", "ground", (Part(mesh, material),), _shift(floor)))
+        backdrop.append(("ground", "ground", (Part(mesh, material),), pose_of((0, 0, floor))))
     rng.permutation(4)  # was used by removed walls; kept so that later draws stay the same
     return backdrop, panorama
 
 
 def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng, t0_ns: int, t1_ns: int) -> PosePath:
     """Return a random path or, for an object with its own motion, a way at the speed of its steps."""
-    locomotion, speed = _gait(one.parts)
+    locomotion, speed = gait(one.parts)
     if locomotion == "free" or (locomotion == "level" and speed == 0):
         turns = one.resting or locomotion == "level"
         return random_path(rng, t0_ns, t1_ns, config.object_motion, space, one.radius, one.pose, on_ground=turns)
@@ -258,9 +260,7 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
         rng.uniform(low, min(high, config.region.height)),
     ]
     target = np.array([*rng.uniform(-0.2, 0.2, 2) * half, floor + rng.uniform(0.05, 0.3) * config.region.height])
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = look_rotation(target - position), position
-    return T, target
+    return pose_of(position, look_rotation(target - position)), target
 
 
 def _place(
@@ -279,7 +279,7 @@ def _place(
         asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
         resting = config.ground is not None and rng.random() >= settings.flying
-        locomotion, _ = _gait(asset.parts)
+        locomotion, _ = gait(asset.parts)
         if locomotion == "free":
             rotation = _rotation(rng, resting)
         else:
@@ -307,10 +307,8 @@ def _place(
                 f"object {k} ({asset.name}, radius {radius:.2f} m) left out: no free place in {_PLACEMENTS} tries"
             )
             continue
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation, position
         centres[taken], radii[taken] = position, radius
-        placed.append(_Placed(f"{asset.name}#{k}", parts, T, radius, resting))
+        placed.append(_Placed(f"{asset.name}#{k}", parts, pose_of(position, rotation), radius, resting))
         log.extend(f"{asset.name}#{k} {text}" for text in (said, word) if text)
         log.extend(line for line in asset.log if line not in log)
         omissions.update(dict.fromkeys(asset.omissions))
@@ -365,10 +363,6 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     return T_cam[:3, 3] + ray / math.sqrt(ray @ ray) * _log_uniform(rng, config.objects.distance)
 
 
-def _gait(parts: Iterable[Part]) -> tuple[str, float]:
-    return gait(part.mesh for part in parts)
-
-
 def _rotation(rng, resting: bool) -> np.ndarray:
     """Return (3, 3). Flying: uniform over rotations. Resting: any heading, upright or, for three in ten, lying on its
     side."""
@@ -382,6 +376,7 @@ def _rotation(rng, resting: bool) -> np.ndarray:
 def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]:
     """Return the asset at its size, with its own materials or a random texture and tint."""
     tint = 1 - config.objects.tint * rng.random(3)
+    # Drawn for every object, worn or not, so that a file's materials change no later draw.
     repeats = _log_uniform(rng, config.objects.texture_scale)
     parts = []
     texture = None if asset.has_materials else textures.draw(rng, split, log)
@@ -391,8 +386,7 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
             material = replace(
                 material, texture=texture, base_color=tuple(float(c) for c in tint), uv_scale=(repeats, repeats)
             )
-        sides = material.both_sides  # of a file, or None
-        sides = sides if sides is None or config.both_sides is None else config.both_sides
+        sides = sides_of(material, config.both_sides)
         material = replace(material, unlit=material.unlit or config.light.unlit, both_sides=sides)
         parts.append(Part(scale_mesh(part.mesh, radius), material))
     return tuple(parts)
@@ -402,6 +396,7 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
     """Return the falling objects by name. The same number of values is drawn for each object, falling or not."""
     found = {}
     for name in names if config is not None else ():
+        # All numbers of a body are drawn whether it falls or not: a changed share leaves the others' as they are.
         falls, thrown, around, axis = rng.random(), rng.random(), rng.uniform(0, 2 * math.pi), rng.normal(size=3)
         elevation, speed, spin = rng.uniform(0, math.pi / 3), rng.uniform(*config.speed), rng.uniform(*config.spin)
         density, friction = _log_uniform(rng, config.density), rng.uniform(*config.friction)
@@ -446,12 +441,6 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tupl
     else:
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
     return sky_box(config.size, config.subdivisions, images, brightness, repeats), None
-
-
-def _shift(z: float) -> np.ndarray:
-    T = np.eye(4)
-    T[2, 3] = z
-    return T
 
 
 def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:

@@ -15,7 +15,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.primitives import parameter_hash, square
 from blinkgl.scene.lights import lit_by
 from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.reading import contents
+from blinkgl.scene.reading import contents, existing, resolve
 from blinkgl.scene.surfaces.environment import environment, turned
 from blinkgl.scene.surfaces.images import (
     IMAGE_SUFFIXES,
@@ -27,7 +27,7 @@ from blinkgl.scene.surfaces.images import (
     shrink,
 )
 from blinkgl.scene.types import FARTHEST, Light, Material, Mesh, Part, SceneObject, Texture
-from blinkgl.scene.worlds.pool import files_below, resolve, split_of
+from blinkgl.scene.worlds.pool import files_below, split_of
 
 _MARGIN = 1 / 16
 PANORAMA_INSET = 1 / (1 + _MARGIN)
@@ -66,6 +66,7 @@ def panorama_sky(textures: Sequence[Texture], brightness: float) -> tuple[Part, 
 
 def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture]:
     """Return six textures of an equirectangular image, for :func:`panorama_sky`."""
+    # A quarter of the panorama's width for 90 degrees keeps its resolution at the horizon.
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _MARGIN)
     return [
         Texture(side, f"{name} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)
@@ -88,13 +89,12 @@ def with_environment(
     if config is None:
         return light, objects
     where = "scene.light.environment.map"
-    file = resolve(config.map, base)
-    if not file.is_file():
-        raise ConfigError("no such file", where=where, value=config.map, accepted="an equirectangular image")
+    file = existing(config.map, base, where, "an equirectangular image")
     angle = np.radians(config.heading)
     light = panorama_light(file, angle, config.strength, light, f"{where}: {config.map}")
     if config.visible:
         image = shrink(load_image(file), 4096)
+        # A panorama's columns are azimuth, so turning it about z moves them; it decreases to the right.
         image = np.roll(image, -round(config.heading / 360 * image.shape[1]), axis=1)
         textures = panorama_textures(image, file.stem, content_hash(contents(file, "image"), repr(config).encode()))
         parts = panorama_sky(textures, config.strength)
@@ -128,6 +128,7 @@ def drawn_panorama(
                 accepted="an equirectangular image or a folder of them",
             )
         files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
+    # By content: neither names, copies nor the order of a folder change what is drawn.
     hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
     mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
     if not mine:

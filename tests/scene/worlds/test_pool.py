@@ -174,10 +174,10 @@ def write_billion_vertices(path):
     path.write_text(path.read_text().replace("vertex 3\n", "vertex 999999999\n").replace("face 1000000000", "face 1"))
 
 
-def write_billion_glb(path):
+def write_billion_glb(path, accessor=1, count=3_000_000_000):
     builder = GltfBuilder()
     builder.node(mesh=triangle(builder))
-    builder.tree["accessors"][1]["count"] = 3_000_000_000
+    builder.tree["accessors"][accessor]["count"] = count
     path.write_bytes(builder.glb())
 
 
@@ -202,10 +202,7 @@ def write_truncated_glb(path):
 
 
 def write_short_accessor(path):
-    builder = GltfBuilder()
-    builder.node(mesh=triangle(builder))
-    builder.tree["accessors"][0]["count"] = 30
-    path.write_bytes(builder.glb())
+    write_billion_glb(path, 0, 30)
 
 
 def write_bad_index(path):

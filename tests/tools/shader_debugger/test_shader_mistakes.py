@@ -36,6 +36,9 @@ class Judge:
     def found(self, folder: Path | None = None) -> dict:
         """The verdict on the shaders of a folder, up to the first buffer that is wrong; None: on those that ship."""
         self.renderer.gl.make_current()
+        # OpenGL's objects outlive Python's: the programs of the judge before would stay until the context ends.
+        if self.renderer.gl.shaders is not self.shipped:
+            self.renderer.gl.shaders.clear()
         self.renderer.use_shaders(ShaderLoader(self.renderer.gl.ctx, folder) if folder else self.shipped)
         gpu = moments.GpuMoment(self.renderer, self.when)
         comparison = compare.Comparison(gpu, self.reference)

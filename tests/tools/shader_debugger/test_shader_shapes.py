@@ -228,6 +228,7 @@ class Judge:
             return []
         finally:
             self.renderer.use_shaders(ours)
+            loader.clear()  # OpenGL's objects outlive Python's
 
 
 @pytest.fixture(scope="module")

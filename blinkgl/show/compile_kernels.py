@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import tempfile
 import time
@@ -54,8 +55,10 @@ def _of_an_emulator(emulator: str) -> None:
 
 
 def _of_a_sequence() -> None:
-    """Compile the kernels of paths, occlusion and preview."""
+    """Compile the kernels of paths, occlusion and, where PyAV can write one, preview."""
     small = {
+        "output": {"compression": "gzip"},
+        "preview": {"enabled": _installed("av")},
         "camera": {"width": 64, "height": 48},
         "time": {"duration": 0.02, "label_rate": 50},
         "labels": {"flow": ["forward", "backward"]},
@@ -68,6 +71,14 @@ def _of_a_sequence() -> None:
                 pass
         except GLError:
             pass  # `blinkgl doctor` reports what is missing
+
+
+def _installed(module: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        return False
+    return True
 
 
 if __name__ == "__main__":

@@ -311,7 +311,7 @@ def resume_run(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema)
         raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
     state = read_state(folder)
     saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
-    saved = {**_OTHER, **saved}
+    saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
     for path in sorted({*saved, *now}):
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
         if not free and saved.get(path) != now.get(path):

@@ -214,10 +214,19 @@ class SourceConfig(Config):
     recipe: str | None = Field(
         None, description="YAML file of `blinkgl generate`, instead of a folder; relative to the YAML file"
     )
-    online: bool = Field(False, description="render the recipe's sequences during training; no sample is repeated")
+    online: bool = Field(
+        False, description="render the recipe's sequences during training; no sample is repeated (but see uses)"
+    )
     set: tuple[str, ...] = Field((), description="overrides of the recipe, as `a.b=c`")
     workers: int = Field(1, ge=0, le=256, description="rendering processes; 0: render in the training process")
     samples: int = Field(8, ge=1, le=1000, description="windows per sequence, each with its own flow")
+    uses: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="times that each rendered sample is used, hundreds of samples apart and each time augmented "
+        "otherwise, where rendering is slower than training",
+    )
     window_ms: tuple[float, float] | None = Field(
         None,
         description="window lengths, [shortest, longest], log-uniform; null: the recipe's label interval",

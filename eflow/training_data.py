@@ -37,7 +37,11 @@ def training_sets(
 
             first = mixture.first(k, start * data.batch, rank, world)
             seed = derived_seed(config.seed, f"rank {rank}") if rank else config.seed
-            sources[k] = stack.enter_context(open_online(s, seed, first=first, batch=data.batch // world))
+            batch = data.batch // world
+            # Each loader process has four batches in hand (dataset.batches), and one is collected.
+            loaded = 4 * (data.workers + 1) * batch // s.uses
+            source = open_online(s, seed, first=first, batch=batch, loaded=loaded)
+            sources[k] = stack.enter_context(source)
     return mixture, [sources[k] for k in range(len(data.train))]
 
 

@@ -26,7 +26,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -97,14 +97,19 @@ def assets(folder: Path) -> None:
     shutil.copytree(str(resources.files("blinkgl.configs") / "scenes"), folder / "configs" / "scenes")
 
 
-def generated(name: str, scratch: Path) -> Path:
-    """Generate the case ``name`` and return the folder of the data set."""
+def recipe_of(name: str, scratch: Path) -> Path:
+    """Write the recipe of the case ``name`` beside its assets and return its path."""
     recipe = scratch / "recipe.yaml"
     case, base = table()["cases"][name], table()["base"]
     if "from" in case.get("scene", {}):  # a whole scene: nothing of the base's is laid over it
         base = {key: value for key, value in base.items() if key != "scene"}
     recipe.write_text(to_yaml(merge(base, case)), encoding="utf-8")
-    for _ in generate_run(load_run(recipe), scratch / "out"):
+    return recipe
+
+
+def generated(name: str, scratch: Path, overrides: Sequence[str] = ()) -> Path:
+    """Generate the case ``name`` and return the folder of the data set."""
+    for _ in generate_run(load_run(recipe_of(name, scratch), overrides), scratch / "out"):
         pass
     return scratch / "out"
 

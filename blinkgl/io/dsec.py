@@ -17,13 +17,22 @@ from pathlib import Path
 from typing import NoReturn
 
 import h5py
-import hdf5plugin
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import MAX_SIDE, CheckedWriter, check_events, check_size, events_of
-from blinkgl.io.hdf5 import Blocks, attribute, dataset, growing_dataset, hdf5_errors, open_hdf5, packing, write_rows
+from blinkgl.io.hdf5 import (
+    SHUFFLE,
+    Blocks,
+    attribute,
+    dataset,
+    growing_dataset,
+    hdf5_errors,
+    open_hdf5,
+    packing,
+    write_rows,
+)
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
@@ -337,7 +346,7 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: s
     loaders such as E-RAFT's require the file. codec : "gzip", which h5py alone reads, or another, which is Blosc's
     zstd."""
     with output_errors(path), h5py.File(path, "w") as file:
-        packed = packing("gzip" if codec == "gzip" else "zstd", hdf5plugin.Blosc.SHUFFLE)
+        packed = packing("gzip" if codec == "gzip" else "zstd", SHUFFLE)
         file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False, **packed)
 
 

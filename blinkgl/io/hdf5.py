@@ -17,16 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import hdf5plugin
 import numpy as np
 from numpy.typing import DTypeLike
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, ConfigError
 
 _MAX_CHUNK_BYTES = 1 << 28
 """HDF5 unpacks a whole chunk, even for a small part of it."""
 
-_LEVEL, _BIT_SHUFFLE = 1, hdf5plugin.Blosc.BITSHUFFLE
+_LEVEL, SHUFFLE, _BIT_SHUFFLE = 1, 1, 2
+"""Blosc's numbers, which hdf5plugin has, too; that is imported only where a filter of its is used."""
 CODECS = {"zstd": 5, "lz4": 1}
 """Blosc's codecs -> their numbers in the filter's parameters."""
 _NAMES = {number: name.encode() for name, number in CODECS.items()}
@@ -35,6 +35,8 @@ _BLOSC_VALUES = 4
 _FILTERS = {1: "gzip", 2: "shuffle", 32000: "lzf", 32001: "Blosc", 32004: "LZ4", 32015: "zstd"}
 """Filters that are run on files of strangers. Others that HDF5 or hdf5plugin know (szip, Fletcher32, SZ, ZFP …) end the
 process on a damaged chunk."""
+_BLOSC, _PLUGGED = 32001, frozenset((32001, 32004, 32015))
+"""Blosc, and all filters that hdf5plugin brings."""
 _ECF = 0x8ECF
 """Prophesee's filter."""
 
@@ -80,6 +82,9 @@ def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
     if h5py.h5o.get_info(root, name).type != h5py.h5o.TYPE_DATASET:
         return None
     layout = h5py.h5d.open(root, name).get_create_plist()
+    if any(layout.get_filter(k)[0] in _PLUGGED for k in range(layout.get_nfilters())):
+        with contextlib.suppress(ImportError):  # reading then says which filter is missing
+            _plugin()
     if layout.get_external_count():
         return "a data set with external storage"
     if layout.get_layout() == h5py.h5d.VIRTUAL:
@@ -150,7 +155,7 @@ def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
                 if code == _ECF
                 else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
             )
-        if code == hdf5plugin.Blosc.filter_id and len(values) < _BLOSC_VALUES:
+        if code == _BLOSC and len(values) < _BLOSC_VALUES:
             raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks data that Blosc needs", where=str(path))
     if found.chunks is None:
         # Compact data lie in the object's header and are always whole.
@@ -200,10 +205,17 @@ def growing_dataset(
 
 
 def packing(codec: str, shuffle: int) -> dict[str, Any]:
-    """Return the arguments of ``create_dataset`` for a codec of :func:`growing_dataset`.   shuffle : of Blosc."""
+    """Return the arguments of ``create_dataset`` for a codec of :func:`growing_dataset`.   shuffle : of Blosc.
+
+    Raises ConfigError: hdf5plugin is not installed, which gzip does not need."""
     if codec == "gzip":
         return {"compression": "gzip", "compression_opts": _LEVEL, "shuffle": True}
-    return {"compression": hdf5plugin.Blosc(cname=codec, clevel=_LEVEL, shuffle=shuffle)}
+    try:
+        blosc = _plugin().Blosc
+    except ImportError as error:
+        accepted = "use pip install hdf5plugin, or in a recipe output.compression: gzip"
+        raise ConfigError("no Blosc for HDF5", value=codec, accepted=accepted) from error
+    return {"compression": blosc(cname=codec, clevel=_LEVEL, shuffle=shuffle)}
 
 
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
@@ -302,4 +314,11 @@ def _compressed(array: np.ndarray, codec: bytes) -> bytes | None:
 @functools.cache
 def _blosc() -> ctypes.CDLL:
     """Return the C-Blosc that HDF5's own filter uses."""
-    return ctypes.CDLL(str(Path(hdf5plugin.PLUGIN_PATH) / "libh5blosc.so"))
+    return ctypes.CDLL(str(Path(_plugin().PLUGIN_PATH) / "libh5blosc.so"))
+
+
+def _plugin() -> Any:
+    """Return hdf5plugin, whose import makes its filters known to HDF5. Raises ImportError."""
+    import hdf5plugin
+
+    return hdf5plugin

@@ -123,17 +123,21 @@ class SampleStream(Closing):
     def take(self, n: int) -> Sample:
         """Wait for sample n and return it; it is removed."""
         sample = self.peek(n)
-        self._mark(*self._place(n))
+        self.drop(n)
         return sample
 
     def peek(self, n: int) -> Sample:
         """Wait for sample n and return it; it stays."""
         return read_sample(self._wait(n))
 
+    def drop(self, n: int) -> None:
+        """Remove sample n, which was peeked at."""
+        self._mark(*self._place(n))
+
     def move(self, n: int, to: Path) -> None:
         """Move sample n to the file ``to``, which must not exist; as :meth:`take`. Raises OSError."""
         shutil.copyfile(self._wait(n), to)
-        self._mark(*self._place(n))
+        self.drop(n)
 
     def _wait(self, n: int) -> Path:
         slot, item = self._place(n)

@@ -16,23 +16,36 @@ from blinkgl.online.stream import SampleStream
 from eflow.config import SourceConfig
 from eflow.data.window import RawSample, raw_sample
 
+LEAST_APART = 512
+"""Rendered samples between two uses of one, at least."""
+
 
 class OnlineSource(Closing):
     """An endless :class:`~eflow.data.sources.Source`. ``source[n]`` returns sample n once, in a loader process, too;
     :meth:`first` does not consume it.
 
+    uses, apart : where a rendered sample is used several times, each one that is new is followed by those that are
+    ``apart``, 2 · ``apart`` … older; at the beginning, where there are none yet, by any. It is kept for ``apart`` more
+    than its last use, since loader processes do not take samples in order.
     stats : :class:`blinkgl.online.StreamStats`."""
 
     endless = True
 
-    def __init__(self, stream: SampleStream):
+    def __init__(self, stream: SampleStream, uses: int = 1, apart: int = LEAST_APART):
+        self._uses, self._apart = uses, apart
         self.stream, self.stats, self.has_backward = stream, stream.stats, stream.has_backward
 
     def __len__(self) -> int:
         raise TypeError("an online source is endless")
 
     def __getitem__(self, n: int) -> RawSample:
-        return raw_sample(self.stream.take(n))
+        if self._uses == 1:
+            return raw_sample(self.stream.take(n))
+        newest, age = divmod(n, self._uses)
+        if age == 0 and (gone := newest - self._uses * self._apart) >= self.stream.first:
+            self.stream.drop(gone)
+        wanted = newest - age * self._apart
+        return raw_sample(self.stream.peek(wanted if wanted >= 0 else wanted % (newest + 1)))
 
     def first(self) -> RawSample:
         """Return the first sample of a training without consuming it."""
@@ -46,10 +59,13 @@ class OnlineSource(Closing):
         self.stream.close()
 
 
-def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int = 0, batch: int = 1) -> OnlineSource:
+def open_online(
+    s: SourceConfig, seed: int, *, split: str = "train", first: int = 0, batch: int = 1, loaded: int = 0
+) -> OnlineSource:
     """Open the source of ``{recipe: FILE, online: true, …}`` in an eflow configuration.
 
-    first : the first sample to take.   batch : samples taken together.
+    first : the first sample to take.   batch : samples taken together.   loaded : samples that loader processes may
+    take before their turn.
     Raises BlinkGLError: the recipe is bad, or cannot be rendered here."""
     template = load_run(s.recipe, s.set)
     template = load_run(s.recipe, s.set, seed=stream_seed(template.seed, seed))
@@ -65,10 +81,12 @@ def open_online(s: SourceConfig, seed: int, *, split: str = "train", first: int 
         split=split,
         seed=seed,
     )
+    apart = max(LEAST_APART, loaded)
+    kept = s.uses * apart if s.uses > 1 else 0
+    first, ahead = max(0, first // s.uses - kept), 1 + (batch + kept) // (MIX * s.samples)
     with placed(lambda where: f"{s.recipe}: {where}" if where else s.recipe):
-        return OnlineSource(
-            SampleStream.of(template, job, workers=s.workers, first=first, ahead=1 + batch // (MIX * s.samples))
-        )
+        stream = SampleStream.of(template, job, workers=s.workers, first=first, ahead=ahead)
+        return OnlineSource(stream, s.uses, apart)
 
 
 class Held:

@@ -46,6 +46,22 @@ def test_the_same_samples_whoever_renders_them_though_a_worker_is_killed(recipe)
     assert not spool.exists()
 
 
+def test_a_sample_is_used_again_and_again_far_apart_and_then_dropped(recipe, monkeypatch):
+    monkeypatch.setattr("eflow.data.online.LEAST_APART", 5)
+    uses, apart, whole = 3, 5, 2 * MIX * 2 + 8
+    with open_online(asked(recipe, window_ms=(5, 30)), 0) as source:
+        alone = [said(source[n]) for n in range(whole)]
+    with open_online(asked(recipe, window_ms=(5, 30), uses=uses), 0) as source:
+        seen = [alone.index(said(source[n])) for n in range(uses * whole)]
+        assert seen[::uses] == list(range(whole))
+        full = seen[uses * uses * apart :]  # from here on there are older ones of every age
+        assert [n - m for n, m in zip(np.repeat(full[::uses], uses), full)] == [0, apart, 2 * apart] * (len(full) // 3)
+        assert len(set(seen[: uses * apart])) == apart
+        with pytest.raises(EventDataError, match="taken"):
+            source[0]
+        assert source.stream.peek(whole - uses * apart)  # kept for one distance more than its last use
+
+
 def test_ranks_take_their_own_streams_one_sample_after_the_other():
     """Of a stream of its own each rank takes the samples 0, 1, 2 …; of a folder they share the order of one process."""
     mixture = Mixture([None, 10, None], [1.0, 0.3, 0.5], seed=3)
@@ -154,9 +170,11 @@ def run_file(folder: Path, *sets: dict, **keys) -> Path:
     return path
 
 
-def test_trains_without_files_and_resumes_exactly(tmp_path, recipe):
-    live = {"recipe": str(recipe), "online": True, "workers": 0, "samples": 2}
-    validate_on = [live]
+@pytest.mark.parametrize("uses", [1, 3])
+def test_trains_without_files_and_resumes_exactly(tmp_path, recipe, monkeypatch, uses):
+    monkeypatch.setattr("eflow.data.online.LEAST_APART", 1)
+    live = {"recipe": str(recipe), "online": True, "workers": 0, "samples": 2, "uses": uses}
+    validate_on = [{**live, "uses": 1}]
     config = load_train_config(run_file(tmp_path, live, validate_on=validate_on, validate_samples=3))
     train(config, tmp_path / "whole", quiet=True)
     train(config, tmp_path / "parts", stop_after=9, quiet=True)  # inside the second block
@@ -166,7 +184,7 @@ def test_trains_without_files_and_resumes_exactly(tmp_path, recipe):
     assert steps[0] == steps[1] and len(steps[0]) == 12
     assert [r["recipe/zero"] for r in logs[0] if r["kind"] == "validation"] == [logs[1][-1]["recipe/zero"]]
     last = logs[0][-2]
-    assert last["rendered"] >= 24 and last["render_ms"] > 0 and 0 < last["waited"] <= 1
+    assert last["rendered"] >= 24 // uses and last["render_ms"] > 0 and 0 < last["waited"] <= 1
     files = [sorted(p.name for p in newest(tmp_path / d).iterdir()) for d in ("whole", "parts")]
     assert files[0] == files[1]
 

@@ -23,7 +23,7 @@ from blinkgl.events.v2e import V2e  # noqa: E402
 from blinkgl.sequence_files.sequence_dir import read_manifest  # noqa: E402
 from blinkgl.tensors import emulator as devices  # noqa: E402
 from blinkgl.tensors.choice import make_on_device  # noqa: E402
-from same_events import assert_same  # noqa: E402
+from blinkgl.tools.same_events import assert_same  # noqa: E402
 from tests.tiny_recipe import TINY  # noqa: E402
 
 CARD, SOFTWARE = SimpleNamespace(is_software=False), SimpleNamespace(is_software=True)

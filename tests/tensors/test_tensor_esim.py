@@ -11,7 +11,7 @@ from blinkgl.errors import EventDataError  # noqa: E402
 from blinkgl.events.esim import Esim  # noqa: E402
 from blinkgl.events.v2e import V2e  # noqa: E402
 from blinkgl.tensors import TensorEsim, TensorV2e, batch  # noqa: E402
-from same_events import assert_same, compare  # noqa: E402
+from blinkgl.tools.same_events import assert_same, compare  # noqa: E402
 
 OPTIONS = {
     "defaults": {},

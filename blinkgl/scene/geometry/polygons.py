@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mapbox_earcut
 import numpy as np
 
 
@@ -57,6 +56,8 @@ def _fans(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def _ears(points: np.ndarray) -> np.ndarray:
     """Return (T, 3) indices of the triangles of one polygon, (n, 3), seen along the axis that is nearest its normal."""
+    import mapbox_earcut
+
     flat = points - points[0]
     normal = np.cross(flat[1:-1], flat[2:]).sum(axis=0)
     axis = int(np.abs(normal).argmax())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -16,13 +18,26 @@ def assert_same(ours: Events, theirs: Events, what: object) -> None:
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), (what, name)
 
 
-def compare(batch_kind, single_kind, config, height, width, envs, steps=7, seed=5, density=0.6, dtype_seed=0):
-    """Steps both and compares all events; returns how many there were.
+def compare(
+    batch_kind: Any,
+    single_kind: Any,
+    config: Any,
+    height: int,
+    width: int,
+    envs: int,
+    *,
+    steps: int = 7,
+    seed: int = 5,
+    density: float = 0.6,
+    frames_seed: int = 0,
+    device: str = "cpu",
+) -> int:
+    """Steps both and compares all events; returns how many there were. Raises AssertionError.
 
     Environments have intervals of their own, one of 5 s among them; the last begins anew in the middle, and the whole
     batch is saved and restored."""
-    rng = np.random.default_rng((dtype_seed, height, width, envs))
-    make = lambda: batch_kind(height, width, config, envs=envs, seed=seed)
+    rng = np.random.default_rng((frames_seed, height, width, envs))
+    make = lambda: batch_kind(height, width, config, envs=envs, seed=seed, device=device)
     batch = make()
     singles = [single_kind(height, width, config, s) for s in batch.seeds]
     t_ns, total = np.arange(envs) * 12_345 + 7, 0
@@ -40,7 +55,7 @@ def compare(batch_kind, single_kind, config, height, width, envs, steps=7, seed=
             state = batch.state_dict()
             batch = make()
             batch.load_state_dict(state)
-        chunks = batch.step(torch.from_numpy(frames), t_ns if n % 2 else t_ns.tolist()).numpy()
+        chunks = batch.step(torch.from_numpy(frames).to(device), t_ns if n % 2 else t_ns.tolist()).numpy()
         for k, single in enumerate(singles):
             events = single.step(frames[k], int(t_ns[k]))
             assert_same(chunks[k], events, (config, n, k))

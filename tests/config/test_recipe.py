@@ -55,7 +55,7 @@ def test_groups_share_what_they_do_not_say(tmp_path):
     assert len({c.events.cutoff_hz for c in configs.values()}) == 5, (
         "each sequence draws for itself, groups with seeds of their own"
     )
-    assert [t.name for t in Plan.of(load(tmp_path, TREE), num=1).tasks] == ["train/a_000000", "test/b_000000"]
+    assert [t.name for t in Plan.of(load(tmp_path, TREE), num=2).tasks] == ["train/a_000000", "test/b_000000"]
 
 
 def test_a_group_does_not_depend_on_the_others(tmp_path):
@@ -223,7 +223,7 @@ def test_a_scene_from_another_file(tmp_path):
 
 # --- Recipes of published training sets: what they draw, keys beside them, and that every value has a source.
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "sensors.md"
 
 
 def events_of(tmp_path, text, count=400):

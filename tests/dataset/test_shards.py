@@ -21,11 +21,8 @@ from runs import recipe_file
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
-    run_dataset(
-        load_run(recipe_file(folder, labels={"flow": ["forward"], "float_flow": ["npy"], "ids": True, "depth": True})),
-        folder / "out",
-        num=2,
-    )
+    labels = {"flow": ["forward"], "float_flow": ["npy"], "ids": True, "depth": True}
+    run_dataset(load_run(recipe_file(folder, labels=labels), ["groups.fly.output.sequences=2"]), folder / "out")
     return folder / "out"
 
 

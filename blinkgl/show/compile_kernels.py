@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import importlib
 import os
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from importlib.util import find_spec
 from multiprocessing import get_context
 
 import numpy as np
@@ -69,12 +69,20 @@ def _of_a_sequence() -> None:
     small = [
         *("camera.width=64", "camera.height=48", "time.duration=0.02", "time.label_rate=50"),
         *("labels.flow=[forward,backward]", "images={preset: raw, exposure_us: 2000}"),
-        *("output.compression=gzip", f"preview.enabled={str(find_spec('av') is not None).lower()}"),
+        *("output.compression=gzip", f"preview.enabled={str(_installed('av')).lower()}"),
     ]
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(GLError):  # `blinkgl doctor` says what is missing
         for name in ("demo", "dancers", "flexible"):
             for _ in generate_run(load_run(name, small), f"{folder}/{name}", num=1):
                 pass
+
+
+def _installed(module: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        return False
+    return True
 
 
 def _of_files() -> None:

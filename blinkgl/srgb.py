@@ -12,7 +12,8 @@ def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
     """Return the linear light of sRGB values in [0, 1]. Any shape; float64 stays float64, all others become float32."""
     x = _floating(encoded)
     one = x.dtype.type
-    return np.where(x <= one(0.04045), x / one(12.92), np.power((np.maximum(x, 0) + one(0.055)) / one(1.055), one(2.4)))
+    curve = np.power((np.maximum(x, 0) + one(0.055)) / one(1.055), one(2.4))
+    return np.where(x <= one(0.04045), x / one(12.92), curve).astype(one, copy=False)  # NumPy 1 promotes single values
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
@@ -21,7 +22,8 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     x = _floating(linear)
     one = x.dtype.type
     x = np.clip(np.nan_to_num(x, nan=0.0), 0, 1)
-    return np.where(x <= one(0.0031308), x * one(12.92), one(1.055) * np.power(x, one(1 / 2.4)) - one(0.055))
+    curve = one(1.055) * np.power(x, one(1 / 2.4)) - one(0.055)
+    return np.where(x <= one(0.0031308), x * one(12.92), curve).astype(one, copy=False)
 
 
 def to_srgb8(linear: np.ndarray) -> np.ndarray:

@@ -318,8 +318,8 @@ def import_(
     checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
 ) -> None:
-    """Convert a published checkpoint of E-RAFT to one of eflow. predict, evaluate, submit and train (init_from) read
-    it. Only tensors are read. The file also stores E-RAFT's padding, border and time bins."""
+    """Convert a published checkpoint of E-RAFT. The commands predict, evaluate, submit and train (init_from) read the
+    new file. Only tensors are read. The file also stores E-RAFT's padding, border and time bins."""
     from eflow.models import parameters_of
     from eflow.published import import_published
 

@@ -513,9 +513,8 @@ def test_an_inertial_stream_without_samples():
     "name", ["fletcher32_1byte_sigsegv.h5", "sz3_sigsegv.h5", "sz_sigsegv.h5", "szip_block0_sigfpe.h5"]
 )
 def test_filters_that_would_end_the_process_are_not_run(name):
-    with pytest.raises(
-        AssetError, match=r"packed by an HDF5 filter that is not run here .*expected gzip, shuffle, lzf"
-    ):
+    refused = r"packed by an HDF5 filter that is not run here .*expected gzip, shuffle, lzf"
+    with pytest.raises(AssetError, match=f"{refused}|Unknown SZIP configuration"):  # the latter by h5py 3.12
         read(shared(f"field/attack/hdf5_filters/{name}"))
 
 

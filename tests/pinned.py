@@ -1,7 +1,7 @@
 """Tests of words that a library chooses run with the versions of constraints.txt, and skip with others."""
 
 import re
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
@@ -13,5 +13,9 @@ def only_with_pinned(*names: str) -> None:
     """Skip the test where one of these libraries has another version than the pinned one."""
     for name in names:
         pinned = re.search(rf"^{name}==(\S+)$", CONSTRAINTS, re.M)[1]
-        if version(name) != pinned:
-            pytest.skip(f"compares words of {name} {pinned}; {version(name)} is installed")
+        try:
+            found = version(name)
+        except PackageNotFoundError:  # typer may carry click inside
+            continue
+        if found != pinned:
+            pytest.skip(f"compares words of {name} {pinned}; {found} is installed")

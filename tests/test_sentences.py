@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from pinned import only_with_pinned
 from sentences import sentences
 

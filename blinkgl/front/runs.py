@@ -86,7 +86,7 @@ def generate(
 ) -> Outcome:
     """Make a data set in the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
-    source : :class:`Scene` or the result of :func:`load`.   num : number of sequences (of each group at most).
+    source : :class:`Scene` or the result of :func:`load`.   num : number of sequences, dealt over the recipe's groups.
     workers : processes; 1: this one.
     resume : continue where ``out`` contains sequences of this run.   settings : emulator, sensor, timeline, quality,
     labels, images, imu, tracks as of :func:`record`, rig as of :func:`record`.

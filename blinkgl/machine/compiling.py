@@ -52,7 +52,8 @@ class Watch:
             return False
         self.say("compiling kernels, once per machine and version: about a minute")
         self.start()
-        done = subprocess.run([sys.executable, "-m", _ALL_KERNELS], capture_output=True, text=True, check=False)
+        # -P: modules of the folder that the user stands in are not imported.
+        done = subprocess.run([sys.executable, "-P", "-m", _ALL_KERNELS], capture_output=True, text=True, check=False)
         self.end()
         for line in done.stdout.splitlines():
             self.say(line)

@@ -329,7 +329,8 @@ def _framed(sequence: SequenceView, window_us: int, film: str) -> str:
     middle_us = (sequence.start_us + sequence.end_us) // 2
     notes = [p.note for s in sequence.sensors for p in s.pictures(middle_us, window_us) if "flow" in p.heading]
     sensors = ", ".join(
-        f"{s.name} {s.source.width}x{s.source.height} px, {s.event_count:,} events" for s in sequence.sensors
+        f"{s.name} {s.source.width}x{s.source.height} px" + (f", {s.event_count:,} events" if s.event_count else "")
+        for s in sequence.sensors
     )
     return _SAVED.substitute(
         name=html.escape(printable(sequence.name)),

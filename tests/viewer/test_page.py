@@ -239,7 +239,7 @@ def test_a_saved_page_is_whole_and_asks_nobody(made, tmp_path, capsys):
     assert run(["view", str(made.root / "rig"), "--save", str(out)]) == 0
     text = out.read_text()
     assert "__VISER_EMBED_DATA__=" in text
-    words = ("<title>", "ON, brighter", "hue is direction", "ms in space", "full colour", "px, ", "events;")
+    words = ("<title>", "ON, brighter", "hue is direction", "ms in space", "full colour", " px, ", " events")
     assert [word for word in words if word not in text] == [], "title, units and legend"
     assert text.count("</script>") == 2, "viser's own page is inside, as text"
     assert not re.search(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=[\"']?(?:https?:)?//", text)

@@ -11,6 +11,7 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 
@@ -77,6 +78,10 @@ def _of_a_sequence() -> None:
                 pass
 
 
+_TEXT: Any = {"columns": "t,x,y,p", "time_unit": "s"}
+"""What a text does not say; it would be guessed, and said."""
+
+
 def _installed(module: str) -> bool:
     try:
         importlib.import_module(module)
@@ -91,9 +96,9 @@ def _of_files() -> None:
     events = Events(xy, xy, t, p)
     # Without Blosc or PyAV nothing of theirs is needed.
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(BlinkGLError):
-        for ending in (".raw", ".txt", ".csv", ".h5"):
+        for ending, declared in ((".raw", {}), (".txt", _TEXT), (".csv", _TEXT), (".h5", {})):
             write_events(f"{folder}/events{ending}", events, 8, 8)
-            read_events(f"{folder}/events{ending}")
+            read_events(f"{folder}/events{ending}", **declared)
         with VideoWriter(f"{folder}/video.mp4", 64, 64, 30.0) as video:
             for k in range(12):
                 video.write((127 + 90 * np.sin(np.indices((64, 64, 3)).sum(0) / 9 + k)).astype(np.uint8))

@@ -16,6 +16,7 @@ class Swinging:
     """A formula: every joint swings about an axis, the first one also slides and breathes."""
 
     period_ns = span_ns = 1_000_000_000
+    timescale_ns = 50_000_000
     is_static = False
 
     def __init__(self, count: int = 2, angle: float = 0.8):

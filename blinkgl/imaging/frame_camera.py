@@ -22,15 +22,9 @@ from blinkgl.imaging.sensor import encode, mosaic, readings
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.colour import LUMA
 from blinkgl.render.moment import View
-from blinkgl.timeline.sampling import largest_speed
 
 if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer
-
-SPEED_EVERY, SPEED_TIMES = 4, 3
-"""Sampling of the speeds that determine the number of instants: every n-th pixel, and this many times of the
-exposure."""
-
 
 LENS_SPACING = 2.0
 """Spacing of lens samples of out-of-focus points, in ``max_px``: one pixel by default, because each sample is a pixel's
@@ -43,7 +37,7 @@ class CameraImage:
 
     k : number, from 0.   start_ns, end_ns : from the first row's exposure to the end of the last one's.
     exposure_ns : of each row.   row_ns : between the starts of two rows.   gain : a factor.
-    instants : number of instants averaged.   step_px : largest motion between two, from the speeds at a few times.
+    instants : number of instants averaged.   step_px : largest motion between two.
     pictures : name -> codes, (H, W, 3) RGB or (H, W) of one colour per pixel, uint8 for 8 bits, else uint16: "images",
     the camera's output, and those of ``images.also``.   sensor : name of the camera; "" of a single one."""
 
@@ -165,9 +159,7 @@ class FrameCamera:
         """Return the mean over the exposure, (H, W, 3) float64, 1 being white; the number of instants; the largest
         motion between two of them, px."""
         config, draw = self.config, self.renderer
-        # At both ends and in the middle: a pose's speed changes little within an exposure.
-        times = np.linspace(exposure.start_ns, exposure.end_ns, SPEED_TIMES)
-        speed = max(largest_speed(draw.velocity(int(t), SPEED_EVERY).view()) for t in times)
+        speed = draw.motion.fastest(exposure.start_ns, exposure.end_ns, config.max_px)
         points = self._points_needed(exposure.middle_ns)
         count = instants(exposure, speed, config.max_px, points, config.max_instants)
         lens = config.lens if points > 1 else None

@@ -8,7 +8,7 @@ passes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +16,8 @@ import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.camera.drawing import seen_through
+from blinkgl.scene.motion import piecewise
+from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.types.recent import Recent
 
 if TYPE_CHECKING:
@@ -172,8 +174,13 @@ class Moment:
     @cached_property
     def rates(self) -> Rates:
         dT_world_obj = self._stage.bodies.rates(self.t_ns)
-        dT_cam_obj = cam_from_obj_rate(self.T_world_cam, self.dT_world_cam, self.T_world_obj, dT_world_obj)
-        return Rates(self.view.projection @ dT_cam_obj, dT_world_obj)
+        return Rates(self.view.projection @ self.dT_cam_obj, dT_world_obj)
+
+    @cached_property
+    def dT_cam_obj(self) -> np.ndarray:
+        """Return d(T_cam_obj)/dt, (n, 4, 4) float64, 1/s."""
+        dT_world_obj = self._stage.bodies.rates(self.t_ns)
+        return cam_from_obj_rate(self.T_world_cam, self.dT_world_cam, self.T_world_obj, dT_world_obj)
 
     @cached_property
     def centres(self) -> np.ndarray:
@@ -229,27 +236,61 @@ class Bodies:
     """Poses of a scene's objects, shared by all cameras; the last few times are kept."""
 
     def __init__(self, scene: Scene):
-        self.paths: list[PosePath] = [o.path for o in scene.objects]
-        self.moving = [i for i, path in enumerate(self.paths) if not path.is_static]
-        self._start = np.stack([p.pose(scene.t0_ns) for p in self.paths]) if self.paths else np.zeros((0, 4, 4))
+        paths = [o.path for o in scene.objects]
+        moving = [i for i, path in enumerate(paths) if not path.is_static]
+        # Piecewise cubic paths are evaluated together, others one by one.
+        self.cubic = Cubics({i: path for i in moving if isinstance(path := paths[i], KeyframePath)})
+        self.others: dict[int, PosePath] = {i: paths[i] for i in moving if not isinstance(paths[i], KeyframePath)}
+        self._start = np.stack([p.pose(scene.t0_ns) for p in paths]) if paths else np.zeros((0, 4, 4))
         self._poses: Recent[int, np.ndarray] = Recent(KEPT)
         self._rates: Recent[int, np.ndarray] = Recent(KEPT)
 
     def poses(self, t_ns: int) -> np.ndarray:
         """Return T_world_obj, (n, 4, 4) float64."""
-        return self._poses.of(t_ns, lambda: self._made(self._start, lambda path: path.pose(t_ns)))
+        return self._poses.of(t_ns, lambda: self._made(self._start.copy(), t_ns, self.cubic.poses, "pose"))
 
     def rates(self, t_ns: int) -> np.ndarray:
         """Return d(T_world_obj)/dt, (n, 4, 4) float64, 1/s."""
         start = np.zeros_like(self._start)
-        return self._rates.of(t_ns, lambda: self._made(start, lambda path: path.derivative(t_ns)))
+        return self._rates.of(t_ns, lambda: self._made(start, t_ns, self.cubic.derivatives, "derivative"))
 
-    def _made(self, start: np.ndarray, of: Callable[[PosePath], np.ndarray]) -> np.ndarray:
-        made = start.copy()
-        # Rows of objects that do not move keep the values in ``start``.
-        for i in self.moving:
-            made[i] = of(self.paths[i])
-        return made
+    def bounds(self, ta_ns: int, tb_ns: int) -> np.ndarray:
+        """Return (n, 4) float64 over [ta, tb]: ``speed_bound`` and ``unseen`` of each object's path."""
+        out = np.zeros((len(self._start), 4))
+        self.cubic.bounds(ta_ns, tb_ns, out)
+        for i, path in self.others.items():
+            out[i] = *path.speed_bound(ta_ns, tb_ns), *path.unseen(ta_ns, tb_ns)
+        return out
+
+    def _made(self, out: np.ndarray, t_ns: int, cubic: Callable[[int, np.ndarray], None], name: str) -> np.ndarray:
+        # Rows of objects that do not move keep their values.
+        cubic(t_ns, out)
+        for i, path in self.others.items():
+            out[i] = getattr(path, name)(t_ns)
+        return out
+
+
+class Cubics:
+    """Piecewise cubic paths, by row, evaluated in one call."""
+
+    def __init__(self, paths: Mapping[int, KeyframePath]):
+        self.rows = np.array(list(paths), np.int64)
+        coefficients = [path.coefficients for path in paths.values()]
+        self.first = np.cumsum([0, *(len(knots) for knots, *_ in coefficients)]).astype(np.int64)
+        # A path has one piece less than knots: an empty one is put behind each, so that both are numbered alike.
+        pad = lambda array: np.concatenate([array, np.zeros_like(array[:1])])
+        empty = np.zeros(0, np.int64), np.zeros((0, 4, 3)), np.zeros((0, 4, 3)), np.zeros((0, 3, 3))
+        padded = [empty, *((knots, pad(cp), pad(cr), pad(rot)) for knots, cp, cr, rot in coefficients)]
+        self.knots, self.cp, self.cr, self.rot = (np.concatenate(arrays) for arrays in zip(*padded, strict=True))
+
+    def poses(self, t_ns: int, out: np.ndarray) -> None:
+        piecewise.all_poses(int(t_ns), self.first, self.knots, self.cp, self.cr, self.rot, self.rows, out)
+
+    def derivatives(self, t_ns: int, out: np.ndarray) -> None:
+        piecewise.all_derivatives(int(t_ns), self.first, self.knots, self.cp, self.cr, self.rot, self.rows, out)
+
+    def bounds(self, ta_ns: int, tb_ns: int, out: np.ndarray) -> None:
+        piecewise.all_bounds(int(ta_ns), int(tb_ns), self.first, self.knots, self.cp, self.cr, self.rows, out)
 
 
 class Moments:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from blinkgl.render.frames import Frame
 from blinkgl.render.labels import DrawnLabel, Seen
 from blinkgl.render.lens import Lens
 from blinkgl.render.moment import Moment, Moments, View
+from blinkgl.render.motion import Motion
 from blinkgl.render.painter import Painter, RenderStats
 from blinkgl.render.passes import (
     Brightness,
@@ -137,6 +139,7 @@ class Renderer(Releasing):
         Earlier frames are not reused, and frames are drawn completely."""
         self.scene = self.scene.with_camera(camera)
         self._moments.look_through(camera)
+        self.motion.camera = camera
         self._labels = {}
         self.whole = True  # the static part of one picture is not valid for the other
         lens, new = self._painter.lens, Lens.of(self.gl, camera)
@@ -155,6 +158,11 @@ class Renderer(Releasing):
     def triangles(self) -> int:
         """Return the number of triangles of the whole scene, before culling."""
         return self._painter.resources.triangles
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Return the speeds of the scene in the camera's picture, which are computed without drawing."""
+        return Motion(self.scene, self.items, self._moments)
 
     def moment(self, t_ns: int) -> Moment:
         """Return the moment at t_ns, shared by all passes of that time."""

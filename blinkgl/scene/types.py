@@ -85,7 +85,8 @@ class Deformer(ABC):
     mirrors : whether the shape is a mirror image at some time (:meth:`side`).
 
     Config : its model in ``deform:``; None: none.   period_ns : period of the shape; None: not periodic.   span_ns :
-    time from 0 after which the shape no longer changes."""
+    time from 0 after which the shape no longer changes.   timescale_ns : time in which no velocity changes much, such
+    as a sixteenth of the shortest period; None: unknown, so that steps between frames are examined at all times."""
 
     glsl: ClassVar[str]
     source: ClassVar[str | None] = None
@@ -96,6 +97,7 @@ class Deformer(ABC):
     sizes: Mapping[str, int] = {}
     period_ns: int | None = None
     span_ns: int = 0
+    timescale_ns: int | None = None
     locomotion: str = "free"
     speed: float = 0.0
     mirrors: bool = False
@@ -134,6 +136,11 @@ class Deformer(ABC):
     @abstractmethod
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
         """Return directions of the normals, not normalised, (V, 3) float64."""
+
+    def of_vertices(self, vertices: np.ndarray) -> Deformer | None:
+        """Return the deformer of a mesh of some of the vertices, (n,) indices, in their order; None where it is not
+        known: a subclass with numbers for each vertex says it."""
+        return None if self.attributes or self.textures else self
 
     def transformed(self, matrix: np.ndarray) -> Deformer:
         """Return the deformer of the mesh under an affine (4, 4) map A: q_A(A p) = A q(p). Raises TypeError where that

@@ -6,13 +6,11 @@ the length of a sequence.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
-
-import numpy as np
-
-from blinkgl.machine.kernels import kernel
+from typing import Protocol
 
 NS_PER_S = 1_000_000_000
 _PROPOSED = 0.98
@@ -37,37 +35,51 @@ def uniform_times(fps: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
         yield t1_ns
 
 
-def displacement_times(
-    max_px: float, min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int, speed: Callable[[int], float]
-) -> Iterator[int]:
-    """Yield times with ``speed * step <= max_px`` at both ends of each step, steps within [min_step, max_step].
+SHOWN = 0.1
+"""Largest displacement, in steps' limits, that the speeds at both ends of a step may leave out."""
 
-    speed : t_ns -> largest image speed at that time, px/s."""
-    return bounded_times(lambda t_ns: speed(t_ns) / max_px, min_step_ns, max_step_ns, t0_ns, t1_ns)
+
+class Pace(Protocol):
+    """What limits the steps of a scene."""
+
+    def at(self, t_ns: int) -> float:
+        """Return the steps per second that the scene needs at a time."""
+
+    def hides(self, ta_ns: int, tb_ns: int, steps: float) -> bool:
+        """Return whether between two times it may need more steps per second, by more than ``steps``, than at both."""
+
+    def bend(self, ta_ns: int, tb_ns: int) -> float:
+        """Return how far the scene leaves a steady motion from one time to the other in between, in steps."""
+
+
+BEND = 0.1
+"""Largest value of :meth:`Pace.bend` of a step. Emulators take what is between two frames as a straight line, which
+cuts off the turning points of a motion to and fro."""
 
 
 def bounded_times(
-    pace: Callable[[int], float],
+    pace: Pace,
     min_step_ns: int,
     max_step_ns: int,
     t0_ns: int,
     t1_ns: int,
     stops_ns: Sequence[int] = (),
 ) -> Iterator[int]:
-    """Yield times with ``pace * step <= 1`` at both ends of each step, steps within [min_step, max_step].
+    """Yield times with ``pace * step <= 1`` everywhere in each step, steps within [min_step, max_step].
 
-    pace : t_ns -> steps per second that the scene needs at that time.
-    stops_ns : increasing times that no step may cross, such as impacts: a motion that reverses inside a step is
-        invisible at its ends. One that comes less than min_step after another, or before t1, is left out.
+    stops_ns : increasing times that no step may cross, such as impacts. One that comes less than min_step after
+        another, or before t1, is left out.
     The step is proposed from the pace at its start (as in Rebecq et al. 2018, section 3.2), or from the expected pace
-    at its end if the pace rises as over the last step. It is then checked against the pace at its end, which the
-    original does not do: a motion that accelerates inside the step would exceed the bound. A rejected step is shortened
-    and tried again. The pace at an accepted end is the next step's start, so there is one pace per frame if nothing is
-    rejected. The last step ends at t1 exactly; steps are shorter than min_step only there and before a stop.
+    at its end if the pace rises as over the last step. It is then checked against the pace at its end, and inside it
+    wherever the pace may be higher than at the times known so far (:func:`_holds_until`), which the original does not
+    do: a motion that accelerates, or goes to and fro, or passes through the picture inside the step would exceed the
+    bound. A rejected step is shortened and tried again. The pace at an accepted end is the next step's start, so there
+    is one pace per frame if nothing is rejected. The last step ends at t1 exactly; steps are shorter than min_step only
+    there and before a stop.
     """
     yield t0_ns
     t = t0_ns
-    v = v_before = pace(t)
+    v = v_before = pace.at(t)
     ends = deque(_apart(stops_ns, min_step_ns, t0_ns, t1_ns))
     while t < t1_ns:
         while ends and ends[0] <= t:
@@ -77,14 +89,46 @@ def bounded_times(
         expected = max(v, 2 * v - v_before)
         step = min(_step(_PROPOSED, expected, min_step_ns, max_step_ns), (ends[0] if ends else t1_ns) - t)
         while True:
-            end = t + step
-            v_end = pace(end)
-            if max(v, v_end) * step <= NS_PER_S * (1 + 1e-9) or step <= min_step_ns:
+            v_end = pace.at(t + step)
+            if step <= min_step_ns:
                 break
-            # 0.9: a step cut to exactly the limit of the end's pace is often rejected again.
-            step = max(min_step_ns, min(int(0.9 * step), _step(0.95, max(v, v_end), min_step_ns, max_step_ns)))
-        yield end
-        t, v_before, v = end, v, v_end
+            if max(v, v_end) * step > _LIMIT:
+                # 0.9: a step cut to exactly the limit of the end's pace is often rejected again.
+                step = max(min_step_ns, min(int(0.9 * step), _step(0.95, max(v, v_end), min_step_ns, max_step_ns)))
+                continue
+            holds = _holds_until(pace, t, t + step, min_step_ns)
+            if holds < t + step:
+                step = max(min_step_ns, holds - t)
+                continue
+            bend = pace.bend(t, t + step)
+            if bend <= BEND:
+                break
+            # It grows with the square of the step.
+            step = max(min_step_ns, int(step * max(0.5, 0.95 * math.sqrt(BEND / bend))))
+        yield t + step
+        t, v_before, v = t + step, v, v_end
+
+
+_LIMIT = NS_PER_S * (1 + 1e-9)
+
+
+def _holds_until(pace: Pace, t: int, end: int, min_step_ns: int) -> int:
+    """Return the end of the longest part of the step from t to ``end``, which holds at both, that holds everywhere.
+
+    Intervals are halved, the earliest first, until both ends of each show its pace, or it is min_step long."""
+    fastest, intervals = pace.at(t), [(t, end)]
+    while intervals:
+        a, b = intervals.pop()
+        if b - a > min_step_ns and pace.hides(a, b, SHOWN * NS_PER_S / (end - t)):
+            middle = (a + b) // 2
+            intervals += [(middle, b), (a, middle)]
+            continue
+        most = max(fastest, pace.at(b))
+        if most * (b - t) > _LIMIT:
+            # Up to a it holds, and until b nothing is faster than ``most``.
+            return min(b, max(a, t + int(0.95 / most * NS_PER_S)))
+        fastest = most
+    return end
 
 
 def _apart(stops_ns: Sequence[int], least_ns: int, t0_ns: int, t1_ns: int) -> Iterator[int]:
@@ -121,25 +165,3 @@ class Ticks:
             self._next_us += self._period_us
             count += 1
         return count
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Speed of the fastest pixel.
-
-
-@kernel
-def _largest_squared(velocity):
-    largest = np.float32(0.0)
-    for y in range(velocity.shape[0]):
-        for x in range(velocity.shape[1]):
-            # Compares squares and takes one root at the end; inf and NaN fail the comparison.
-            squared = velocity[y, x, 0] * velocity[y, x, 0] + velocity[y, x, 1] * velocity[y, x, 1]
-            if squared > largest and squared < np.float32(np.inf):
-                largest = squared
-    return largest
-
-
-def largest_speed(velocity: np.ndarray) -> float:
-    """Return the largest speed, px/s, of (H, W, 2) float32 px/s. Pixels without a finite velocity (a surface in the
-    camera plane) are left out."""
-    return float(np.sqrt(_largest_squared(velocity)))

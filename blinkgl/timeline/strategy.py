@@ -11,16 +11,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from blinkgl.config.timeline import TimelineConfig
 from blinkgl.events.response import Response
 from blinkgl.timeline.sampling import bounded_times, uniform_times
+from blinkgl.types.recent import Recent
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a timeline needs of a small picture: two numbers, a percentile and the maximum of what moves in it.
+# What the brightness timeline needs of a small picture: a percentile and the maximum of what changes in it.
 
 SLOWEST = np.float32(2.0**-40)
 """Values (px/s, or per second) below this, about 1e-12, count as still."""
@@ -43,13 +44,9 @@ class Ranked(NamedTuple):
 STILL = Ranked(0, 0.0, 0.0)
 
 
-def speeds(drawn: Drawn, percent: float) -> Ranked:
-    """Return the statistics of the lengths of (h, w, 2) float32 vectors."""
-    return ranked(np.linalg.norm(drawn.read(), axis=-1), percent)
-
-
 def speeds_of_edges(drawn: Drawn, luminance: np.ndarray, response: Response, percent: float) -> Ranked:
-    """Return :func:`speeds` where neighbouring pixels of the (h, w) luminance differ by a threshold or more."""
+    """Return the statistics of the lengths of (h, w, 2) float32 vectors where neighbouring pixels of the (h, w)
+    luminance differ by a threshold or more."""
     signal, edge = response.signal(luminance), np.zeros(luminance.shape, bool)
     for s, on in ((signal, edge), (signal.T, edge.T)):
         step = np.abs(np.diff(s, axis=0)) >= response.threshold
@@ -90,14 +87,37 @@ def between(below: np.float32, above: np.float32, share: float) -> float:
     return float(above - apart * np.float32(1.0 - share))
 
 
-class SmallPictures(Protocol):
-    """The small pictures that a timeline requests of a renderer: every n-th pixel in x and y."""
+class Look(Protocol):
+    """The speeds of a scene's surfaces at one time. largest : px/s."""
+
+    largest: float
+
+    def percentile(self, percent: float) -> float: ...
+
+
+class Moving(Protocol):
+    """The speeds of a scene."""
+
+    def look(self, t_ns: int) -> Any: ...
+
+    def hides(self, a: Any, b: Any, tolerance: float) -> bool:
+        """Return whether something may be faster between two looks, by more than ``tolerance`` px/s, than both show."""
+
+    def bend(self, a: Any, b: Any) -> float:
+        """Return how far, px, anything leaves a steady motion between two looks."""
+
+
+class Watched(Protocol):
+    """What a timeline asks of a renderer."""
+
+    @property
+    def motion(self) -> Moving: ...
 
     def velocity_of_movers(self, t_ns: int, every: int) -> Drawn:
-        """Return (h, w, 2) float32 image velocity, px/s of the whole image."""
+        """Return (h, w, 2) float32 image velocity, px/s of the whole image, of every n-th pixel in x and y."""
 
     def brightness(self, t_ns: int, every: int) -> Drawn:
-        """Return (h, w, 2) float32 luminance and its rate of change per second."""
+        """Return (h, w, 2) float32 luminance and its rate of change per second, of every n-th pixel in x and y."""
 
 
 class Timeline:
@@ -109,30 +129,56 @@ class Timeline:
         config: TimelineConfig,
         t0_ns: int,
         t1_ns: int,
-        pictures: SmallPictures,
+        scene: Watched,
         response: Response,
         stops_ns: Sequence[int] = (),
     ):
-        self.config, self.t0_ns, self.t1_ns, self.pictures, self.response = config, t0_ns, t1_ns, pictures, response
+        self.config, self.t0_ns, self.t1_ns, self.scene, self.response = config, t0_ns, t1_ns, scene, response
         self.stops_ns = stops_ns
         self.looks = 0
-        """Number of small pictures requested so far."""
+        """Number of times examined so far."""
         self.others: tuple[Timeline, ...] = ()
         """Timelines of other cameras whose pace also limits this one (:mod:`blinkgl.timeline.strategy`)."""
+        self._known: Recent[int, float] = Recent(_KNOWN)
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
         least, most = round(c.min_step_us * 1000), round(c.max_step_us * 1000)
-        return bounded_times(self._counted, least, most, self.t0_ns, self.t1_ns, self.stops_ns)
+        return bounded_times(self, least, most, self.t0_ns, self.t1_ns, self.stops_ns)
 
-    def pace(self, t_ns: int) -> float:
-        """Return the steps per second that the scene needs at one time."""
+    def at(self, t_ns: int) -> float:
+        """Return the steps per second that the strictest camera needs at one time."""
+        return self._known.of(t_ns, lambda: self._counted(t_ns))
+
+    def hides(self, ta_ns: int, tb_ns: int, steps: float) -> bool:
+        """Return whether a camera may need more steps per second between two times, by more than ``steps``, than at
+        both of them."""
+        motion = self.scene.motion
+        hidden = motion.hides(motion.look(ta_ns), motion.look(tb_ns), steps * self.step_px)
+        return hidden or any(other.hides(ta_ns, tb_ns, steps) for other in self.others)
+
+    def bend(self, ta_ns: int, tb_ns: int) -> float:
+        """Return how far anything leaves a steady motion between two times, in displacements of a step."""
+        motion = self.scene.motion
+        own = motion.bend(motion.look(ta_ns), motion.look(tb_ns)) / self.step_px
+        return max([own, *(other.bend(ta_ns, tb_ns) for other in self.others)])
+
+    @property
+    def step_px(self) -> float:
+        """Return the displacement, px, that a step may have."""
         raise NotImplementedError
 
-    # The strictest camera decides.
+    def pace(self, t_ns: int) -> float:
+        """Return the steps per second that this camera needs at one time."""
+        raise NotImplementedError
+
     def _counted(self, t_ns: int) -> float:
         self.looks += 1
         return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
+
+
+_KNOWN = 64
+"""Paces in memory: a step that is refused is examined again."""
 
 
 class Uniform(Timeline):
@@ -143,13 +189,18 @@ class Uniform(Timeline):
 
 
 class Displacement(Timeline):
-    """Steps in which pixels move ``max_px``, by the image velocity of moving pixels."""
+    """Steps in which surfaces move ``max_px``."""
+
+    @property
+    def step_px(self) -> float:
+        return (
+            self.config.max_px if self.config.max_px_peak is None else min(self.config.max_px, self.config.max_px_peak)
+        )
 
     def pace(self, t_ns: int) -> float:
-        c = self.config
-        seen = speeds(self.pictures.velocity_of_movers(t_ns, c.sample_every), c.percentile)
-        pace = seen.percentile / c.max_px
-        return pace if c.max_px_peak is None else max(pace, seen.largest / c.max_px_peak)
+        c, look = self.config, self.scene.motion.look(t_ns)
+        pace = look.percentile(c.percentile) / c.max_px
+        return pace if c.max_px_peak is None else max(pace, look.largest / c.max_px_peak)
 
 
 class Brightness(Timeline):
@@ -157,12 +208,16 @@ class Brightness(Timeline):
     the signal changes there by all of the contrast within a pixel, also where the surfaces themselves have one colour
     and no rate."""
 
+    @property
+    def step_px(self) -> float:
+        return self.config.max_fraction_of_threshold
+
     def pace(self, t_ns: int) -> float:
         c = self.config
-        picture = self.pictures.brightness(t_ns, c.sample_every).read()
+        picture = self.scene.brightness(t_ns, c.sample_every).read()
         luminance, rate = picture[..., 0], picture[..., 1]
         seen = ranked(np.abs(self.response.change(luminance, rate)), c.percentile)
-        moving = self.pictures.velocity_of_movers(t_ns, c.sample_every)
+        moving = self.scene.velocity_of_movers(t_ns, c.sample_every)
         edges = speeds_of_edges(moving, luminance, self.response, c.percentile)
         return max(seen.percentile / self.response.threshold, edges.largest) / c.max_fraction_of_threshold
 
@@ -174,13 +229,13 @@ def make_timeline(
     config: TimelineConfig,
     t0_ns: int,
     t1_ns: int,
-    pictures: SmallPictures,
+    scene: Watched,
     response: Response,
     stops_ns: Sequence[int] = (),
 ) -> Timeline:
     """Return the timeline of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, which adaptive
     kinds do not cross."""
-    return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response, stops_ns)
+    return _KINDS[config.kind](config, t0_ns, t1_ns, scene, response, stops_ns)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -192,7 +247,7 @@ class Shared(Timeline):
 
     def __init__(self, own: Timeline, times: Iterator[int]):
         self._times = times
-        super().__init__(own.config, own.t0_ns, own.t1_ns, own.pictures, own.response, own.stops_ns)
+        super().__init__(own.config, own.t0_ns, own.t1_ns, own.scene, own.response, own.stops_ns)
 
     def __iter__(self) -> Iterator[int]:
         return self._times

@@ -16,8 +16,7 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath
-from blinkgl.timeline import displacement_times, uniform_times
-from blinkgl.timeline.sampling import largest_speed
+from blinkgl.timeline import uniform_times
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
 from tests.render.render_scenes import (
     LEVEL,
@@ -34,6 +33,7 @@ from tests.render.render_scenes import (
     still,
     thing,
 )
+from tests.timeline.paces import displacement_times
 
 MS = 1_000_000
 MEDIAN, WORST = 5e-7, 1e-5  # of the motion
@@ -138,7 +138,7 @@ def test_a_million_pixels_per_second(gl, promise, speed):
     promise(f"{speed:g} px/s: velocity, largest, relative", e.velocity.max(), WORST)
     promise(f"{speed:g} px/s: flow over a microsecond, largest, relative", e.worst, WORST)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        fastest = lambda t: largest_speed(renderer.velocity(t, 4).read())
+        fastest = lambda t: renderer.motion.look(t).largest
         ten_px = int(10 / speed * SECOND)
         times = np.array(list(displacement_times(0.5, 1, 20_000_000, 0, ten_px, fastest)))
         slow = np.array(list(displacement_times(0.5, 100_000, 20_000_000, 0, 400_000, fastest)))

@@ -171,3 +171,8 @@ def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, t
     )
     path = curve(seed + 3, (0, 0, 0), 0.15, 0.05, LEVEL) if camera_moves else still(rotation=LEVEL)
     return scene(objects, rig(width, height, 0.94 * width, path), background=0.0)
+
+
+def largest_speed(velocity: np.ndarray) -> float:
+    """Return the largest length of (H, W, 2) vectors."""
+    return float(np.linalg.norm(velocity, axis=-1).max())

@@ -23,8 +23,7 @@ from blinkgl.render.resources import HALF_LEAST, HALF_MOST, half_floats
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
-from blinkgl.timeline.sampling import largest_speed
-from render_scenes import LEVEL, SECOND, cube, curve, drift, rig, scene, still, thing
+from render_scenes import LEVEL, SECOND, cube, curve, drift, largest_speed, rig, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
 
@@ -165,18 +164,6 @@ def test_projection_puts_points_on_the_documented_pixel():
     window = (ndc[:, :2] + 1) / 2 * (640, 480) - 0.5
     np.testing.assert_allclose(window, points[:, :2] / points[:, 2:] * (500, 510) + (300, 250), atol=1e-10)
     np.testing.assert_allclose(ndc[:, 2], 0.1 / points[:, 2], rtol=1e-14)
-
-
-# ---- per-pixel helpers -------------------------------------------------------------------------------------------
-
-
-def test_largest_speed():
-    velocity = np.zeros((3, 4, 2), np.float32)
-    velocity[1, 2] = (3, 4)
-    velocity[0, 0] = (np.inf, 0)
-    velocity[0, 1] = (np.nan, 0)
-    assert largest_speed(velocity) == 5.0
-    assert largest_speed(np.zeros((2, 2, 2), np.float32)) == 0.0
 
 
 # --- Poses to clip space: the frustum's planes lie where the image ends, and stacks of poses are stacks of single

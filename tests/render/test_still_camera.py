@@ -17,9 +17,8 @@ from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Scene
-from blinkgl.timeline.sampling import largest_speed
 from blinkgl.tools.bench import probe_scene
-from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
+from render_scenes import LEVEL, SECOND, cube, curve, drift, largest_speed, mixed_scene, scene, sphere, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
 

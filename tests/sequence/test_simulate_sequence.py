@@ -112,11 +112,11 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
         drawn.clear()
         made[name] = list(simulate_sequence(SequenceRequest(config, 0, **wanted), gl))
         expected = {
-            "everything": {"luminance", "velocity_of_movers", "colour", "labels", "velocity"},
-            "events": {"luminance", "velocity_of_movers"},
+            "everything": {"luminance", "colour", "labels", "velocity"},
+            "events": {"luminance"},
             "labels": {"colour", "labels"},
         }
-        assert set(drawn) == expected[name], "motion: what the timeline looks at"
+        assert set(drawn) == expected[name], "the timeline draws nothing"
     assert_same(events_of(made["everything"]), events_of(made["events"]))
     assert not events_of(made["labels"]).t.size
     for a, b in zip((i for i in made["everything"] if isinstance(i, GroundTruth)), made["labels"], strict=True):

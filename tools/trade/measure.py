@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.reader import apply_overrides
 from blinkgl.config.run import RunTemplate
@@ -26,12 +27,13 @@ from blinkgl.events.grids import masked
 from blinkgl.gl import GLContext
 from blinkgl.render.cutouts import Cutouts, lattice, mask_of
 from blinkgl.render.frames import Rectangle
+from blinkgl.render.motion import Look, Motion
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
-from blinkgl.timeline.sampling import displacement_times, largest_speed
+from blinkgl.timeline.sampling import Pace, bounded_times
 from blinkgl.tools.trade.metrics import EventErrors, SpeedMaps, event_errors, flow_errors
 from blinkgl.tools.trade.settings import SIZES, Setting
 from blinkgl.types.events import Events
@@ -64,19 +66,38 @@ class FineTiles(Cutouts):
     ):
         super().__init__(gl, scene, tiles, scale, samples)
 
-    def speed(self, t_ns: int) -> float:
-        """Return the largest image speed in the rectangles, px/s."""
-        largest = 0.0
-        for camera in self._cameras:
-            self._renderer.look_through(camera)
-            largest = max(
-                largest, largest_speed(self._renderer.velocity_of_movers(t_ns, self._scale).read()) / self._scale
-            )
-        return largest
-
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
         """Yield times between which nothing in the rectangles moves by more than ``max_px``."""
-        return displacement_times(max_px, 1000, MAX_STEP_NS, t0_ns, t1_ns, self.speed)
+        return bounded_times(self.pace(max_px), 1000, MAX_STEP_NS, t0_ns, t1_ns)
+
+    def pace(self, max_px: float) -> Pace:
+        """Return the pace of steps in which nothing in the rectangles moves by more than ``max_px``."""
+        return _PaceOfTiles(self._renderer.motion, self._cameras, max_px * self._scale)
+
+
+@dataclass(frozen=True)
+class _PaceOfTiles:
+    """The pace (:class:`blinkgl.timeline.sampling.Pace`) of several cameras at one place. max_px : of their px."""
+
+    motion: Motion
+    cameras: Sequence[CameraModel]
+    max_px: float
+
+    def at(self, t_ns: int) -> float:
+        return max(look.largest for look in self._looks(t_ns)) / self.max_px
+
+    def hides(self, ta_ns: int, tb_ns: int, steps: float) -> bool:
+        looks = zip(self._looks(ta_ns), self._looks(tb_ns), strict=True)
+        return any(self.motion.hides(a, b, steps * self.max_px) for a, b in looks)
+
+    def bend(self, ta_ns: int, tb_ns: int) -> float:
+        looks = zip(self._looks(ta_ns), self._looks(tb_ns), strict=True)
+        return max(self.motion.bend(a, b) for a, b in looks) / self.max_px
+
+    def _looks(self, t_ns: int) -> Iterator[Look]:
+        for camera in self.cameras:
+            self.motion.camera = camera
+            yield self.motion.look(t_ns)
 
 
 def reference_events(

@@ -75,6 +75,11 @@ class Animation:
         """Return the time after which the clip repeats itself, or does not change any more."""
         return self._playing.span_ns
 
+    @property
+    def timescale_ns(self) -> int:
+        """Return the time in which no velocity changes much: half of that between the closest key frames."""
+        return self._playing.timescale_ns(self.tracks)
+
     def deformer(
         self,
         node: int,
@@ -144,6 +149,7 @@ class Animation:
             not moving,
             playing.period_ns if moving else None,
             playing.span_ns if moving else 0,
+            playing.timescale_ns(mine),
         )
         return morphs.taken(source).transformed(at_rest[:3, :3])
 

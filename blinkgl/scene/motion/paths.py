@@ -60,6 +60,8 @@ class StaticPath:
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         return 0.0, 0.0
 
+    unseen = speed_bound
+
 
 class KeyframePath:
     """Motion through given poses.
@@ -131,6 +133,17 @@ class KeyframePath:
         v, w = piecewise.speed_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
         return v * _BOUND_MARGIN, w * _BOUND_MARGIN
 
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """Return bounds, see :class:`PosePath`, by the same Bezier points. The angular velocity is taken as phi',
+        which it is for a steady rotation and for small phi."""
+        return piecewise.unseen(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
+
+    @property
+    def coefficients(self) -> tuple[np.ndarray, ...]:
+        """Return all coefficients: times (N,) int64 ns, polynomials of position and of rotation (N - 1, 4, 3),
+        rotations (N - 1, 3, 3)."""
+        return self._knots, self._cp, self._cr, self._rot
+
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
         """Return an upper bound over [ta, tb] of |n . velocity| in units/s of the body's points within ``reach`` of its
         origin, for the world direction ``normal`` (unit). Zero (to rounding) for a body that slides and turns on a
@@ -188,12 +201,6 @@ class HermitePath(KeyframePath):
         self._rot = np.ascontiguousarray(Rotation.from_quat(np.stack([x, y, z, quaternions[:-1, 0]], 1)).as_matrix())
         self.is_static = not (self._cp[:, 1:].any() or self._cr[:, 1:].any())
 
-    @property
-    def coefficients(self) -> tuple[np.ndarray, ...]:
-        """Return all coefficients: times (N,) int64 ns, polynomials of position and of rotation (N - 1, 4, 3),
-        rotations (N - 1, 3, 3)."""
-        return self._knots, self._cp, self._cr, self._rot
-
 
 class CutPath:
     """``path`` until ``t_cut_ns``, then the pose of that instant.
@@ -220,6 +227,12 @@ class CutPath:
         if ta_ns >= self.t_cut_ns:
             return 0.0, 0.0
         return self.path.speed_bound(ta_ns, min(tb_ns, self.t_cut_ns))
+
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        if not ta_ns < self.t_cut_ns <= tb_ns:
+            return self.path.unseen(ta_ns, tb_ns) if tb_ns < self.t_cut_ns else (0.0, 0.0)
+        # At tb the body stands, which says nothing of its velocity before the cut.
+        return self.path.speed_bound(ta_ns, self.t_cut_ns)
 
 
 class PausedPath:
@@ -265,6 +278,13 @@ class PausedPath:
         # Both ends lie in the stop: the path's clock stands over the whole interval.
         return (0.0, 0.0) if a == b and before == after == 0 else self.path.speed_bound(a, b)
 
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        (a, before), (b, after) = self._clock(int(ta_ns)), self._clock(int(tb_ns))
+        v, w = self.path.unseen(a, b)
+        inside = ta_ns < self.stop_ns + self.ramp_ns and tb_ns > self.stop_ns
+        # Slowing down and speeding up within the interval: the body is slower there than at either end.
+        return (v, w) if not inside or (before, after) != (1.0, 1.0) else self.path.speed_bound(a, b)
+
     def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
         """Return the bound of :meth:`KeyframePath.approach_bound`."""
         return self.path.approach_bound(normal, reach, self._clock(int(ta_ns))[0], self._clock(int(tb_ns))[0])
@@ -275,7 +295,8 @@ class AffinePath:
     nearest to its linear part.
 
     motion : (M, dM/dt), ((4, 4), (4, 4) 1/s), at a time in ns.   local : (4, 4) rigid, from the body to M's axes.
-    span_ns : time in which the motion takes all its values; 0: unknown."""
+    span_ns : time in which the motion takes all its values; 0: unknown.
+    timescale_ns : time in which its velocity changes little."""
 
     is_static = False
 
@@ -286,9 +307,11 @@ class AffinePath:
         t1_ns: int,
         local: ArrayLike,
         span_ns: int = 0,
+        timescale_ns: int = 1,
     ):
         self.t0_ns, self.t1_ns = int(t0_ns), int(t1_ns)
         self._motion, self._local, self._span_ns = motion, rigid(local), span_ns
+        self._timescale_ns = max(int(timescale_ns), 1)
 
     def pose(self, t_ns: int) -> np.ndarray:
         matrix, _ = self._motion(min(max(int(t_ns), self.t0_ns), self.t1_ns))
@@ -318,10 +341,15 @@ class AffinePath:
         """Return bounds, see :class:`PosePath`, from samples; a quarter is added for what lies between them."""
         if self._span_ns:
             tb_ns = min(tb_ns, ta_ns + self._span_ns)
-        rates = [self.derivative(int(t)) for t in np.linspace(ta_ns, tb_ns, _SPEED_SAMPLES)]
+        samples = min(max(2, 4 * -(-(tb_ns - ta_ns) // self._timescale_ns)), _SPEED_SAMPLES)
+        rates = [self.derivative(int(t)) for t in np.linspace(ta_ns, tb_ns, samples)]
         speed = max(float(np.linalg.norm(D[:3, 3])) for D in rates)
         # The matrix of a rotation's rate has sqrt(2) times the norm of the angular velocity.
         return 1.25 * speed, 1.25 * max(float(np.linalg.norm(D[:3, :3])) for D in rates) / math.sqrt(2)
+
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """Return the whole speeds where the ends are farther apart than the motion's own time scale, else 0."""
+        return (0.0, 0.0) if tb_ns - ta_ns <= self._timescale_ns else self.speed_bound(ta_ns, tb_ns)
 
 
 _SPEED_SAMPLES = 256
@@ -356,6 +384,10 @@ class OffsetPath:
         # |v + w x r| <= |v| + |w| |r|.
         return (v + w * self._arm) * _BOUND_MARGIN, w
 
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        v, w = self.path.unseen(ta_ns, tb_ns)
+        return v + (w + turned(self.path.speed_bound(ta_ns, tb_ns)[1], (tb_ns - ta_ns) * 1e-9)) * self._arm, w
+
 
 class SharedOriginPath:
     """A body that stays at another's position without rotating with it: the sky around a camera."""
@@ -379,6 +411,15 @@ class SharedOriginPath:
 
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         return self.path.speed_bound(ta_ns, tb_ns)[0], 0.0
+
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        return self.path.unseen(ta_ns, tb_ns)[0], 0.0
+
+
+def turned(rate: float, seconds: float) -> float:
+    """Return how far the velocity of a point at distance 1 leaves the straight line between its values at two times
+    while it turns at up to ``rate``, rad/s: the height of an arc of that angle over its chord, as a speed."""
+    return rate * min(2.0, (rate * seconds) ** 2 / 8)
 
 
 def smoothed(

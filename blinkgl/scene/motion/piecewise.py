@@ -301,6 +301,65 @@ def approach_bound(
 
 
 @kernel
+def _off(c, a, b):
+    """Return the distance of the point ``c`` from the segment a to b, (3,) each."""
+    along, length = 0.0, 0.0
+    for k in range(3):
+        along += (c[k] - a[k]) * (b[k] - a[k])
+        length += (b[k] - a[k]) ** 2
+    s = min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
+    q = 0.0
+    for k in range(3):
+        q += (c[k] - a[k] - s * (b[k] - a[k])) ** 2
+    return math.sqrt(q)
+
+
+@kernel
+def _slope(c, u, out):
+    """Write p'(u) of the cubic p to ``out``, (3,)."""
+    for k in range(3):
+        out[k] = (3.0 * c[3, k] * u + 2.0 * c[2, k]) * u + c[1, k]
+
+
+@kernel
+def _quadratic_off(c, ua, ub, a, b):
+    """Return an upper bound over [ua, ub] of the distance of p'(u) from the segment a to b: the largest of the three
+    Bezier points of p'."""
+    most, point = 0.0, np.empty(3)
+    for corner in range(3):
+        v = ub if corner == 2 else ua
+        w = ua if corner == 0 else ub
+        for k in range(3):
+            point[k] = 3.0 * c[3, k] * v * w + c[2, k] * (v + w) + c[1, k]
+        most = max(most, _off(point, a, b))
+    return most
+
+
+@kernel
+def unseen(ta: int, tb: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray) -> tuple[float, float]:
+    """Return upper bounds over [ta, tb] of the distance of the origin's velocity, and of the rotation vector's rate,
+    from the segments between their values at both ends: what the ends do not show. Beyond the knots both are 0."""
+    a, b, da, db = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    if tb < knots[0] or ta > knots[-1] or tb < ta:
+        return 0.0, 0.0
+    i, j = _piece(ta, knots), _piece(tb, knots)
+    if ta >= knots[0]:
+        _slope(cp[i], (ta - knots[i]) * 1e-9, a)
+        _slope(cr[i], (ta - knots[i]) * 1e-9, da)
+    if tb <= knots[-1]:
+        _slope(cp[j], (tb - knots[j]) * 1e-9, b)
+        _slope(cr[j], (tb - knots[j]) * 1e-9, db)
+    ta, tb = max(ta, knots[0]), min(tb, knots[-1])
+    speed, rate = 0.0, 0.0
+    for n in range(i, j + 1):
+        ua = (max(ta, knots[n]) - knots[n]) * 1e-9
+        ub = (min(tb, knots[n + 1]) - knots[n]) * 1e-9
+        speed = max(speed, _quadratic_off(cp[n], ua, ub, a, b))
+        rate = max(rate, _quadratic_off(cr[n], ua, ub, da, db))
+    return speed, rate
+
+
+@kernel
 def speed_bound(ta: int, tb: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray) -> tuple[float, float]:
     """Return upper bounds over [ta, tb] of the speed of the origin and of the angular rate."""
     if tb < knots[0] or ta > knots[-1] or tb < ta:
@@ -313,3 +372,64 @@ def speed_bound(ta: int, tb: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndar
         speed = max(speed, _quadratic_bound(cp[i], ua, ub))
         rate = max(rate, _quadratic_bound(cr[i], ua, ub))
     return speed, rate
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Many paths at once, one after the other in the same arrays. first : (n + 1,) where each one's knots begin; its pieces
+# have the numbers of their first knots.
+
+
+@kernel
+def all_poses(
+    t: int,
+    first: np.ndarray,
+    knots: np.ndarray,
+    cp: np.ndarray,
+    cr: np.ndarray,
+    rot: np.ndarray,
+    rows: np.ndarray,
+    T: np.ndarray,
+) -> None:
+    """Write the pose of path k to row rows[k] of T, (m, 4, 4)."""
+    for k in range(len(rows)):
+        a, b = first[k], first[k + 1]
+        pose(t, knots[a:b], cp[a : b - 1], cr[a : b - 1], rot[a : b - 1], T[rows[k]])
+
+
+@kernel
+def all_derivatives(
+    t: int,
+    first: np.ndarray,
+    knots: np.ndarray,
+    cp: np.ndarray,
+    cr: np.ndarray,
+    rot: np.ndarray,
+    rows: np.ndarray,
+    D: np.ndarray,
+) -> None:
+    """Write dT/dt of path k to row rows[k] of D, (m, 4, 4): 0 beyond its knots."""
+    for k in range(len(rows)):
+        a, b = first[k], first[k + 1]
+        D[rows[k]] = 0.0
+        if knots[a] <= t <= knots[b - 1]:
+            derivative(t, knots[a:b], cp[a : b - 1], cr[a : b - 1], rot[a : b - 1], D[rows[k]])
+
+
+@kernel
+def all_bounds(
+    ta: int,
+    tb: int,
+    first: np.ndarray,
+    knots: np.ndarray,
+    cp: np.ndarray,
+    cr: np.ndarray,
+    rows: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write both numbers of :func:`speed_bound` and both of :func:`unseen` of path k to row rows[k] of ``out``, (m,
+    4)."""
+    for k in range(len(rows)):
+        a, b = first[k], first[k + 1]
+        row = out[rows[k]]
+        row[0], row[1] = speed_bound(ta, tb, knots[a:b], cp[a : b - 1], cr[a : b - 1])
+        row[2], row[3] = unseen(ta, tb, knots[a:b], cp[a : b - 1], cr[a : b - 1])

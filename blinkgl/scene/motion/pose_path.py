@@ -30,3 +30,8 @@ class PosePath(Protocol):
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         """Return upper bounds over [ta, tb] of (|velocity of the body's origin| in units/s, |angular rate| in
         rad/s)."""
+
+    def unseen(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """Return upper bounds over [ta, tb] of how far the velocity of the body's origin, units/s, and its angular
+        velocity, rad/s, leave the straight line between their values at ta and tb. Both 0: what moves between these
+        times is never faster than at one of them."""

@@ -7,13 +7,13 @@ Values between key frames are exact, and so are their rates: nothing is resample
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from blinkgl.machine.kernels import kernel
-from blinkgl.scene.shapes.skeleton import Locals
+from blinkgl.scene.shapes.skeleton import NEVER, Locals
 
 PATHS = ("translation", "rotation", "scale")
 KINDS = ("LINEAR", "STEP", "CUBICSPLINE")
@@ -83,6 +83,12 @@ class Playing:
     def is_static(self) -> bool:
         return self.speed == 0 or self.last <= self.first
 
+    def timescale_ns(self, tracks: Iterable[Track]) -> int:
+        """Return half of the time between the closest two key frames of these tracks; without key frames,
+        :data:`~blinkgl.scene.shapes.skeleton.NEVER`."""
+        closest = min((float(np.diff(track.times).min()) for track in tracks if len(track.times) > 1), default=0.0)
+        return max(round(closest / abs(self.speed) * 0.5e9), 1) if closest and self.speed else NEVER
+
     def at(self, t_ns: int) -> tuple[float, float]:
         """Return (time of the clip, its rate)."""
         length, period = self.last - self.first, self.period_ns
@@ -108,6 +114,7 @@ class Clip:
         moving = [track for track in tracks if track.path in PATHS]
         self.is_static = playing.is_static or not moving
         self.period_ns, self.span_ns = playing.period_ns, playing.span_ns
+        self.timescale_ns = playing.timescale_ns(moving)
         scales = [track for track in moving if track.path == "scale"]
         # A cubic may go below 0 between positive keys.
         self.mirrors = any(track.interpolation == "CUBICSPLINE" or (track.values < 0).any() for track in scales)

@@ -35,6 +35,11 @@ class Beat:
         return max(round(self.period * 1e9), 1)
 
     @property
+    def timescale_ns(self) -> int:
+        """Return a sixteenth of the period: from one to the next a sine's slope is within 2 % of its larger one."""
+        return max(self.period_ns // 16, 1)
+
+    @property
     def rate(self) -> float:
         """Return d(phi)/dt, rad/s."""
         return 2 * math.pi * 1e9 / self.period_ns
@@ -82,6 +87,7 @@ class Waves(Deformer):
             beats,
         )
         self.period_ns = self.span_ns = max(beat.period_ns for beat in beats)
+        self.timescale_ns = min(beat.timescale_ns for beat in beats)
 
     @property
     def is_static(self) -> bool:
@@ -212,6 +218,7 @@ class Turn(Deformer):
     def __init__(self, axis: np.ndarray, pivot: np.ndarray, share: tuple[np.ndarray, float], angle: float, beat: Beat):
         self.axis, self.pivot, self.share, self.angle, self.beat = axis, pivot, share, angle, beat
         self.period_ns = self.span_ns = beat.period_ns
+        self.timescale_ns = beat.timescale_ns
 
     @property
     def is_static(self) -> bool:
@@ -320,6 +327,7 @@ class Breathe(Deformer):
     def __init__(self, centre: np.ndarray, amount: np.ndarray, beat: Beat):
         self.centre, self.amount, self.beat = centre, amount, beat
         self.period_ns = self.span_ns = beat.period_ns
+        self.timescale_ns = beat.timescale_ns
 
     @classmethod
     def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Breathe:

@@ -38,6 +38,8 @@ class Cycle:
         speed: float = 0.0,
     ):
         self.period_ns = self.span_ns = max(round(period * 1e9), 1)
+        # A sixteenth of the fourth harmonic's period; those above it are small.
+        self.timescale_ns = max(self.period_ns // 64, 1)
         self.phase, self.speed = phase, speed
         count = len(angles)
         values = np.concatenate([root[:, None], angles], axis=1)  # the root's position is row 0

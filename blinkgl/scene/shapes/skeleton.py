@@ -18,6 +18,8 @@ from blinkgl.machine.kernels import kernel
 from blinkgl.types.recent import Recent
 
 _KEPT = 4
+NEVER = 1 << 62
+"""ns: the time scale of what does not move."""
 
 
 class Locals(NamedTuple):
@@ -45,13 +47,16 @@ class Locals(NamedTuple):
 
 class Motion(Protocol):
     """The motion of a skeleton's joints. period_ns : its period; None: not periodic.   span_ns : time from 0 after
-    which nothing changes."""
+    which nothing changes.   timescale_ns : time in which no velocity changes much."""
 
     @property
     def period_ns(self) -> int | None: ...
 
     @property
     def span_ns(self) -> int: ...
+
+    @property
+    def timescale_ns(self) -> int: ...
 
     @property
     def is_static(self) -> bool: ...
@@ -65,6 +70,7 @@ class Still:
 
     period_ns = None
     span_ns = 0
+    timescale_ns = NEVER
     is_static = True
 
     def __init__(self, locals_: Locals):

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from blinkgl.errors import AssetError
 from blinkgl.machine.kernels import kernel
-from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
+from blinkgl.scene.shapes.skeleton import NEVER, Locals, Skeleton, Still
 from blinkgl.scene.types import Deformer, Mesh
 
 MAX_ROWS = 1024
@@ -33,7 +33,7 @@ _TEXTURE_WIDTH = 4096
 class Morphs:
     """Morph targets of a mesh. positions : (k, V, 3) displacements at weight 1.   normals : likewise, or None.
     weights : ((k,), (k,)) at a time in ns: weight of each, and its rate per second.
-    is_static, period_ns, span_ns : as of :class:`~blinkgl.scene.shapes.skeleton.Motion`."""
+    is_static, period_ns, span_ns, timescale_ns : as of :class:`~blinkgl.scene.shapes.skeleton.Motion`."""
 
     positions: np.ndarray
     normals: np.ndarray | None
@@ -41,6 +41,7 @@ class Morphs:
     is_static: bool = False
     period_ns: int | None = None
     span_ns: int = 0
+    timescale_ns: int = NEVER
 
     def taken(self, vertices: np.ndarray) -> Morphs:
         """Return the targets of some of the vertices, in their order."""
@@ -113,6 +114,7 @@ class Skin(Deformer):
         periods = {part.period_ns for part in moving}
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
+        self.timescale_ns = min((part.timescale_ns for part in moving), default=NEVER)
         self.locomotion = getattr(skeleton.motion, "locomotion", "free")
         # The body moves along its x axis, whose scale is the length of the first column.
         self.speed = getattr(skeleton.motion, "speed", 0.0) * float(np.linalg.norm(self.after[:3, 0]))
@@ -150,6 +152,14 @@ class Skin(Deformer):
         """Return a skin with morph targets and one static joint."""
         still = Skeleton([-1], Still(Locals.rest(1)))
         return cls.rigid(still, 0, morphs.positions.shape[1], morphs, where=where)
+
+    def of_vertices(self, vertices: np.ndarray) -> Skin:
+        morphs = None if self.morphs is None else self.morphs.taken(vertices)
+        bound = self.joints[vertices], self.weights[vertices]
+        after, before = self.after, self.before
+        return Skin(
+            self.skeleton, self.bones, self.inverse_bind, *bound, morphs, after=after, before=before, where=self.where
+        )
 
     @property
     def rows(self) -> int:

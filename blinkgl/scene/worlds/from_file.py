@@ -226,7 +226,7 @@ def _motion(
     if animation is None or not animation.moves(node):
         return StaticPath(rest @ local, t0_ns, t1_ns), baked
     motion, baked = _rigid(animation, node, t0_ns)
-    return AffinePath(motion, t0_ns, t1_ns, local, animation.span_ns), baked
+    return AffinePath(motion, t0_ns, t1_ns, local, animation.span_ns, animation.timescale_ns), baked
 
 
 def _with_lights(

@@ -78,7 +78,7 @@ def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
             assert np.percentile(inside, 97) < 2e-4 * image.max() and inside.mean() < 2e-3 * image.max()
             assert not mine[~bench.mask].any()
             speed = np.hypot(*np.moveaxis(whole.velocity(t).read(), -1, 0))[bench.mask].max()
-            assert tiles.speed(t) == pytest.approx(speed, rel=0.05)
+            assert tiles.pace(1.0).at(t) == pytest.approx(speed, rel=0.05)
 
 
 def test_reference_converges_and_the_ladder_says_so(gl, config):

@@ -84,6 +84,8 @@ def _plain(value: Any) -> str:
 
 
 PROBES = 12
+COUNTING_S = 3.0
+"""Wall seconds in which times of frames are counted; those of a longer sequence are estimated from these."""
 
 
 @dataclass(frozen=True)
@@ -284,13 +286,15 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short part of the real sequence
     event_s = _timed(lambda t: renderer.luminance(t).view(), times)
     result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
+    if probe.timeline.notes:
+        result.scene["times"] = "; ".join(probe.timeline.notes)
     result.add("event frames", f"timeline: {config.timeline.kind}", result.frames, event_s)
     if config.timeline.kind != "uniform":
-        name, said = "velocity", ""
+        name, why = "speeds", "of surfaces, decide the step; nothing is drawn"
         if config.timeline.kind == "brightness":
-            name, said = "brightness, and velocity of edges", "; displacement misses fewer events at this cost"
+            name = "brightness, and velocity of edges"
+            why = f"decide the step; every {config.timeline.sample_every}. pixel; displacement misses fewer events"
         count = int(1.1 * result.frames)  # a step is sometimes shortened
-        why = f"decides the step; every {config.timeline.sample_every}. pixel{said}"
         result.add(name, why, count, _timed(probe.timeline.pace, times))
     _pictures(config, renderer, times[:3], (scene.t1_ns - scene.t0_ns) * 1e-9, result)
     _over_time(config, scene, renderer, result)
@@ -302,10 +306,18 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
 
 def _event_frames(config: SequenceConfig, probe: SensorSimulation, times: list[int], duration: float) -> int:
-    """Return the number of event frames, from the pace at a few times."""
+    """Return the number of event frames: of displacement the times themselves, or as many as a few seconds give; of
+    brightness from the pace at a few times."""
     timeline = config.timeline
     if timeline.kind == "uniform":
         return math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, at any rate
+    if timeline.kind == "displacement":
+        count, until = 0, time.perf_counter() + COUNTING_S
+        for t_ns in probe.timeline:
+            count += 1
+            if time.perf_counter() > until:
+                return round(count * duration / max((t_ns - probe.t0_ns) * 1e-9, 1e-9))
+        return count
     steps = np.clip(
         [1 / max(probe.timeline.pace(t), 1e-12) for t in times],
         timeline.min_step_us * 1e-6,

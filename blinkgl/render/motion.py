@@ -59,8 +59,8 @@ class Look:
     speed.
     largest : px/s.   items : (m, 4) of each item: 1 if a part of it is in view; the smallest depth of that part; how
     far the rest is from the view, world units, and as the sine of an angle.
-    velocities : (m, POINTS + 1, 2) px/s of a few of each item's points and, last, the mean over its surface in view;
-    nan for what is not in view."""
+    velocities : (m, POINTS + 2, 2) px/s of a few of each item's points; of its surface in view the mean; and the mean
+    away from the middle of the view, and around it. nan for what is not in view."""
 
     t_ns: int
     areas: np.ndarray
@@ -130,7 +130,7 @@ class Motion:
         sides = np.array([item.side(t_ns) for item in self._items], np.int64)
         twists, cones = self._light(t_ns, T_world_cam, dT_world_cam, centres)
         areas, sums, rows = np.zeros(BINS), np.zeros(BINS), np.zeros((len(self._items), 4))
-        velocities = np.full((len(self._items), POINTS + 1, 2), np.nan)
+        velocities = np.full((len(self._items), POINTS + 2, 2), np.nan)
         largest = _look(
             T, D, self._body, surfaces.ranges[few.astype(np.intp), np.arange(len(few))], sides, points, rates,
             surfaces.faces, view.planes, view.near, view.corner, view.size, view.jacobians, twists, cones, areas, sums,
@@ -326,6 +326,20 @@ def _pattern(x, y, z, twists, cones, corner, size, jacobians):
 
 
 @kernel
+def _patterns(polygon, count, area, twists, cones, corner, size, jacobians):
+    """Return the largest px/s of the light's patterns on a polygon of this area, px²: on a grid of about 4 px."""
+    n, most = min(max(int(math.sqrt(area) / 4.0), 1), 64), 0.0
+    for k in range(1, count - 1):
+        a, b, c = polygon[0], polygon[k], polygon[k + 1]
+        for i in range(n + 1):
+            for j in range(n + 1 - i):
+                s, t = i / n, j / n
+                x, y, z = a[:3] + s * (b[:3] - a[:3]) + t * (c[:3] - a[:3])
+                most = max(most, _pattern(x, y, z, twists, cones, corner, size, jacobians))
+    return most
+
+
+@kernel
 def _cut(polygon, count, out, nx, ny, nz, d):
     """Write the part of a polygon of ``count`` corners (position, velocity) in which n . x >= d to ``out``; return its
     number of corners."""
@@ -380,7 +394,7 @@ def _look(
                 q = moved[v]
                 a, b, _ = _velocity(q[0], q[1], q[2], q[3], q[4], q[5], corner, size, jacobians)
                 velocities[i, k, 0], velocities[i, k, 1] = a, b
-        whole, mean_x, mean_y = 0.0, 0.0, 0.0
+        whole, mean_x, mean_y, spread, outwards, around = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for f in range(int(ranges[i, 2]), int(ranges[i, 3])):
             ka, kb, kc = faces[f, 0] - first, faces[f, 1] - first, faces[f, 2] - first
             a, b, c = moved[ka], moved[kb], moved[kc]
@@ -436,14 +450,18 @@ def _look(
                 speed = math.sqrt(x * x + y * y)
                 if speed < np.inf:  # also false for nan
                     sum_x, sum_y = sum_x + x, sum_y + y
-                    if lit:
-                        speed = max(speed, _pattern(q[0], q[1], q[2], twists, cones, corner, size, jacobians))
+                    u, v = q[0] / q[2], q[1] / q[2]
+                    spread += math.sqrt(u * u + v * v)
+                    outwards, around = outwards + x * u + y * v, around + y * u - x * v
                     fastest, density = max(fastest, speed), max(density, dense)
                 nearest = min(nearest, q[2])
                 area += (q[0] * r[1] - r[0] * q[1]) / (q[2] * r[2])
             seen = 1.0
+            area = 0.5 * abs(area) * density
+            if lit:
+                fastest = max(fastest, _patterns(polygon, count, area, twists, cones, corner, size, jacobians))
             largest = max(largest, fastest)
-            area = 0.5 * abs(area) * density * ranges[i, 4]
+            area *= ranges[i, 4]
             whole += area
             mean_x, mean_y = mean_x + area * sum_x / count, mean_y + area * sum_y / count
             if fastest >= SLOWEST:
@@ -452,6 +470,8 @@ def _look(
                 sums[k] += area * fastest
         if whole > 0.0:
             velocities[i, POINTS, 0], velocities[i, POINTS, 1] = mean_x / whole, mean_y / whole
+        if spread > 0.0:
+            velocities[i, POINTS + 1, 0], velocities[i, POINTS + 1, 1] = outwards / spread, around / spread
         rows[i, SEEN], rows[i, NEAREST], rows[i, AWAY], rows[i, ASIDE] = seen, nearest, away, aside
     return largest
 

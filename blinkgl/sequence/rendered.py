@@ -65,7 +65,7 @@ class RenderedSequence(SensorSimulation):
         size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
         self.scene, self.renderer = scene, renderer
         # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
-        self.notes = scene.omissions + (() if config.scene.kind == "random" else scene.log)
+        self._notes = scene.omissions + (() if config.scene.kind == "random" else scene.log)
         if scene.dynamics is not None:
             self.libraries = {scene.dynamics.engine: scene.dynamics.version}
         if request.labels:
@@ -93,6 +93,10 @@ class RenderedSequence(SensorSimulation):
             seed = kernel_seed(config.seed, request.index, Role.IMAGES, of.number)
             self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
         super().__init__(request, of, clock, size=size, span_ns=span_ns, camera=camera, pictures_hz=pictures_hz)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self._notes if self.timeline is None else self._notes + self.timeline.notes
 
     def _resume(self) -> None:
         self.renderer.gl.resume()

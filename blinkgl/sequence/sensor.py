@@ -61,13 +61,11 @@ class SensorSimulation(ABC):
     events, labels : numbers so far.   triangles : of everything drawn; 0 for recorded frames.
     frame_camera : the :class:`~blinkgl.imaging.FrameCamera` of its images; None: there is none.
     timeline : the :class:`Timeline` of event frames; None for recorded frames, and without events.
-    notes : what was guessed, left out or not drawn of the files so far, a line each.
     libraries : versions of those that affect this sequence but not every one."""
 
     triangles = 0
     timeline: Timeline | None = None
     frame_camera: FrameCamera | None = None
-    notes: Sequence[str] = ()
     libraries: Mapping[str, str] = MappingProxyType({})
 
     def __init__(
@@ -146,6 +144,12 @@ class SensorSimulation(ABC):
         truth = self._truth(k, t_ns)
         self.labels += truth.forward_ns is not None
         return truth
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Return what was guessed, left out or not drawn of the files so far, and what limits its times, a line
+        each."""
+        return ()
 
     @property
     def frames(self) -> int:

@@ -52,7 +52,7 @@ class Pace(Protocol):
         """Return how far the scene leaves a steady motion from one time to the other in between, in steps."""
 
 
-BEND = 0.1
+BEND = 0.05
 """Largest value of :meth:`Pace.bend` of a step. Emulators take what is between two frames as a straight line, which
 cuts off the turning points of a motion to and fro."""
 

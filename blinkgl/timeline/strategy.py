@@ -96,7 +96,9 @@ class Look(Protocol):
 
 
 class Moving(Protocol):
-    """The speeds of a scene."""
+    """The speeds of a scene.   unbounded : names of bodies of which only single times are known."""
+
+    unbounded: Sequence[str]
 
     def look(self, t_ns: int) -> Any: ...
 
@@ -139,12 +141,31 @@ class Timeline:
         """Number of times examined so far."""
         self.others: tuple[Timeline, ...] = ()
         """Timelines of other cameras whose pace also limits this one (:mod:`blinkgl.timeline.strategy`)."""
+        self.too_long, self.longest = 0, 0.0
+        """Number of steps so far that ``min_step_us`` kept too long, and the largest motion of any, in steps."""
         self._known: Recent[int, float] = Recent(_KNOWN)
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
         least, most = round(c.min_step_us * 1000), round(c.max_step_us * 1000)
-        return bounded_times(self, least, most, self.t0_ns, self.t1_ns, self.stops_ns)
+        last, self.too_long, self.longest = self.t0_ns, 0, 0.0
+        for t_ns in bounded_times(self, least, most, self.t0_ns, self.t1_ns, self.stops_ns):
+            steps = max(self.at(last), self.at(t_ns)) * (t_ns - last) * 1e-9
+            self.too_long += steps > TOO_LONG
+            self.longest = max(self.longest, steps)
+            yield t_ns
+            last = t_ns
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what limits the times so far, a line each."""
+        found = []
+        if self.too_long:
+            found.append(
+                f"{self.too_long} steps between event frames are {self.config.min_step_us:g} µs long and would have to "
+                f"be up to {self.longest:.3g} times shorter for this motion; expected a smaller timeline.min_step_us"
+            )
+        return (*found, *(line for other in self.others for line in other.notes))
 
     def at(self, t_ns: int) -> float:
         """Return the steps per second that the strictest camera needs at one time."""
@@ -177,6 +198,8 @@ class Timeline:
         return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
 
 
+TOO_LONG = 1.25
+"""Motion of a step, in steps, from which on it is reported."""
 _KNOWN = 64
 """Paces in memory: a step that is refused is examined again."""
 
@@ -201,6 +224,12 @@ class Displacement(Timeline):
         c, look = self.config, self.scene.motion.look(t_ns)
         pace = look.percentile(c.percentile) / c.max_px
         return pace if c.max_px_peak is None else max(pace, look.largest / c.max_px_peak)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        bodies = ", ".join(f"'{name}'" for name in dict.fromkeys(self.scene.motion.unbounded))
+        unknown = f"the deformer of {bodies} has no timescale_ns, so steps are examined every timeline.min_step_us"
+        return (*super().notes, *([unknown] if bodies else ()))
 
 
 class Brightness(Timeline):

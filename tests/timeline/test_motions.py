@@ -1,0 +1,185 @@
+"""What adaptive times see of fast motion: the events of a dense fixed rate, in twelve scenes in which both ends of a step
+do not show what happens inside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.events import EsimConfig
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.config.timeline import DisplacementTimeline, UniformTimeline
+from blinkgl.events import Esim, Events
+from blinkgl.events.camera import EventCamera, emulate
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.motion.paths import CutPath, KeyframePath
+from blinkgl.scene.shapes.skeleton import Locals, Skeleton
+from blinkgl.scene.shapes.skin import Skin
+from blinkgl.scene.types import Lamp, Light, Material, Scene
+from blinkgl.sequence.rendered import drawn
+from blinkgl.timeline import make_timeline
+from blinkgl.tools.trade.matching import match_events
+from tests.render.render_scenes import (
+    LEVEL,
+    SECOND,
+    quad,
+    rig,
+    scene,
+    smooth_texture,
+    sphere,
+    still,
+    thing,
+)
+from tests.skinned import Swinging
+
+MS = 1_000_000
+WIDTH, HEIGHT, FOCAL = 80, 60, 80.0
+FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)
+ESIM = EsimConfig(contrast_threshold=0.15, threshold_sigma=0.0)
+GREY, WHITE = Material(base_color=(0.1,) * 3, unlit=True), Material(base_color=(0.9,) * 3, unlit=True)
+PICTURE = Material(smooth_texture(1), unlit=True, uv_scale=(3.0, 3.0))
+SHARP = Material(smooth_texture(2), unlit=True)
+DENSE = UniformTimeline(fps=10_000)
+END = 80 * MS
+
+
+def keyed(position: Callable[[float], tuple], turn: Callable[[float], tuple] = lambda t: (0, 0, 0), base=LEVEL):
+    """A path through poses every quarter of a millisecond. turn : rotation vector before ``base``."""
+    times = np.arange(0, END + MS, MS // 4)
+    s = times * 1e-9
+    return KeyframePath(
+        times, [position(t) for t in s], Rotation.concatenate([Rotation.from_rotvec(turn(t)) * base for t in s])
+    )
+
+
+def wall(material=PICTURE, half=3.0, away=3.0):
+    return thing("wall", 1, quad(half, half), still((0, away, 0), FACING), material)
+
+
+def seen(objects, path=None, light=None, background=0.1, focal=FOCAL) -> Scene:
+    return replace(scene(objects, rig(WIDTH, HEIGHT, focal, path), light, background), t1_ns=END)
+
+
+def sine(amplitude: float, hertz: float):
+    return lambda t: amplitude * math.sin(2 * math.pi * hertz * t)
+
+
+def fan() -> Scene:
+    """3,000 rev/min: two and a half turns in the time of a longest step."""
+    turns = keyed(lambda t: (0, 2.0, 0), lambda t: (0, 2 * math.pi * 50 * t, 0), FACING)
+    return seen([wall(GREY), thing("fan", 2, quad(0.6, 0.12), turns, SHARP)])
+
+
+def hand_shake() -> Scene:
+    """12 Hz, 6 px, about two axes."""
+    x, y = sine(6 / FOCAL, 12), sine(4 / FOCAL, 9)
+    return seen([wall()], keyed(lambda t: (0, 0, 0), lambda t: (y(t), 0, x(t))))
+
+
+def pendulum() -> Scene:
+    """It turns round at 40 ms."""
+    angle = lambda t: 0.6 * math.sin(2 * math.pi * t / 0.16)
+    swing = keyed(lambda t: (math.sin(angle(t)), 3.0, 0.6 - math.cos(angle(t))))
+    return seen([wall(GREY, 6), thing("bob", 2, sphere(0.2, 2), swing, WHITE)])
+
+
+def bouncing_ball() -> Scene:
+    """An impact every 20 ms, at 4 m/s."""
+    bounce = keyed(lambda t: (0, 2.0, -0.3 + 0.04 * (1 - (2 * (t / 0.02 % 1) - 1) ** 2) * 8))
+    return seen([wall(GREY), thing("ball", 2, sphere(0.15, 2), bounce, SHARP)])
+
+
+def flash() -> Scene:
+    """A beam sweeps over a wall within 8 ms of 80, and back."""
+    swing = lambda t: (0, 0, 1.0 if abs(t - 0.04) > 0.008 else 1 - math.cos(math.pi / 2 * (t - 0.04) / 0.008))
+    path = keyed(lambda t: (0, 0.5, 0), swing, LEVEL * Rotation.from_euler("x", 180, degrees=True))
+    spot = Lamp("spot", (40.0,) * 3, path, inner=0.1, outer=0.25)
+    lit = Material(base_color=(0.8,) * 3)
+    return seen([wall(lit)], light=replace(Light(), sun=0.0, sky=0.05, lamps=(spot,)))
+
+
+class _Waving(Swinging):
+    """Nine times as fast."""
+
+    period_ns = span_ns = SECOND // 9
+    timescale_ns = period_ns // 16
+
+    def locals(self, t_ns: int) -> Locals:
+        slow = Swinging(self.count, self.angle).locals(9 * t_ns)
+        return Locals(*slow[:3], *(9 * rate for rate in slow[3:]))
+
+
+def waving_arm() -> Scene:
+    """A skinned arm that waves at 9 Hz."""
+    from tests.skinned import arm
+
+    mesh = arm()
+    skin = mesh.deformer
+    skeleton = Skeleton([-1, 0], _Waving(2, 0.5))
+    waving = Skin(skeleton, skin.bones, skin.inverse_bind, skin.joints, skin.weights)
+    return seen([wall(GREY, 9, 9), thing("arm", 2, replace(mesh, deformer=waving), still((0, 6, -1)), WHITE)])
+
+
+def passing_car() -> Scene:
+    """From outside on one side to outside on the other within 8 ms."""
+    drives = keyed(lambda t: (-60 + 1000 * t, 4.0, 0), base=FACING)
+    return seen([wall(GREY, 40, 30), thing("car", 2, quad(0.8, 0.3), drives, SHARP)])
+
+
+def from_behind() -> Scene:
+    """A card comes out from behind a post and goes back within 6 ms."""
+    out = lambda t: 1.2 * math.cos(math.pi * (t - 0.05) / 0.006) if abs(t - 0.05) < 0.003 else 0
+    darts = keyed(lambda t: (out(t), 4, 0), base=FACING)
+    post = thing("post", 3, quad(0.4, 3), still((0, 3, 0), FACING), PICTURE)
+    return seen([wall(GREY, 9, 9), post, thing("card", 2, quad(0.3, 0.3), darts, WHITE)])
+
+
+def to_and_fro_along_the_axis() -> Scene:
+    """A zoom: the camera jumps forth and back at 20 Hz."""
+    return seen([wall()], keyed(lambda t: (0, 0.25 * math.sin(2 * math.pi * 20 * t), 0)))
+
+
+def vibration() -> Scene:
+    """100 Hz, 3 px."""
+    return seen([wall()], keyed(lambda t: (3 * 3.0 / FOCAL * math.sin(2 * math.pi * 100 * t), 0, 0)))
+
+
+def ball_through_the_picture() -> Scene:
+    """At 10,000 px/s."""
+    flies = keyed(lambda t: (-5.5 + 250 * (t - 0.02), 2.0, 0))
+    return seen([thing("ball", 2, sphere(0.25, 3), flies, WHITE)])
+
+
+def stopped_body() -> Scene:
+    """It moves until a collision cuts its path, within a step that stands at its end."""
+    path = CutPath(keyed(lambda t: (-0.6 + 12 * t, 2.9, 0), base=FACING), 53 * MS)
+    return seen([wall(GREY), thing("card", 2, quad(0.4, 0.4), path, SHARP)])
+
+
+WORLDS = (
+    fan, hand_shake, pendulum, bouncing_ball, flash, waving_arm, passing_car, from_behind, to_and_fro_along_the_axis,
+    vibration, ball_through_the_picture, stopped_body,
+)  # fmt: skip
+
+
+def events(renderer: Renderer, timeline) -> tuple[Events, int]:
+    made = make_timeline(timeline, 0, END, renderer, Esim.response(ESIM))
+    camera = EventCamera(ESIM, None, HEIGHT, WIDTH, 0)
+    return Events.concatenate([e for _, e in emulate(drawn(renderer, made), camera)]), camera.frames
+
+
+@pytest.mark.parametrize("world", WORLDS, ids=lambda world: world.__name__)
+def test_no_motion_between_two_frames_goes_unseen(gl, world):
+    """97 % of the events of frames at 10 kHz, and their times within what a step of a pixel takes."""
+    with Renderer(gl, world(), RenderConfig()) as renderer:
+        dense, _ = events(renderer, DENSE)
+        made, frames = events(renderer, DisplacementTimeline(max_px=1.0, min_step_us=20))
+    assert len(dense) > 400 and frames < 1500
+    assert len(made) == pytest.approx(len(dense), rel=0.03)
+    matching = match_events(dense, made, HEIGHT, WIDTH, 4000)
+    assert matching.matched.mean() > 0.95

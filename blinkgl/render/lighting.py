@@ -67,6 +67,9 @@ class Lighting:
         self._weights: dict[tuple[float, ...], np.ndarray] = {}
         self._bytes: dict[tuple, bytes] = {}  # constant values, by uniform and by the channel that one value represents
         self._last: tuple[Moment | None, bool, dict[str, np.ndarray]] = None, False, {}
+        none = np.zeros((0, 3), np.float32)
+        self._directed: tuple[Moment | None, tuple[np.ndarray, np.ndarray]] = None, (none, none)
+        self._sun = np.asarray(light.sun_direction, np.float64)
 
     def defines(self, kind: Kind, one_channel: bool, maps: Sequence[Any]) -> dict[str, Any]:
         """Return the defines of a lit pass's variant. RGB: light of three channels, where one is not enough: for
@@ -97,7 +100,7 @@ class Lighting:
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Set the uniforms of lights.glsl that the program has."""
-        if "sun_direction" in uniforms or _NAMES.isdisjoint(uniforms):
+        if _NAMES.isdisjoint(uniforms):
             return
         index, channel = item.object_index, item.material.base_color
         for name, per_channel in _FIXED.items():
@@ -121,6 +124,16 @@ class Lighting:
                     if per_channel and uniform.array_length == per_channel:
                         values = (self.channel(channel) @ values).astype(np.float32)
                     uniform.write(values.tobytes())
+
+    def directions(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+        """Return the directions of the sun and of world z in the objects' axes, (n, 3) float32 each; those of the last
+        moment are kept."""
+        if self._directed[0] is not moment:
+            R = moment.T_world_obj[:, :3, :3]
+            # v @ R is R^T v, and R[2] is R^T z.
+            sun = np.ascontiguousarray(self._sun @ R, np.float32)
+            self._directed = moment, (sun, np.ascontiguousarray(R[:, 2], np.float32))
+        return self._directed[1]
 
     def channel(self, base: tuple[float, ...]) -> np.ndarray:
         """Return (3,) the shares of r, g, b in the luminance of this base colour, which one channel represents."""

@@ -81,6 +81,14 @@ class Painter:
         """Return the table of uniforms that a pass sets."""
         return Uniforms(program)
 
+    def ready(self, uniforms: Uniforms, moment: Moment, size: tuple[int, int]) -> None:
+        """Set the uniforms that all items of a picture share: at each picture anew, since the context's programs, with
+        their uniforms, are shared with other renderers."""
+        if "light_strength" in uniforms:
+            uniforms["light_strength"].value = (self.scene.light.sun, self.scene.light.sky)
+        if "fog" in uniforms:
+            self.fog(uniforms, moment, size)
+
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Set the uniforms of every program that draws the scene: matrices, depths and, if it has them, the light."""
         index = item.object_index
@@ -88,14 +96,11 @@ class Painter:
         if "inverse_depths" in uniforms:
             uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
         if "sun_direction" in uniforms:
-            # Every time: the context's programs, with their uniforms, are shared with other renderers.
-            light = self.scene.light
-            uniforms["light_strength"].value = (light.sun, light.sky)
-            # v @ R is R^T v: a world direction in the object's axes; R[2] is that of world z.
-            R = moment.T_world_obj[index, :3, :3]
-            uniforms["sun_direction"].value = tuple(light.sun_direction @ R)
-            uniforms["up_direction"].value = tuple(R[2])
-        self.lighting.place(uniforms, item, moment)
+            sun, up = self.lighting.directions(moment)
+            uniforms["sun_direction"].write(sun[index])
+            uniforms["up_direction"].write(up[index])
+        else:
+            self.lighting.place(uniforms, item, moment)
         if item.extended:
             self._dress(uniforms, item, moment)
 

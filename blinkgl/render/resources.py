@@ -124,6 +124,7 @@ class SceneResources:
         self._buffers: dict[tuple, tuple[moderngl.Buffer, moderngl.Buffer]] = {}
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
+        self._vaos_of_items: dict[tuple[int, int], moderngl.VertexArray] = {}
         self._shapes: dict[int, Shape] = {}
         self._volumes: dict[str, moderngl.Texture3D] = {}
         self.items = draw_items(scene)
@@ -135,6 +136,12 @@ class SceneResources:
     def vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
         """Return the vertex array of the attributes that ``program`` uses; the rest of the interleaved vertex is
         skipped."""
+        known = self._vaos_of_items.get((id(program), item.number))
+        if known is None:
+            known = self._vaos_of_items[id(program), item.number] = self._vertex_array(program, item)
+        return known
+
+    def _vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
         # The texture coordinates of a buffer depend on both, so they are part of its key.
         whole = _by_whole_repeats(item.material)
         key = (id(program), id(item.mesh), item.material.uv_scale, whole)
@@ -295,7 +302,7 @@ class SceneResources:
         """Drop all vertex arrays, before the programs they were made for are replaced."""
         for vao in self._vaos.values():
             vao.release()
-        self._vaos = {}
+        self._vaos, self._vaos_of_items = {}, {}
 
     def release(self) -> None:
         self.forget_vertex_arrays()

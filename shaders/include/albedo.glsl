@@ -45,6 +45,10 @@ ALBEDO albedo_at(vec2 uv)
     right = mix(right, 0.5 * down, row);
     // Squares of the spacing of the taps on the surface, two texels and one texel: half of log2 is the level.
     float level = 0.5 * log2(max(mix(4.0 * along, max(along, 16.0 * across), row), 1e-30));
+#ifdef NEAREST_LEVEL
+    // One level instead of the mean of two: the four taps blur the difference.
+    level = floor(level + 0.5);
+#endif
 #define TAP(at) textureLod(albedo, at, level).CHANNELS
 #else
     // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples

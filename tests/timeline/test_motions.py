@@ -1,5 +1,5 @@
-"""What adaptive times see of fast motion: the events of a dense fixed rate, in twelve scenes in which both ends of a step
-do not show what happens inside it."""
+"""What adaptive times see of fast motion: the events of a dense fixed rate, in twelve scenes in which both ends of a
+step do not show what happens inside it."""
 
 from __future__ import annotations
 

@@ -158,9 +158,18 @@ class ScenePass(Pass):
         """Set textures and uniforms of the program besides those that every program of the scene has."""
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
-        programs = self.programs(painter)
+        programs, ready = self.programs(painter), set()
         for item in self.items(shot.moment) if items is None else items:
-            self.draw_item(painter, shot, item, programs[item.kind])
+            uniforms = programs[item.kind]
+            if item.kind not in ready:
+                ready.add(item.kind)
+                self.prepare(painter, shot, uniforms)
+            self.draw_item(painter, shot, item, uniforms)
+
+    def prepare(self, painter: Painter, shot: Shot, uniforms: Uniforms) -> None:
+        """Set all that a program needs of the picture, once before its items."""
+        painter.ready(uniforms, shot.moment, shot.size)
+        self.bind(uniforms, shot)
 
     def programs(self, painter: Painter) -> dict[Kind, Uniforms]:
         """Return the painter's programs for this pass, by kind of material."""
@@ -178,9 +187,6 @@ class ScenePass(Pass):
         painter.place(uniforms, item, shot.moment)
         if item.deformer is not None:
             painter.deform(uniforms, item, shot.moment, shot.ends)
-        if "fog" in uniforms:
-            painter.fog(uniforms, shot.moment, shot.size)
-        self.bind(uniforms, shot)
         self.set(painter, uniforms, item, shot)
 
 

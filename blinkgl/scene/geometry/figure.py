@@ -134,7 +134,8 @@ _CHART_OF = {
     "arm": "upper_arm", "forearm": "forearm", "hand": "hand", "thigh": "thigh", "shank": "shank", "foot": "foot",
     "toes": "foot",
 }  # fmt: skip
-_STEP = 0.026  # m of an average body: about 4,000 vertices
+SPACINGS = (0.026, 0.037, 0.052)
+"""m between the vertices of an average body, finest first: about 4,000, 2,000 and 1,000 of them."""
 _BLEND = 0.014
 _SOFT = 0.022  # m over which the weights of neighbouring bones change
 _BIND = {"arm_l": 42.0, "arm_r": -42.0, "thigh_l": 4.0, "thigh_r": -4.0, "foot_l": -4.0, "foot_r": 4.0}
@@ -174,10 +175,10 @@ class _Piece(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def body_of(body: Proportions) -> Body:
+def body_of(body: Proportions, level: int = 0) -> Body:
     """Return the skin of a body in the bind pose, its limbs apart, its soles on z = 0: the average one with each bone
-    scaled in length and thickness. Read only."""
-    points, normals, faces, uvs, joints, weights = _average()
+    scaled in length and thickness. level : of :data:`SPACINGS`. Read only."""
+    points, normals, faces, uvs, joints, weights = _average(SPACINGS[level])
     bind, shape = _bind(body), _shape(body)
     turns = bind[:, :3, :3]
     # The scale acts in each joint's own axes: R S R^T.
@@ -217,10 +218,11 @@ def _shape(body: Proportions) -> np.ndarray:
     return out
 
 
-@lru_cache(maxsize=1)
-def _average() -> tuple[np.ndarray, ...]:
-    """Return an average body in the bind pose: (V, 3) points, (V, 3) normals, (F, 3) faces, (V, 2) texture coordinates,
-    (V, 4) joints and their weights. Vertices are split at the texture's seams."""
+@lru_cache(maxsize=len(SPACINGS))
+def _average(spacing: float) -> tuple[np.ndarray, ...]:
+    """Return an average body in the bind pose, with vertices about ``spacing`` m apart: (V, 3) points, (V, 3) normals,
+    (F, 3) faces, (V, 2) texture coordinates, (V, 4) joints and their weights. Vertices are split at the texture's
+    seams."""
     body = Proportions()
     bind = _bind(body)
     pieces = _pieces(body, bind)
@@ -236,8 +238,8 @@ def _average() -> tuple[np.ndarray, ...]:
 
     ends = np.concatenate([[p.a, p.b] for p in pieces])
     low, high = ends.min(axis=0) - 0.2, ends.max(axis=0) + 0.2
-    low[2] = floor - 2.4 * _STEP
-    points, faces, normals = isosurface(distance, low, high, _STEP)
+    low[2] = floor - 2.4 * spacing
+    points, faces, normals = isosurface(distance, low, high, spacing)
     weights = _weights(points, faces, pieces)
     uvs = _unwrapped(points, faces, normals, weights, bind)
     # The four largest weights are kept, as the shader takes four.

@@ -33,13 +33,15 @@ def figure(
     tempo: float = 1.0,
     phase: float = 0.0,
     coat: int = 0,
+    *,
+    level: int = 0,
 ) -> tuple[Surface, Deformer]:
     """A person on z = 0, facing along x, who walks, runs, dances, waves or stands, in place (an object's `way` moves
     it). The texture is an atlas in which each part of the body has its place, all in one scale."""
     if height > 1000:
         raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
     proportions = Proportions(height, build, legs, arms, head)
-    body = body_of(proportions)
+    body = body_of(proportions, level)
     skeleton = Skeleton(PARENTS, clip_of(clip, proportions, tempo, phase, variant))
     skin = Skin(skeleton, range(len(PARENTS)), body.inverse_bind, body.joints, body.weights, where="figure")
     return (body.vertices, body.normals, body.uvs, body.faces), skin

@@ -108,7 +108,10 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
     closedness; add it to :data:`BUILDERS`. Raises TypeError for a name that is not there."""
     if build.__name__ not in PRIMITIVES:
         raise TypeError(f"no primitive '{build.__name__}' in config/primitives.py")
-    signature = inspect.signature(build)
+    whole = inspect.signature(build)
+    # ``level``, of living ones, is no parameter of the configuration: scenes choose it (:func:`coarser`).
+    given = [p for p in whole.parameters.values() if p.kind is not p.KEYWORD_ONLY]
+    signature = whole.replace(parameters=given)
 
     def checked(**parameters: Any) -> inspect.BoundArguments:
         where = build.__name__
@@ -126,10 +129,10 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
             bound.arguments[key] = _checked(where, key, value, signature.parameters[key].default)
         return bound
 
-    @wraps(build)
-    def made(**parameters: Any) -> Mesh:
+    def at_level(level: int, **parameters: Any) -> Mesh:
         where, bound = build.__name__, checked(**parameters)
-        built = build(**bound.arguments)
+        coarse = {"level": level} if level else {}
+        built = build(**bound.arguments, **coarse)
         (positions, normals, uvs, faces), deformer = built if len(built) == 2 else (built, None)
         return Mesh(
             vertices=np.ascontiguousarray(positions, np.float64),
@@ -138,11 +141,17 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
             uvs=np.ascontiguousarray(uvs, np.float32),
             closed=closedness(*weld(positions, faces)),
             name=where,
-            source_hash=parameter_hash("primitive", 1, where, tuple(bound.arguments.items())),
+            source_hash=parameter_hash("primitive", 1, where, tuple((bound.arguments | coarse).items())),
             deformer=deformer,
         )
 
+    @wraps(build)
+    def made(**parameters: Any) -> Mesh:
+        return at_level(0, **parameters)
+
+    made.__signature__ = signature  # type: ignore[attr-defined]
     made.checked = checked  # type: ignore[attr-defined]
+    made.at_level = at_level if whole != signature else None  # type: ignore[attr-defined]
     BUILDERS[build.__name__] = made
     return made
 

@@ -114,7 +114,9 @@ class Skin(Deformer):
         periods = {part.period_ns for part in moving}
         self.period_ns = periods.pop() if len(periods) == 1 else None
         self.span_ns = max((part.span_ns for part in moving), default=0)
-        self.timescale_ns = min((part.timescale_ns for part in moving), default=NEVER)
+        # A motion of somebody's own may not say it.
+        scales = [getattr(part, "timescale_ns", None) for part in moving]
+        self.timescale_ns = None if None in scales else min(filter(None, scales), default=NEVER)
         self.locomotion = getattr(skeleton.motion, "locomotion", "free")
         # The body moves along its x axis, whose scale is the length of the first column.
         self.speed = getattr(skeleton.motion, "speed", 0.0) * float(np.linalg.norm(self.after[:3, 0]))

@@ -22,6 +22,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, MeshConfig, ObjectConfig, 
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.machine.extras import install
 from blinkgl.scene.geometry import BUILDERS
+from blinkgl.scene.geometry.figure import SPACINGS
 from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
@@ -72,6 +73,10 @@ def explicit_scene(
     omissions: dict[str, None] = {}
     objects = _objects(config, t0_ns, t1_ns, base, memory, log, omissions)
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True, log=log)
+    objects = [
+        obj if item.mesh in memory.meshes else _in_detail(obj, item, config, camera, path)
+        for obj, item in zip(objects, config.objects, strict=True)
+    ]
     bodies = {obj.name: item.physics for obj, item in zip(objects, config.objects) if item.physics is not None}
     if config.collisions:
         # Nothing stops falling objects: the engine knows the others' final paths.
@@ -147,6 +152,34 @@ def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: 
             mesh, _ = split_mirrored(mesh)  # a deforming mesh keeps its seams: its joints count its vertices
         parts.append(Part(mesh, worn))
     return parts
+
+
+def _in_detail(
+    obj: SceneObject, item: ObjectConfig, config: ExplicitSceneConfig, camera: CameraModel, path: PosePath
+) -> SceneObject:
+    """Return a body whose primitive has levels of detail with the coarsest vertices that are at most :data:`APART` px
+    from each other when it is nearest to the camera."""
+    mesh = config.meshes[item.mesh]
+    builder = BUILDERS.get(mesh.primitive or "")
+    if builder is None or builder.at_level is None or len(obj.parts) != 1 or item.deform is not None:
+        return obj
+    part, times = obj.parts[0], np.linspace(path.t0_ns, path.t1_ns, 65).astype(np.int64)
+    apart = obj.path.poses(times)[:, :3, 3] - path.poses(times)[:, :3, 3]
+    # From the height of the body's middle, which may come as near as half of its radius.
+    middle, size = (part.mesh.vertices.max(axis=0) + part.mesh.vertices.min(axis=0)) / 2, part.mesh.radius / 2
+    nearest = max(float(np.linalg.norm(apart + middle, axis=1).min()) - size / 2, camera.near)
+    px_per_unit = camera.px_per_slope / nearest * float(np.max(item.scale))
+    level = max((k for k, spacing in enumerate(SPACINGS) if spacing * px_per_unit <= APART), default=0)
+    if not level:
+        return obj
+    with _parameters_of(item.mesh):
+        coarse = builder.at_level(level, **mesh.parameters)
+    matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
+    return replace(obj, parts=(replace(part, mesh=transform_mesh(coarse, matrix)),))
+
+
+APART = 4.0
+"""px between neighbouring vertices of a body by formula: its outline leaves the round one by less than a pixel."""
 
 
 def _object_path(

@@ -6,7 +6,9 @@ out the read-out.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -269,3 +271,29 @@ def emulate(
         with clock("events"):
             events = camera.step(frame)
         yield frame.t_ns, events
+
+
+def emulate_beside(
+    frames: Iterable[EventFrame],
+    camera: EventCamera,
+    clock: Callable[[str], AbstractContextManager] = lambda _: _NOTHING,
+) -> Iterator[tuple[int, Events]]:
+    """Yield what :func:`emulate` does, bit for bit, while the next frame is made: the camera works in a thread of its
+    own, on a copy of each frame. On one processor it is :func:`emulate`."""
+    if len(os.sched_getaffinity(0)) < 2:
+        yield from emulate(frames, camera, clock)
+        return
+
+    def step(frame: EventFrame) -> Events:
+        with clock("events"):
+            return camera.step(frame)
+
+    with ThreadPoolExecutor(1, "emulator") as thread:
+        working: tuple[int, Future[Events]] | None = None
+        for frame in frames:
+            if working is not None:
+                yield working[0], working[1].result()
+            # The source may overwrite its frame when the next is asked for.
+            working = frame.t_ns, thread.submit(step, frame._replace(luminance=np.array(frame.luminance)))
+        if working is not None:
+            yield working[0], working[1].result()

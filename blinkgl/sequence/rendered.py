@@ -15,7 +15,7 @@ from blinkgl.config.over_time import track_times
 from blinkgl.config.sequence import CameraOnRig
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
-from blinkgl.events.camera import EventCamera, EventFrame, emulate
+from blinkgl.events.camera import EventCamera, EventFrame, emulate, emulate_beside
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
@@ -103,7 +103,9 @@ class RenderedSequence(SensorSimulation):
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
-            yield from emulate(self._frames(), self.camera, self.clock)
+            # A tensor's frame stays on the card, which works beside the processor by itself.
+            run = emulate_beside if self.camera.tensor_device is None else emulate
+            yield from run(self._frames(), self.camera, self.clock)
         except EventDataError as error:
             raise self._explained(error) from error
 

@@ -29,12 +29,16 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
     backend: Annotated[str, typer.Option(help="OpenGL backend to examine: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
+    compile_all: Annotated[
+        bool,
+        typer.Option("--compile", help="First compile the kernels of all common commands, so that none has to wait."),
+    ] = False,
 ) -> int:
     """Report what this machine offers and what is missing. Every missing part has the command that installs it. Exit
     status 2 if something required is missing."""
     from blinkgl.show import doctor as command
 
-    return command.run(backend, device, as_json)
+    return command.run(backend, device, as_json, compile_all)
 
 
 @app.command()

@@ -9,6 +9,7 @@ other is compiled again.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import sys
 import zlib
@@ -34,6 +35,46 @@ class _Listener(event.Listener):
 
     def on_end(self, event: event.Event) -> None:
         watch.end()
+        # What was compiled is kept after this event; what failed is not. (``is_failed`` says the opposite in numba.)
+        if sys.exc_info()[0] is not None:
+            turn.end()
+
+
+TURN_HELD = "BLINKGL_COMPILES"
+"""Set in the environment of processes that compile together on purpose (:mod:`blinkgl.show.compile_kernels`)."""
+
+
+class _Turn:
+    """One process of a machine compiles at a time: others wait, and then find the kernel on disk. The system gives the
+    turn to the next where a process ends."""
+
+    def __init__(self) -> None:
+        self._file: int | None = None
+
+    def begin(self) -> bool:
+        """Wait for the turn. Return whether it began now, so that another process may have compiled meanwhile."""
+        if self._file is not None or TURN_HELD in os.environ:
+            return False
+        try:
+            self._file = os.open(_turn_file(), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except (OSError, RuntimeError):  # nothing can be kept there, so nobody would find it
+            return False
+        with contextlib.suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if watch.say is not None:
+                    watch.say("waiting for another process, which compiles kernels")
+                fcntl.flock(self._file, fcntl.LOCK_EX)
+        return True
+
+    def end(self) -> None:
+        if self._file is not None and not watch.compiles:
+            os.close(self._file)
+            self._file = None
+
+
+turn = _Turn()
 
 
 event.register("numba:compile", _Listener())
@@ -82,8 +123,10 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             found = super().load_overload(sig, target_context)
-            if found is None and watch.compile_all(_stamp()):
+            if found is None and turn.begin():
                 found = super().load_overload(sig, target_context)
+                if found is not None:
+                    turn.end()
             return found
         except Exception:  # noqa: BLE001 - damaged bytes raise anything
             self._say("the kernels kept there are damaged or unreadable and are compiled again")
@@ -96,6 +139,8 @@ class _Cache(FunctionCache):
             super().save_overload(sig, data)
         except OSError as error:
             self._say(f"kernels cannot be kept there ({error.strerror}) and are compiled in every process")
+        finally:
+            turn.end()
 
     def _say(self, what: str) -> None:
         if self.cache_path not in _said:
@@ -103,10 +148,21 @@ class _Cache(FunctionCache):
             kernel_cache_failed(f"{self.cache_path}: {what}")
 
 
+def kept() -> tuple[Path, int]:
+    """Return the folder of this package's kernels, which may be one beside each of its folders, and the number of
+    kernels that are kept there. Raises RuntimeError where none can be."""
+    folder = _turn_file().parent
+    beside = folder.name == "__pycache__"
+    root = Path(__file__).resolve().parents[1] if beside else folder.parent
+    return (root if beside else folder), sum(1 for _ in root.rglob("*.nbc"))
+
+
 @cache
-def _stamp() -> Path:
-    """Return the file that says that the kernels of the common commands have been compiled by this numba."""
-    return Path(FunctionCache(_stamp.__wrapped__).cache_path) / f"all_kernels.{numba.__version__}"
+def _turn_file() -> Path:
+    """Return the file whose lock is the turn to compile, where kernels are kept."""
+    folder = Path(FunctionCache(_turn_file.__wrapped__).cache_path)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / "compiling.lock"
 
 
 @cache

@@ -1,10 +1,8 @@
-"""Compile the kernels of the common commands: ``python -m blinkgl.show.compile_kernels``, which ``make`` and the first
-command that needs a kernel run."""
+"""Compile the kernels of the common commands: ``blinkgl doctor --compile``, and ``make test`` before its tests."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import importlib
 import os
 import tempfile
@@ -23,6 +21,7 @@ from blinkgl.events.table import EMULATORS
 from blinkgl.front.event_files import read_events, write_events
 from blinkgl.io.video import VideoWriter
 from blinkgl.machine.compiling import watch
+from blinkgl.machine.kernels import TURN_HELD, turn
 from blinkgl.recordings.simulation import file_to_events, frames_to_events
 from blinkgl.types.events import Events
 
@@ -34,9 +33,14 @@ def compile_ahead() -> str:
     default, began = EmulatorConfig.default_member, time.perf_counter()
     parts = [(_SEQUENCE, default), *((kind,) for kind in sorted(EMULATORS) if kind != default), (_FILES,)]
     workers = min(len(os.sched_getaffinity(0)), len(parts))
-    with open(__file__) as lock, ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        compiled = sum(pool.map(_compile_part, parts))
+    turn.begin()
+    os.environ[TURN_HELD] = str(os.getpid())
+    try:
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            compiled = sum(pool.map(_compile_part, parts))
+    finally:
+        del os.environ[TURN_HELD]
+        turn.end()
     return f"compiled {compiled} kernels in {time.perf_counter() - began:.0f} s" if compiled else ""
 
 

@@ -284,13 +284,11 @@ def _numba() -> Iterator[Check]:
         return f"{widest} on {binding.get_host_cpu_name()}"
 
     def kernels() -> str:
-        from blinkgl.machine.compiling import compiled_s
-        from blinkgl.recordings.simulation import frames_to_events
+        from blinkgl.machine.kernels import kept
 
-        began = compiled_s()
-        list(frames_to_events(np.full((2, 8, 8), 0.5, np.float32), fps=100))
-        took = compiled_s() - began
-        return f"compiled in {took:.0f} s, once per machine and version" if took else "compiled before"
+        folder, count = kept()
+        many = f"{count} compiled" if count else "none compiled yet: commands compile what they need"
+        return f"{many}, in {folder} (blinkgl doctor --compile: all of them, about a minute)"
 
     mend = f"{python()} -m pip install --force-reinstall numba"
     yield _try(section, "numba", version, mend)
@@ -384,8 +382,12 @@ def _extras() -> Iterator[Check]:
 _MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": ("absent", "yellow"), "info": ("", "")}
 
 
-def run(backend: str = "auto", device: int = 0, as_json: bool = False) -> int:
-    """Print the report. Status 2 when something required is missing."""
+def run(backend: str = "auto", device: int = 0, as_json: bool = False, compile_all: bool = False) -> int:
+    """Print the report. Status 2 when something required is missing. compile_all : first compile all kernels."""
+    if compile_all:
+        from blinkgl.show.compile_kernels import compile_ahead
+
+        say(plain_console(stderr=True), compile_ahead() or "all kernels were compiled before")
     report = examine(backend, device)
     if as_json:
         say(plain_console(), report.to_json())

@@ -55,45 +55,70 @@ def test_stages_and_total_are_without_compilation(watch):
     assert clock.seconds == {"events": 1.5} and clock.total == 1.5 and clock.compile_s == 14.0
 
 
-@pytest.fixture
-def ahead(monkeypatch, watch, tmp_path):
-    """The calls of the program that compiles all kernels, which here only prints."""
-    calls = []
-
-    def run(command, **_):
-        calls.append(command)
-        watch.now[0] += 30.0
-        return subprocess.CompletedProcess(command, 0, "compiled 70 kernels in 30 s\n")
-
-    monkeypatch.setattr(compiling.subprocess, "run", run)
-    monkeypatch.setattr(kernels, "watch", watch)
-    monkeypatch.setattr(kernels, "_stamp", lambda: tmp_path / "stamp")
-    return calls
-
-
-def test_the_first_kernel_that_is_missing_has_all_compiled_which_is_said_once(kept, tmp_path, ahead, watch):
+def test_what_compiles_is_said_once_and_counted_at_the_end(kept, tmp_path):
     for file in tmp_path.rglob("*.nb?"):
         file.unlink()
     outer, inner = [], []
+    compiling.watch._said, compiling.watch.told = False, (compiling.watch.kernels, compiling.watch.seconds)
     with compiling.announced_compiling(outer.append), compiling.announced_compiling(inner.append):
         twice = kept()
         assert twice(3) == 6 and twice(1.5) == 3.0
-    assert [call[-1] for call in ahead] == ["blinkgl.show.compile_kernels"] and outer == []
-    assert inner == ["compiling kernels, once per machine and version: about a minute", "compiled 70 kernels in 30 s"]
-    assert watch.seconds >= 30.0, "it belongs to no stage of a sequence"
-    watch.all_compiled = False  # another process, and a kernel of no common command
-    with compiling.announced_compiling(inner.append):
-        assert kept()(np.int8(3)) == 6
-    assert len(ahead) == 1 and len(inner) == 2
+    # Another process of the tests may have the turn.
+    inner = [line for line in inner if not line.startswith("waiting for another process")]
+    assert len(inner) == 2 and inner[0].startswith(
+        "compiling the kernels that this needs, once per machine and version"
+    )
+    assert inner[1].startswith("compiled 2 kernels in ") and outer == []
+    again = []
+    with compiling.announced_compiling(again.append):
+        assert kept()(3) == 6
+    assert not again, "it was kept"
 
 
-def test_nothing_is_compiled_ahead_where_nobody_listens_or_kernels_cannot_be_kept(kept, ahead, watch):
-    assert kept()(np.int8(3)) == 6
-    said = []
-    with compiling.announced_compiling(said.append):
-        compiling.kernel_cache_failed("the disk is full")
-        assert kept()(np.int16(3)) == 6
-    assert ahead == [] and said == ["warning: the disk is full"]
+PROGRAM = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from kernels_of_a_test import twice
+print("ready", flush=True); sys.stdin.readline()
+twice(3), twice(1.5), twice(3 + 1j)
+from blinkgl.machine.compiling import watch
+print(watch.kernels)
+"""
+
+
+def test_one_process_compiles_and_the_others_find_it(kept, tmp_path):
+    """Four processes need the same three kernels at the same time."""
+    for file in tmp_path.rglob("*.nb?"):
+        file.unlink()
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    processes = [subprocess.Popen(command, **pipes) for _ in range(4)]
+    assert all(process.stdout.readline() == "ready\n" for process in processes)
+    for process in processes:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    assert sum(int(process.communicate()[0]) for process in processes) == 3
+
+
+def test_a_process_that_is_ended_passes_its_turn_on(kept, tmp_path):
+    for file in tmp_path.rglob("*.nb?"):
+        file.unlink()
+    holder = subprocess.Popen(
+        [sys.executable, "-c", "from blinkgl.machine.kernels import turn; turn.begin(); print(1, flush=True); input()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdout.readline() == b"1\n"
+    waiter = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert waiter.stdout.readline() == "ready\n"
+    waiter.stdin.write("go\n")
+    waiter.stdin.flush()
+    with pytest.raises(subprocess.TimeoutExpired):
+        waiter.wait(timeout=2)
+    holder.kill()
+    assert int(waiter.communicate()[0]) == 3
 
 
 @pytest.fixture
@@ -173,13 +198,14 @@ def test_an_edit_of_a_function_that_a_kernel_calls_is_seen():
     assert not any("config" in name for name in of_v2e), "no kernel calls those"
 
 
-def test_every_command_says_that_it_compiles(monkeypatch, capsys, ahead, watch, tmp_path):
+def test_every_command_says_that_it_compiles(monkeypatch, capsys, watch):
     app = typer.Typer()
 
     @app.command()
     def some(nothing: bool = False) -> None:
-        watch.compile_all(tmp_path / "stamp")
+        watch.start()
+        watch.end()
 
     monkeypatch.setattr(command_line, "announced_compiling", compiling.announced_compiling)
     assert command_line.run_app(app, ["--nothing"], "some", "BlinkGL") == 0
-    assert "compiling kernels, once per machine" in capsys.readouterr().err
+    assert "compiling the kernels that this needs, once per machine" in capsys.readouterr().err

@@ -31,12 +31,6 @@ class UniformTimeline(_Timeline):
 
 
 class _AdaptiveTimeline(_Timeline):
-    sample_every: int = Field(
-        4,
-        ge=1,
-        le=64,
-        description="the step is chosen from a small picture with every n-th pixel in x and y; 1: all",
-    )
     min_step_us: float = Field(200.0, ge=0.001, description="shortest step, µs")
     max_step_us: float = Field(
         20000.0,
@@ -52,10 +46,12 @@ class _AdaptiveTimeline(_Timeline):
 
 
 class DisplacementTimeline(_AdaptiveTimeline):
-    """Event frames between which pixels move at most ``max_px``, by the speeds at both ends of the step."""
+    """Event frames between which surfaces move at most ``max_px``, everywhere in the step: by the speeds of the scene's
+    geometry in the picture, hidden surfaces included."""
 
     removed: ClassVar[Any] = {
         **_NO_RECONSTRUCTION,
+        "sample_every": Removed("the key left out: no picture is drawn for the step", lambda value: True),
         "first_look": Removed("the key left out, or quality: fast for fewer frames", lambda value: value is False),
     }
 
@@ -64,21 +60,31 @@ class DisplacementTimeline(_AdaptiveTimeline):
         0.5, gt=0, le=1e4, description="largest displacement between two frames, px, for the percentile"
     )
     percentile: float = Field(
-        100.0, gt=0, le=100, description="percentile of the speeds of moving pixels; 100 bounds every sampled pixel"
+        100.0,
+        gt=0,
+        le=100,
+        description="percentile of the speeds of moving surfaces, by their area in the picture; 100 bounds every one",
     )
     max_px_peak: float | None = Field(
         None,
         gt=0,
         le=1e4,
-        description="an additional limit for the fastest sampled pixel, px; for a percentile below 100",
+        description="an additional limit for the fastest surface, px; for a percentile below 100",
     )
 
 
 class BrightnessTimeline(_AdaptiveTimeline):
     """Event frames between which the signal changes by at most a fraction of the contrast threshold, by |dL/dt| from
-    the shader at both ends of the step, and edges of at least a threshold move by at most that many pixels."""
+    the shader at times between which nothing moves faster, and edges of at least a threshold move by at most that many
+    pixels."""
 
     kind: Literal["brightness"] = "brightness"
+    sample_every: int = Field(
+        4,
+        ge=1,
+        le=64,
+        description="the step is chosen from a small picture with every n-th pixel in x and y; 1: all",
+    )
     max_fraction_of_threshold: float = Field(
         1.0,
         gt=0,

@@ -143,6 +143,8 @@ class Timeline:
         """Timelines of other cameras whose pace also limits this one (:mod:`blinkgl.timeline.strategy`)."""
         self.too_long, self.longest = 0, 0.0
         """Number of steps so far that ``min_step_us`` kept too long, and the largest motion of any, in steps."""
+        self.unseen: tuple[int, int] | None = None
+        """The first two times, a shortest step apart, between which something may happen unseen."""
         self._known: Recent[int, float] = Recent(_KNOWN)
 
     def __iter__(self) -> Iterator[int]:
@@ -165,7 +167,15 @@ class Timeline:
                 f"{self.too_long} steps between event frames are {self.config.min_step_us:g} µs long and would have to "
                 f"be up to {self.longest:.3g} times shorter for this motion; expected a smaller timeline.min_step_us"
             )
+        if self.unseen and not self.scene.motion.unbounded:
+            found.append(
+                f"something may pass, or move to and fro, unseen within {self.config.min_step_us:g} µs, first at "
+                f"{self.unseen[0] * 1e-9:.9g} s; expected a smaller timeline.min_step_us"
+            )
         return (*found, *(line for other in self.others for line in other.notes))
+
+    def misses(self, ta_ns: int, tb_ns: int) -> None:
+        self.unseen = self.unseen or (ta_ns, tb_ns)
 
     def at(self, t_ns: int) -> float:
         """Return the steps per second that the strictest camera needs at one time."""

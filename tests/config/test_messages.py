@@ -185,7 +185,7 @@ def test_every_error_of_every_key_is_plain(monkeypatch, third):
             "timeline: {fps: 100}",
             (
                 "timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, "
-                "min_step_us, percentile, sample_every; it is a key of kind: uniform"
+                "min_step_us, percentile; it is a key of kind: uniform"
             ),
         ),
         ("events: {k1: 3}", "events.k1: unknown key; expected one of: causes, contrast_threshold"),

@@ -65,14 +65,19 @@ def timelines(interval: float):
         percentile,
     )
     brightness = st.builds(
-        lambda part, p: {"kind": "brightness", "max_fraction_of_threshold": part, "percentile": p},
+        lambda part, p, n: {
+            "kind": "brightness",
+            "max_fraction_of_threshold": part,
+            "percentile": p,
+            "sample_every": n,
+        },
         magnitude(1e-3, 100),
         percentile,
+        st.sampled_from([1, 4, 64]),
     )
     adaptive = st.builds(
-        lambda way, how, longest: {**way, **longest, **how},
+        lambda way, longest: {**way, **longest},
         displacement | brightness,
-        some(sample_every=st.sampled_from([1, 4, 64])),
         steps,
     )
     return uniform | adaptive

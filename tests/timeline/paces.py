@@ -26,6 +26,9 @@ class Formula:
     def bend(self, ta_ns: int, tb_ns: int) -> float:
         return 0.0
 
+    def misses(self, ta_ns: int, tb_ns: int) -> None:
+        pass
+
 
 def displacement_times(
     max_px: float, low_ns: int, high_ns: int, t0_ns: int, t1_ns: int, speed: Callable[[int], float], dense: int = 0

@@ -17,6 +17,7 @@ from blinkgl.config.timeline import DisplacementTimeline, UniformTimeline
 from blinkgl.events import Esim, Events
 from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.render.renderer import Renderer
+from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.motion.paths import CutPath, KeyframePath
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Skin
@@ -27,6 +28,7 @@ from blinkgl.tools.trade.matching import match_events
 from tests.render.render_scenes import (
     LEVEL,
     SECOND,
+    drift,
     quad,
     rig,
     scene,
@@ -183,3 +185,46 @@ def test_no_motion_between_two_frames_goes_unseen(gl, world):
     assert len(made) == pytest.approx(len(dense), rel=0.03)
     matching = match_events(dense, made, HEIGHT, WIDTH, 4000)
     assert matching.matched.mean() > 0.95
+
+
+# --- what cannot be held is said
+
+
+def test_motion_too_fast_for_the_shortest_step_is_said(gl):
+    """50,000 px/s, at most a pixel a step: 11 px in 200 µs; and a ball that passes within 8 µs."""
+    flies = drift((-40, 2, 0), (85, 2, 0), seconds=0.1)
+    world = seen([thing("ball", 2, sphere(0.25, 3), flies, WHITE)])
+    with Renderer(gl, world, RenderConfig()) as renderer:
+        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        times = list(made)
+    assert len(times) < 100 and made.longest == pytest.approx(1250 * FOCAL / 1.75 * 200e-6, rel=0.01)
+    (note,) = made.notes
+    assert note.startswith(f"{made.too_long} steps between event frames are 200 µs long and would have to be up to ")
+    assert note.endswith("times shorter for this motion; expected a smaller timeline.min_step_us")
+    flies = drift((-5e3, 2, 0), (2e4, 2, 0), seconds=0.1)
+    with Renderer(gl, seen([thing("ball", 2, sphere(0.25, 3), flies, WHITE)]), RenderConfig()) as renderer:
+        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        assert len(list(made)) < 20
+    (note,) = made.notes
+    assert note.startswith("something may pass, or move to and fro, unseen within 200 µs, first at 0.01")
+
+
+def test_many_keys_close_to_each_other_cost_no_more_than_looks(gl):
+    """100,000 key frames a microsecond apart, of a tremble of a thousandth of a pixel."""
+    times = np.arange(0, END, 1000)
+    tremble = 1e-3 / FOCAL * np.random.default_rng(0).normal(0, 1, (len(times), 3))
+    path = KeyframePath(times, tremble, Rotation.concatenate([LEVEL] * len(times)))
+    with Renderer(gl, seen([wall()], path), RenderConfig()) as renderer:
+        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        assert len(list(made)) < 600 and made.looks < 6000
+
+
+def test_a_deformer_without_a_time_scale_is_named(gl):
+    mesh = BUILDERS["flag"]()
+    mesh.deformer.timescale_ns = None
+    body = thing("flag", 2, mesh, still((0, 3, 0)), SHARP)
+    with Renderer(gl, seen([wall(GREY), body]), RenderConfig()) as renderer:
+        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        assert made.notes == (
+            "the deformer of 'flag' has no timescale_ns, so steps are examined every timeline.min_step_us",
+        )

@@ -47,9 +47,9 @@ def times_of(config, renderer, response=Esim.response(ESIM)) -> np.ndarray:
 @pytest.mark.parametrize(
     "config, inside",
     [
-        (DisplacementTimeline(max_px=0.5, sample_every=1), [(100, 0.5)]),
-        (DisplacementTimeline(max_px=0.3, percentile=50, sample_every=2), [(50, 0.3)]),
-        (DisplacementTimeline(max_px=0.3, percentile=50, max_px_peak=0.4, sample_every=1), [(50, 0.3), (100, 0.4)]),
+        (DisplacementTimeline(max_px=0.5), [(100, 0.5)]),
+        (DisplacementTimeline(max_px=0.3, percentile=50), [(50, 0.3)]),
+        (DisplacementTimeline(max_px=0.3, percentile=50, max_px_peak=0.4), [(50, 0.3), (100, 0.4)]),
     ],
 )
 def test_displacement_over_whole_intervals(gl, world, config, inside):

@@ -266,7 +266,45 @@ def networks(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
     return {name: row(name) for name in NETWORKS}
 
 
-WHATS = {f.__name__: f for f in (events, generate, build, passes, labels, formats, start, online, voxels, networks)}
+def main_thread(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
+    """An event frame with the choice of its time and its events: of the configuration at 640x480 (flying_objects unless
+    --config is given), of a crowd, and of 1,000 boxes at 320x240; and what of it keeps the main thread busy. With
+    GALLIUM_NOOP=1 and --set render.antialiasing=none Mesa draws nothing: what an endlessly fast card would leave."""
+    from blinkgl import load
+    from blinkgl.gl import create_context
+    from blinkgl.render.renderer import Renderer
+    from blinkgl.scene.build import sequence_scene
+    from blinkgl.sequence import SequenceRequest, simulate_sequence
+
+    gl, folder = stack.enter_context(create_context()), resources.files("blinkgl.configs")
+    sizes = {"640x480": ["camera.width=640", "camera.height=480"], "320x240": ["camera.width=320", "camera.height=240"]}
+
+    def made(config: Any, scene: Scene) -> Row:
+        renderer = stack.enter_context(Renderer(gl, scene, config.render))
+        request = SequenceRequest(config, 0, labels=False, scene=scene, renderer=renderer)
+        sequences = (simulate_sequence(request, gl).alone for _ in itertools.count())
+        chunks = itertools.chain.from_iterable(sequence.chunks() for sequence in sequences)
+
+        def row() -> dict[str, float]:
+            began = time.thread_time()
+            frames = sum(1 for _ in itertools.islice(chunks, 12))
+            return {"units": frames, "main thread": time.thread_time() - began}
+
+        return row
+
+    first = Path(options.config or str(folder / "flying_objects.yaml"))
+    rows: Rows = {}
+    for size, file in (("640x480", first), ("320x240", Path(str(folder / "scenes" / "crossing.yaml")))):
+        config = load(file, [*sizes[size], *options.overrides]).sequence(0)
+        rows[f"{file.stem}, {size}"] = made(config, sequence_scene(config, 0, file.parent))
+    rows["1,000 boxes, 320x240"] = made(config, boxes(1000))
+    return rows
+
+
+WHATS = {
+    f.__name__: f
+    for f in (events, generate, build, passes, main_thread, labels, formats, start, online, voxels, networks)
+}
 
 
 def probe_scene(kind: str, width: int, height: int) -> Scene:
@@ -303,6 +341,30 @@ def probe_scene(kind: str, width: int, height: int) -> Scene:
     camera = PinHole.centred(width, height, focal_length(width, math.radians(60)))
     rig = Rig.alone(camera, KeyframePath(keys, rng.normal(0, 0.2, (4, 3)), turns))
     return Scene(tuple(objects), rig, 0, 2 * SECOND)
+
+
+def boxes(count: int) -> Scene:
+    """Textured boxes that move before a moving camera of 320x240."""
+    from scipy.spatial.transform import Rotation
+
+    from blinkgl.camera import PinHole
+    from blinkgl.scene.geometry import primitives
+    from blinkgl.scene.motion.paths import KeyframePath
+    from blinkgl.scene.rig import Rig
+    from blinkgl.scene.surfaces.textures import procedural_texture
+    from blinkgl.scene.types import Material, Part, Scene, SceneObject
+
+    rng, times = np.random.default_rng(1), np.linspace(0, SECOND, 4).astype(np.int64)
+    materials = [Material(procedural_texture("fbm", k, 128)) for k in range(8)]
+    shapes = [primitives.cuboid(extents=(0.2, 0.2, 0.2)), primitives.icosphere(radius=0.12, subdivisions=1)]
+    objects = []
+    for k in range(count):
+        centre = rng.uniform((-3, 4, -2.2), (3, 9, 2.2))
+        path = KeyframePath(times, centre + rng.normal(0, 0.1, (4, 3)), Rotation.random(4, random_state=k))
+        objects.append(SceneObject(f"box {k}", k + 1, (Part(shapes[k % 2], materials[k % 8]),), path))
+    level = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    moves = KeyframePath(times, rng.normal(0, 0.1, (4, 3)), Rotation.concatenate([level] * 4))
+    return Scene(tuple(objects), Rig.alone(PinHole.centred(320, 240, 280.0), moves), 0, SECOND)
 
 
 # --- the measured processes -------------------------------------------------------------------------------------------

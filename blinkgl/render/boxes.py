@@ -7,12 +7,14 @@ the triangles.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.labels.semantics import Categories, category_of, class_of
 from blinkgl.machine.kernels import kernel
-from blinkgl.render.casting import vertices_at
+from blinkgl.render.casting import cast, vertices_at
 from blinkgl.render.moment import cam_from_obj
 from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.types.boxes import Boxes, no_boxes
@@ -32,7 +34,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         x0, y0, x1, y1, seen = (int(n) for n in shown[obj.instance_id])
         if not seen and not obj.deforms and _aside(camera, obj, T_cam_obj):
             continue
-        vertices, faces = _solid(obj, t_ns)
+        vertices, faces = _solid(obj, t_ns, T_cam_obj)
         if not len(faces):
             continue
         px, drawn = _projected(camera, vertices @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3], faces)
@@ -43,9 +45,13 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
         # Pixels that it would cover if nothing were in front of it.
-        mask = np.zeros(ids.shape, np.bool_)
-        cover(px, drawn, mask)
-        pixels = max(int(np.count_nonzero(mask)), seen)
+        if any(part.material.mask is not None for part in obj.parts):
+            amodal, pixels = _holed(scene, obj, t_ns, amodal)
+            pixels = max(pixels, seen)
+        else:
+            mask = np.zeros(ids.shape, np.bool_)
+            cover(px, drawn, mask)
+            pixels = max(int(np.count_nonzero(mask)), seen)
         # An object between the pixel centres has no box.
         if not pixels:
             continue
@@ -86,14 +92,47 @@ def _aside(camera: CameraModel, obj: SceneObject, T_cam_obj: np.ndarray) -> bool
     return bool((camera.frustum_planes() @ T_cam_obj[:3, 3] < -obj.radius).any())
 
 
-def _solid(obj: SceneObject, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices of all parts at t_ns, (V, 3) float64, object axes, and the faces, (F, 3)."""
+def _solid(obj: SceneObject, t_ns: int, T_cam_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices of all parts at t_ns, (V, 3) float64, object axes, and the faces, (F, 3): of open surfaces
+    that are drawn from one side only, those that show it to the camera."""
     vertices, faces, begin = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    # The camera's centre in the object's axes.
+    eye = -T_cam_obj[:3, :3].T @ T_cam_obj[:3, 3]
     for part in obj.parts:
-        vertices.append(vertices_at(part.mesh, t_ns))
-        faces.append(part.mesh.faces.astype(np.int64) + begin)
+        at, shown, side = vertices_at(part.mesh, t_ns), part.mesh.faces.astype(np.int64), part.side(t_ns)
+        if side and not part.mesh.closed:
+            a, b, c = (at[shown[:, k]] for k in range(3))
+            shown = shown[side * np.einsum("fk,fk->f", np.cross(b - a, c - a), eye - a) > 0]
+        vertices.append(at)
+        faces.append(shown + begin)
         begin += len(vertices[-1])
     return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _holed(scene: Scene, obj: SceneObject, t_ns: int, box: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return (the amodal box of a body with holes, the pixels of the picture that it covers): of the pixel centres in
+    the box of its triangles whose rays meet it, as if it were alone. The box is that one where the picture would have
+    to be more than :data:`WIDEST` times as wide and high."""
+    camera = scene.camera
+    size = np.array([camera.width, camera.height])
+    low, high = np.ceil(box[:2]), np.floor(box[2:])
+    near, far = np.maximum(low, -WIDEST * size), np.minimum(high, WIDEST * size)
+    if (far < near).any():
+        return box, 0
+    x, y = (np.arange(a, b + 1) for a, b in zip(near, far, strict=True))
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    met = xy[cast(replace(scene, objects=(obj,)), t_ns, xy).hit]
+    pixels = int(np.count_nonzero(((met >= 0) & (met <= size - 1)).all(axis=1)))
+    if not len(met):
+        return box, 0
+    around = np.concatenate([met.min(axis=0) - 0.5, met.max(axis=0) + 0.5])
+    # Sides beyond what was looked at stay as they are.
+    around = np.where(np.concatenate([low < near, high > far]), box, around)
+    return np.concatenate([np.maximum(around[:2], box[:2]), np.minimum(around[2:], box[2:])]), pixels
+
+
+WIDEST = 2
+"""Pictures' sizes beside the picture in which a body with holes is looked for."""
 
 
 def _projected(camera: CameraModel, points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -109,7 +109,8 @@ def judged_by_samples(
 
     HIDDEN: outside the image, before the near plane, or all four pixels around the new position show other, nearer
     objects. SEEN: all four show the point's own object, nothing thin is near (:func:`near_thin`), and their depths,
-    interpolated in 1/Z (exact on a plane), are the point's and differ little. UNDECIDED: the rest.
+    interpolated in 1/Z (exact on a plane), are the point's and differ little. UNDECIDED: the rest, and the outer half
+    pixel of the image.
     """
     height, width = valid.shape
     thin, nearness = near_thin(ids_there, depth_there), _nearness(depth_there)
@@ -124,9 +125,11 @@ def judged_by_samples(
             if not (-0.5 <= xt < width - 0.5 and -0.5 <= yt < height - 0.5) or z_there[y, x] < near:
                 verdict[y, x] = HIDDEN
                 continue
+            # Outside the outermost pixel centres the picture says nothing.
+            if not (0.0 <= xt <= width - 1.0 and 0.0 <= yt <= height - 1.0):
+                verdict[y, x] = UNDECIDED
+                continue
             inverse = 1.0 / np.float64(z_there[y, x])
-            # At the border the four pixels are the outermost ones and the weights extrapolate: otherwise a slanted
-            # surface would seem nearer than its own point there.
             x0 = min(max(int(np.floor(xt)), 0), last_x)
             y0 = min(max(int(np.floor(yt)), 0), last_y)
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)

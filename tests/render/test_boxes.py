@@ -19,7 +19,8 @@ from blinkgl.labels.semantics import BY_NAME, category_of, class_of
 from blinkgl.render.boxes import before
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.shapes.table import deformer_of
-from render_scenes import LEVEL, cube, drift, quad, rig, scene, sphere, still, thing
+from blinkgl.scene.types import Mask, Material, Part, SceneObject
+from render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, sphere, still, thing
 
 MS = 1_000_000
 T = 300 * MS
@@ -187,3 +188,58 @@ def test_boxes_are_drawn_over_pictures(made):
     assert not before_.any() and over.any()
     left, top, _, bottom = frame.boxes.visible_box[0]
     assert over[int(top + 0.5) : int(bottom), int(left + 0.5)].any(axis=-1).all()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_bodies_with_holes_and_of_one_side_are_as_large_as_they_are_seen(gl, turn):
+    """Alone before the camera nothing hides them: a plate whose mask leaves its middle, half a tube that is drawn from
+    its front only, and both in one body. Their boxes are those of their pixels."""
+    alpha = np.zeros((64, 64), np.uint8)
+    alpha[16:48, 16:48] = 255
+    leaf = Material(mask=Mask(alpha), both_sides=True)
+    angle = np.linspace(0, np.pi, 25)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(25)], 1)
+    tube = np.concatenate([ring - [0, 0, 0.5], ring + [0, 0, 0.5]])
+    k = np.arange(24)
+    faces = np.concatenate([np.stack([k, k + 1, k + 25], 1), np.stack([k + 25, k + 1, k + 26], 1)])
+    shell = mesh(0.5 * tube, faces)
+    front = Material(both_sides=False)
+    facing = Rotation.from_euler("z", turn) * LEVEL * Rotation.from_euler("x", 180, degrees=True)
+    half = Rotation.from_euler("z", 3.0 + turn)
+    both = SceneObject(
+        "both", 3, (Part(quad(0.3, 0.3), leaf), Part(replace(shell, vertices=shell.vertices + [0, 0, 0.7]), front)),
+        still((0, 3, -0.4), facing),
+    )  # fmt: skip
+    what = scene(
+        [
+            thing("leaf", 1, quad(0.5, 0.5), still((-1.0, 3, 0.1), facing), leaf),
+            thing("shell", 2, shell, still((1.0, 3, 0.2), half), front),
+            both,
+        ]
+    )
+    with Renderer(gl, what, RenderConfig()) as renderer:
+        frame = renderer.labels(0, asked_for(LabelsConfig(boxes=True, ids=True, flow=(), images=False)))
+    boxes = frame.boxes
+    assert sorted(boxes.instance.tolist()) == [1, 2, 3]
+    assert (boxes.occluded < 0.01).all() and (boxes.truncated == 0).all()
+    np.testing.assert_allclose(boxes.amodal_pixels, boxes.visible_pixels, rtol=0.01)
+    np.testing.assert_allclose(boxes.amodal_box, boxes.visible_box, atol=1.01)
+
+
+def test_a_holed_body_at_the_edge_of_the_picture_is_cut_there(gl):
+    """The opaque half of a plate lies outside: nothing of it is in the picture, and what is has no pixel."""
+    alpha = np.zeros((64, 64), np.uint8)
+    alpha[:, :32] = 255
+    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
+    camera = rig().sensors[0].camera
+    # The plate's middle on the left edge of the picture.
+    x = (-0.5 - camera.cx) / camera.fx * 3
+    for at, seen in ((x, False), (x + 0.25, True)):
+        plate = thing(
+            "plate", 1, quad(0.5, 0.5), still((at, 3, 0), facing), Material(mask=Mask(alpha), both_sides=True)
+        )
+        with Renderer(gl, scene([plate]), RenderConfig()) as renderer:
+            boxes = renderer.labels(0, asked_for(LabelsConfig(boxes=True, ids=True, flow=(), images=False))).boxes
+        assert len(boxes.instance) == seen
+        if seen:
+            assert boxes.truncated[0] == pytest.approx(0.5, abs=0.03) and boxes.occluded[0] == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from blinkgl.render import casting
 from blinkgl.render.occlusion import HIDDEN, NARROW, REACH, SEEN, UNDECIDED, judged_by_samples, near_thin
 from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger import reference
-from render_scenes import LEVEL, cube, drift, mesh, mixed_scene, quad, rig, scene, sphere, still, thing
+from render_scenes import LEVEL, SECOND, cube, drift, mesh, mixed_scene, quad, rig, scene, sphere, still, thing
 
 MS = 1_000_000
 
@@ -45,7 +46,9 @@ def verdict(x, y, flow, z, ids, depth_there, ids_there, near) -> int:
     xt, yt = x + float(flow[0]), y + float(flow[1])
     if xt < -0.5 or yt < -0.5 or xt >= width - 0.5 or yt >= height - 0.5 or z < near:
         return HIDDEN
-    # the square of pixel centres around the place; at the border the outermost one, beyond which its plane goes on
+    if not (0 <= xt <= width - 1 and 0 <= yt <= height - 1):
+        return UNDECIDED  # no pixel centre is on its other side
+    # the square of pixel centres around the place
     left, top = (int(min(max(np.floor(v), 0), max(many - 2, 0))) for v, many in ((xt, width), (yt, height)))
     corners = [(min(top + dy, height - 1), min(left + dx, width - 1), dx, dy) for dy in (0, 1) for dx in (0, 1)]
     at = [(float(depth_there[r, c]), ids_there[r, c] == ids[y, x]) for r, c, _, _ in corners]
@@ -89,6 +92,23 @@ def test_samples_equal_their_slow_twin(shape):
             assert found[r, c] == expected, (r, c)
             answers.add(expected)
     assert answers == ({SEEN, HIDDEN, UNDECIDED} if min(shape) > 2 else answers)
+
+
+def test_the_outer_half_pixel_is_looked_up(gl):
+    """A wall moves up by 0.3 px behind a bar that covers what is above y = -0.2: the first row's points land at -0.3,
+    in the picture and hidden."""
+    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
+    what = scene([], rig(64, 48, 60.0))
+    camera = what.camera
+    # z of the world where a point 5 units away is at y = -0.2.
+    edge = -(-0.2 - camera.cy) / camera.fy * 5
+    bar = thing("bar", 1, quad(9, 1), still((0, 5, edge + 1), facing))
+    rise = 0.3 / camera.fy * 10
+    wall = thing("wall", 2, quad(30, 30), drift((0, 10, 0), (0, 10, rise), facing, facing))
+    with Renderer(gl, replace(what, objects=(bar, wall)), RenderConfig()) as renderer:
+        frame = renderer.labels(0, LabelRequest("ids", "flow_forward", "occlusion_forward"), SECOND)
+    assert (frame.ids == 2).all() and frame.forward.flow[0, :, 1] == pytest.approx(-0.3, abs=1e-3)
+    assert frame.forward.occluded[0].all() and not frame.forward.occluded[1:].any()
 
 
 # ------------------------------------------------------------------------------------------------- rays

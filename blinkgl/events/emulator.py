@@ -67,9 +67,16 @@ class Emulator(ABC):
     tensor_device: Any = None
     """The torch device of which ``step`` takes frames as tensors, too; None: only arrays."""
     _still_pixels_sleep = False
-    """Whether a pixel whose luminance does not change has no events and no changing state."""
+    """Whether a pixel whose luminance does not change has no events and no changing state. A subclass whose
+    :meth:`_advance` is its own, and may change the frames, says it anew."""
+
     _state: tuple[str, ...] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "_advance" in cls.__dict__ and "_still_pixels_sleep" not in cls.__dict__:
+            cls._still_pixels_sleep = False
 
     @classmethod
     @abstractmethod
@@ -178,12 +185,12 @@ class Emulator(ABC):
         return _flat(frame)
 
     def _checked_time(self, t_ns: int) -> int:
-        try:
-            t_ns = int(t_ns)
-        except (TypeError, ValueError, OverflowError):
+        # 33.3, milliseconds perhaps, would become 33 ns.
+        if not isinstance(t_ns, (int, np.integer)) or isinstance(t_ns, bool):
             raise EventDataError(
                 "not a time stamp", where=f"frame {self.frames}", value=t_ns, accepted="whole nanoseconds"
-            ) from None
+            )
+        t_ns = int(t_ns)
         if self.t_ns is not None and t_ns <= self.t_ns:
             raise EventDataError(
                 "time stamps must increase",

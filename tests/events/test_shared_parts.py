@@ -350,3 +350,31 @@ def test_events_do_not_depend_on_the_number_of_threads(config, monkeypatch):
     for other in results[1:]:
         for a, b in zip(results[0], other):
             assert all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
+
+
+@pytest.mark.parametrize("config", [EsimConfig(), V2eConfig(), VoltmeterConfig()])
+@pytest.mark.parametrize("t", [33.3, 33.0, np.float64(5e6), "5", None, True])
+def test_times_are_whole_nanoseconds(config, t):
+    """Milliseconds as a float would be cut to a few nanoseconds, and make no event."""
+    emulator = make_emulator(config, 8, 8, 0)
+    emulator.step(np.full((8, 8), 0.2, np.float32), 0)
+    with pytest.raises(EventDataError, match=r"not a time stamp .*expected whole nanoseconds"):
+        emulator.step(np.full((8, 8), 0.9, np.float32), t)
+    assert emulator.frames == 1
+
+
+def test_an_emulator_that_changes_frames_sees_all_of_them():
+    """A subclass that lets the light flicker: the source promises that no row has changed, and all pixels fire."""
+
+    class Flickers(Esim):
+        def _advance(self, frame, t_ns):
+            return super()._advance(frame * np.float32(2.0 if t_ns % 2_000_000 else 1.0), t_ns)
+
+    class Inherits(Esim):
+        pass
+
+    config, frame = EsimConfig(threshold_sigma=0.0), np.full((8, 8), 0.2, np.float32)
+    for kind, due in ((Flickers, 64 * 3), (Inherits, 0)):
+        emulator = kind(8, 8, config)
+        emulator.step(frame, 0)
+        assert len(emulator.step(frame, 1_000_000, rows=(0, 0))) == due

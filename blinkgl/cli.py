@@ -8,13 +8,12 @@ prints the output and returns the status; it is imported inside the function, so
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated
 
 import typer
 
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
-from blinkgl.machine.command_line import new_app, run_app
+from blinkgl.machine.command_line import new_app, run_app, safe_main
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = new_app("blinkgl", "Event-camera and optical-flow data sets by rasterisation.")
@@ -356,12 +355,12 @@ GONE = {
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
-    return run_app(app, arguments, "blinkgl", "BlinkGL", GONE)
+    return run_app(app, arguments, "blinkgl", "BlinkGL", GONE, resumes="generate")
 
 
 def main() -> None:
     """The console script."""
-    sys.exit(run(sys.argv[1:]))
+    safe_main(run)
 
 
 if __name__ == "__main__":

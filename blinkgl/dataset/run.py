@@ -9,7 +9,6 @@ not affect it, and a run may be interrupted at any point and continued.
 from __future__ import annotations
 
 import contextlib
-import signal
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.interrupts import STOPS, interruptible
 from blinkgl.sequence_files.index import INDEX, write_index
 
 ATTEMPTS = 3
@@ -90,7 +89,7 @@ def run_dataset(
     # Absolute: workers on other machines start in other folders, and a link may change during the run.
     job = Job(str(out.resolve()), str(template.base.resolve()), plan.recipe_text(), num)
     # Batch systems and `docker stop` end a run like Ctrl-C.
-    with interruptible(signal.SIGTERM), folder.locked(plan.tasks.splits):
+    with interruptible(*STOPS), folder.locked(plan.tasks.splits):
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
         keep_logs = False

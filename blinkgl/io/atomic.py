@@ -133,7 +133,7 @@ def _appearing(final: Path) -> Iterator[Path]:
     """Give a hidden name beside ``final``, whose folder is made. What is there is deleted on any exception, and one
     that names it names ``final`` instead."""
     with output_errors(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(final.parent)
         remove_stale(final.parent)
     temporary = temporary_beside(final)
     try:
@@ -205,6 +205,16 @@ def lock_folder(folder: Path) -> int | None:
         os.close(handle)
         raise
     return handle
+
+
+def make_folders(folder: Path) -> list[Path]:
+    """Make a folder and its missing parents, each synced into its own parent: they outlast a power cut. Return those
+    that were made, innermost first. Raises OSError."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in missing:
+        fsync(place.parent)
+    return missing
 
 
 def refuse_existing(final: str | os.PathLike) -> None:

@@ -83,7 +83,7 @@ def test_workers_that_cannot_start_leave_the_log_their_error_names(tmp_path, mon
     recipe = template(tmp_path)
     (tmp_path / "blinkgl").mkdir()
     (tmp_path / "blinkgl/__init__.py").write_text("raise ImportError('half an installation')")
-    monkeypatch.chdir(tmp_path)  # where 'python -m' looks first
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(BlinkGLError, match="workers cannot start: .*worker-0.log") as failure:
         run_dataset(recipe, tmp_path / "out", Local(1))

@@ -165,6 +165,29 @@ def verify(
 
 
 @app.command()
+def drop(
+    folder: Annotated[str, typer.Argument(metavar="OUT", help="Data set.")],
+    sequences: Annotated[
+        list[str] | None, typer.Argument(metavar="SEQUENCE", help="SPLIT/NAME_000000, or folders of sequences.")
+    ] = None,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--where", metavar="'KEY < VALUE'", help="Those whose line in index.jsonl meets it; all of several."
+        ),
+    ] = None,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="Take them from the record; generate --resume makes them again.")
+    ] = False,
+) -> int:
+    """Take sequences out of a data set on purpose. Their folders are deleted, and generate --resume, verify, export and
+    report agree without them."""
+    from blinkgl.show import drop as command
+
+    return command.run(folder, sequences or [], where=where or [], undo=undo)
+
+
+@app.command()
 def explain(
     config: Annotated[str, typer.Argument(help="YAML file, or the name of a shipped one (blinkgl configs).")],
     sequence: Annotated[

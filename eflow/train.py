@@ -36,7 +36,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from blinkgl.config.reader import to_yaml
 from blinkgl.errors import ConfigError, OutputError
-from blinkgl.io.atomic import lock_folder, make_folders, output_errors, refuse_existing, write_whole
+from blinkgl.io.atomic import LOCK, locked_folder, make_folders, output_errors, refuse_existing, write_whole
 from eflow import checkpoint as ckpt
 from eflow.checkpoint import resume_run, weights_of
 from eflow.config import OptimConfig, TrainConfig
@@ -410,25 +410,27 @@ def _held(out: Path, resume: bool, begun: Callable[[], bool]) -> Iterator[None]:
     """Hold the run folder, so that no other training writes into it. A new one is removed if the training ends before
     its first step. Raises OutputError: it exists, with ``resume`` and files that are no training's; another run uses
     it."""
-    if not resume:
-        refuse_existing(out)
     made = not out.exists()
     with output_errors(out):
         make_folders(out)
-        handle = lock_folder(out)
-    try:
-        if not resume:
-            refuse_existing(out)  # another one may have ended in between
-        elif others := sorted(p.name for p in out.glob("[!.]*") if p.name not in _OURS):
-            raise OutputError(
-                "holds other files than a training's",
-                where=str(out),
-                value=others[0],
-                accepted="the run folder of this training, or a new folder",
-            )
-        yield
-    finally:
-        if handle is not None:
-            os.close(handle)
-        if made and not begun():
-            shutil.rmtree(out, ignore_errors=True)
+    with locked_folder(out):
+        try:
+            _refuse_others(out, resume)
+            yield
+        finally:
+            if made and not begun():
+                shutil.rmtree(out, ignore_errors=True)
+
+
+def _refuse_others(out: Path, resume: bool) -> None:
+    """Raise OutputError for a locked run folder that holds anything, with ``resume`` anything that is no training's."""
+    others = sorted(p.name for p in out.iterdir() if p.name != LOCK.parts[0])
+    if others and not resume:  # another one may have ended in between
+        refuse_existing(out)
+    if foreign := [name for name in others if name not in _OURS and not name.startswith(".")]:
+        raise OutputError(
+            "holds other files than a training's",
+            where=str(out),
+            value=foreign[0],
+            accepted="the run folder of this training, or a new folder",
+        )

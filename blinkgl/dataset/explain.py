@@ -1,13 +1,14 @@
 """``blinkgl explain CONFIG``: what a run models, what it leaves out and why, and its likely cost.
 
-The scene of one sequence is built and a few of its frames are drawn and timed (or, for recorded frames, converted);
-nothing is written.
+The scene of one sequence is built and a few of its frames are drawn and timed (or, for recorded frames, converted).
+For its cost it and the next ones are made, or begun, in a temporary folder.
 """
 
 from __future__ import annotations
 
 import math
 import platform
+import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -23,9 +24,12 @@ from blinkgl.config.quality import DEFAULT, load_quality
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import DisplacementTimeline
-from blinkgl.gl import create_context
+from blinkgl.dataset.generate import generate_sequence
+from blinkgl.dataset.report import SequenceReport
+from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.machine.compiling import working_clock
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
@@ -84,6 +88,8 @@ def _plain(value: Any) -> str:
 
 
 PROBES = 12
+_REHEARSALS, _REHEARSED_S, _REHEARSED_PART = 12, 8.0, 0.4
+"""As many sequences are made to learn the cost, or as take this time; a long one at least for this time and part."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,12 @@ class Explanation:
     left_out: list[tuple[str, str]] = field(default_factory=list)
     frames: int = 0
     seconds: float = 0.0
+    """Wall time of a sequence in a process that has made one before."""
+    bytes: int = 0
     seconds_per_simulated_second: float = 0.0
+    sequences: int = 1
+    """Sequences of the run or group, which take ``run_seconds`` in one process."""
+    run_seconds: float = 0.0
     machine: str = ""
 
     def add(self, name: str, why: str, count: int, each_s: float) -> None:
@@ -116,11 +127,51 @@ class Explanation:
         """List those parts, (name, whether it is there, why not), that are not there."""
         self.left_out += [(name, why) for name, there, why in parts if not there]
 
-    def ended(self, duration: float) -> Explanation:
-        """Return itself with the sums over all passes. duration : s of the sequence."""
-        self.seconds = sum(one.seconds for one in self.passes)
+    def cost(self, sequences: int, costs: list[tuple[float, int]], duration: float) -> Explanation:
+        """Return itself with the cost of a run of ``sequences`` of ``duration`` s, from those of a few in a process."""
+        self.seconds = float(np.mean([seconds for seconds, _ in costs[1:] or costs]))
+        self.bytes = int(np.mean([size for _, size in costs]))
         self.seconds_per_simulated_second = self.seconds / duration
+        self.sequences, self.run_seconds = sequences, costs[0][0] + (sequences - 1) * self.seconds
         return self
+
+
+class _Enough(Exception):
+    """Enough of a sequence was made to know its cost."""
+
+
+def _rehearsals(template: RunTemplate, index: int, count: int, gl: GLContext | None) -> list[tuple[float, int]]:
+    """Return the costs of sequence ``index`` and, of a run of ``count``, of the next ones, which differ, until it took
+    a while. The first one of a process fills its caches. Raises the errors of generating them."""
+    costs = [_rehearsal(template, index, gl)]
+    while len(costs) < min(count, _REHEARSALS) and sum(seconds for seconds, _ in costs) < _REHEARSED_S:
+        costs.append(_rehearsal(template, index + len(costs), gl))
+    return costs
+
+
+def _rehearsal(template: RunTemplate, index: int, gl: GLContext | None) -> tuple[float, int]:
+    """Return the wall time without compiling, s, and the bytes of a sequence that is made in a temporary folder; of a
+    long one the first part is."""
+    began, cost = working_clock(), (0.0, 0)
+
+    def progress(report: SequenceReport, fraction: float) -> None:
+        nonlocal cost
+        spent = working_clock() - began
+        if spent > _REHEARSED_S and fraction > _REHEARSED_PART:
+            once = report.seconds.get("scene", 0.0)
+            cost = once + (spent - once) / fraction, round(_bytes_below(scratch) / fraction)
+            raise _Enough
+
+    with tempfile.TemporaryDirectory(prefix="blinkgl-explain-") as scratch:
+        try:
+            generate_sequence(template.sequence(index), index, scratch, gl, base=template.base, progress=progress)
+            return working_clock() - began, _bytes_below(scratch)
+        except _Enough:
+            return cost
+
+
+def _bytes_below(folder: str) -> int:
+    return sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
 
 
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
@@ -133,8 +184,11 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     config = template.sequence(template.sequence(0).output.first_index if sequence is None else sequence)
     index = config.output.first_index if sequence is None else sequence
     if config.frames is not None:
-        return _explain_frames(config, index, template.base)
+        costs = _rehearsals(template, index, 1, None)
+        result, duration = _explain_frames(config, index, template.base)
+        return result.cost(config.output.sequences, costs, duration)
     with create_context(config.gl.backend, config.gl.device) as gl:
+        costs = _rehearsals(template, index, config.output.sequences, gl)  # first: with empty caches, as a run begins
         scene = sequence_scene(config, index, template.base)
         result = Explanation(machine=gl.renderer)
         for number, name, own, events in config.cameras():
@@ -147,7 +201,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
                     one.passes.append(_frame_camera(own.images, renderer, seen))
                 _left_out(own, seen, one)
             _join(result, name, one)
-    return result.ended((scene.t1_ns - scene.t0_ns) * 1e-9)
+        return result.cost(config.output.sequences, costs, (scene.t1_ns - scene.t0_ns) * 1e-9)
 
 
 def _join(result: Explanation, name: str, one: Explanation) -> None:
@@ -160,8 +214,9 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
     result.frames = max(result.frames, one.frames)
 
 
-def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
-    """Explain a sequence of recorded frames: nothing is rendered; the first few frames are converted and timed."""
+def _explain_frames(config: SequenceConfig, index: int, base: Path) -> tuple[Explanation, float]:
+    """Explain a sequence of recorded frames, and return its duration, s: nothing is rendered; the first few frames are
+    converted and timed."""
     frames = config.frames
     probe = simulate_sequence(SequenceRequest(config, index, base, labels=False)).alone
     files, flows, masks, way = probe.files, probe.flow.files, probe.flow.masks, probe.flow.direction
@@ -204,7 +259,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     headings = [*(label.heading for label in LABELS.values()), "what made each event"]
     others = dict.fromkeys(heading for heading in headings if heading not in brought)
     result.left_out.append((", ".join(others), "recorded frames bring none"))
-    return result.ended(duration)
+    return result, duration
 
 
 def _living(scene: Scene) -> dict[str, str]:

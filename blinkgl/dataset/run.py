@@ -155,8 +155,11 @@ def _leave(plan: Plan, folder: RunFolder, outcome: Outcome, assets: dict[str, st
 
 def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
     """Return what exists already. Raises OutputError for existing sequences without ``resume``."""
-    outcome = Outcome(len(plan.tasks))
+    dropped = folder.dropped
+    outcome = Outcome(len(plan.tasks) - sum(plan.tasks.number(name) is not None for name in dropped))
     for _, task in plan.tasks.present(folder.out):
+        if task.name in dropped:
+            continue
         state = folder.state(task.name)
         if state is None:  # an empty folder
             continue
@@ -178,7 +181,8 @@ def _loop(
 ) -> None:
     running: dict[int, tuple[int, float]] = {}  # task -> attempt, since when
     # Existing entries were checked before; damaged ones have been moved away by now.
-    fresh = ((number, 1) for number, task in enumerate(plan.tasks) if not folder.occupied(task.name))
+    tasks, dropped = enumerate(plan.tasks), folder.dropped
+    fresh = ((n, 1) for n, task in tasks if task.name not in dropped and not folder.occupied(task.name))
     again: deque[tuple[int, int]] = deque()
 
     def tell(message: Message) -> None:

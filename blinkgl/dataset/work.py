@@ -8,7 +8,7 @@ messages (dicts that JSON can carry):
     {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
      "notes": what was guessed or is not drawn}
     {"kind": "said", "task", "text": a line for the user, about compiling}
-    {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
+    {"kind": "done", "task", "first": of this process, "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use
     trying again, "stop": nor anything else}
 """
@@ -112,6 +112,7 @@ class Maker:
         self.job, self.device = job, device
         self.plan = job.plan()
         self.gl: GLContext | None = None
+        self._first = True
 
     @classmethod
     def of(cls, job: Mapping[str, Any], device: int | None) -> Maker:
@@ -198,9 +199,11 @@ class Maker:
             f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} "
             f"labels, {size} bytes; " + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items())
         )
+        first, self._first = self._first, False
         return {
             "kind": "done",
             "task": number,
+            "first": first,
             "bytes": size,
             "cpu_s": time.process_time() - cpu,
             "peak_rss_kib": peak_kib(),

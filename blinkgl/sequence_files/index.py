@@ -14,7 +14,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from operator import itemgetter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter
@@ -82,6 +82,12 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
         **{key: manifest[key] for key in _SOMETIMES if key in manifest},
         "bytes": sum(file["bytes"] for file in manifest["files"].values()),
     }
+
+
+def task_of(line: dict[str, Any]) -> str:
+    """Return the folder of the task that made a line of the index: the rig's folder for one of its cameras."""
+    path = PurePosixPath(line["path"])
+    return str(path.parent if "sensor" in line else path)
 
 
 def write_index(root: str | Path) -> int:

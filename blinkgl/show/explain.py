@@ -9,7 +9,7 @@ from rich.table import Table
 
 from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import Explanation, explain
-from blinkgl.machine.terminal import plain_console, say
+from blinkgl.machine.terminal import clock, plain_console, say, size
 
 
 def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: Sequence[str] = ()) -> int:
@@ -41,6 +41,7 @@ def show(result: Explanation, console: Console) -> None:
     console.print(left)
     say(
         console,
-        f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
-        f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video",
+        f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s and {size(result.bytes)} a sequence "
+        f"({result.seconds_per_simulated_second:.1f} s per simulated second); {result.sequences:,} in one process: "
+        f"{clock(result.run_seconds)} and {size(result.sequences * result.bytes)}",
     )

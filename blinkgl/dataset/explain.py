@@ -38,7 +38,7 @@ from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
 from blinkgl.sequence.inertial import measured
 from blinkgl.sequence.recorded import RECORDED
-from blinkgl.sequence.rendered import surfaces_at
+from blinkgl.sequence.rendered import nothing_in_view, surfaces_at
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Time steps and filters of a configuration compared with the default preset.
@@ -297,7 +297,7 @@ def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[
         else "none: every surface is unlit",
         **_fog(scene),
         "quality": quality_in_words(config),
-        "notes": "; ".join(scene.log) or "–",
+        "notes": "; ".join(scene.log + nothing_in_view(scene)) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
 

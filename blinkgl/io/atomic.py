@@ -223,12 +223,15 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 def _lock(handle: int, folder: Path) -> bool:
     """Lock an open file; return False where neither kind of lock exists. Raises OutputError: another run has it."""
+    assert fcntl is not None
     # fcntl's lock of the open file, which NFS sends to its server, and flock: over NFS they are the same, so that the
     # first that exists is taken alone. struct flock: type, whence, start, length (0: to the end), pid.
     whole = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
-    for take, how in ((fcntl.fcntl, (fcntl.F_OFD_SETLK, whole)), (fcntl.flock, (fcntl.LOCK_EX | fcntl.LOCK_NB,))):
+    by_fcntl = lambda: fcntl.fcntl(handle, fcntl.F_OFD_SETLK, whole)
+    by_flock = lambda: fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    for take in (by_fcntl, by_flock):
         try:
-            take(handle, *how)
+            take()
             return True
         except (BlockingIOError, PermissionError):
             who = os.pread(handle, 200, 0).decode(errors="replace")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import sys
@@ -103,7 +104,14 @@ def safe_main(run: Callable[[list[str]], int]) -> NoReturn:
     """Run the command line of this process and leave with its status. Processes that it starts, those of libraries,
     too, import nothing from the folder that the user stands in (-P of Python)."""
     os.environ.setdefault("PYTHONSAFEPATH", "1")
-    sys.exit(run(sys.argv[1:]))
+    status = run(sys.argv[1:])
+    if Stop.number is not None:
+        # An interrupt that passed through exec() makes Python end itself by SIGINT, whatever the status.
+        atexit._run_exitfuncs()  # noqa: SLF001
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def _is_usage_error(error: Exception) -> bool:

@@ -68,7 +68,7 @@ def local():
         assert pool._processes == [] and pool.free() == 0
 
 
-def gathered(pool: Local, *kinds: str, seconds: float = 20.0) -> list[dict]:
+def gathered(pool: Local, *kinds: str, seconds: float = 600.0) -> list[dict]:
     """Messages up to the first of one of these kinds."""
     found, end = [], time.monotonic() + seconds
     while not any(m["kind"] in kinds for m in found):

@@ -103,7 +103,7 @@ def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
     driver.kill()
     driver.communicate()
     assert len(workers) == 2
-    wait_for(lambda: not any(alive(pid) for pid in workers), 30)
+    wait_for(lambda: not any(alive(pid) for pid in workers))
     half = [p for p in out.rglob("*") if p.name in {Path(n).name for n in NAMES}]
     assert 1 <= len(half) < 6 and all((p / "manifest.json").is_file() for p in half)
 

@@ -9,11 +9,7 @@ from importlib import import_module
 
 def main(commands: str = "blinkgl.cli") -> None:
     """Run the command line of a module."""
-
-    def leave(number: int, _) -> None:
-        os.write(2, b"interrupted\n")
-        os._exit(128 + number)
-
+    leave = lambda number, _: os.write(2, b"interrupted\n") and os._exit(128 + number)
     heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
     before = {number: signal.signal(number, leave) for number in heard}
     run = import_module(commands).main

@@ -118,7 +118,7 @@ class Training:
         self.stop = config.optim.steps if stop_after is None else min(config.optim.steps, self.start + stop_after)
         self._make_data(stack)
         if self.lead:  # now that nothing is wrong with the data
-            self.content = content_of(config, self.sources, [scored.sources[0] for _, scored, _ in self.validation])
+            self.content = content_of(config)
             ckpt.same_content(state.get("content", self.content), self.content, config)
             stack.enter_context(_held(out, resume, lambda: self.step > self.start))
         self.net = self._parallel()

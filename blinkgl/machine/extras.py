@@ -7,8 +7,7 @@ import os
 import re
 import shlex
 import sys
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 
 EXTRAS = {  # extra of setup.cfg -> (distributions, purpose)
     "cycles": (
@@ -49,17 +48,14 @@ def python() -> str:
     return shlex.quote(relative if len(relative) < len(sys.executable) else sys.executable)
 
 
-def install(*distributions: str) -> str:
+def install(*names: str) -> str:
     """Return the command that installs them for this interpreter, in compatible versions."""
-    return f"{python()} -m pip install {' '.join(shlex.quote(_PINNED.get(name, name)) for name in distributions)}"
+    return f"{python()} -m pip install {' '.join(shlex.quote(_PINNED.get(name, name)) for name in names)}"
 
 
 def newer_than_tested() -> list[str]:
     """Return "av 19.0.2 (tested: 18.1.0)" for every installed library that is newer than those of the tests."""
+    here = {one.name: one.version for one in distributions() if one.name in TESTED}
     numbers = lambda text: [int(part) for part in re.findall(r"\d+", text.partition("+")[0])]
-    found = []
-    for name, tested in TESTED.items():
-        with suppress(PackageNotFoundError):
-            if numbers(here := version(name)) > numbers(tested):
-                found.append(f"{name} {here} (tested: {tested})")
-    return found
+    newer = sorted(name for name, version in here.items() if numbers(version) > numbers(TESTED[name]))
+    return [f"{name} {here[name]} (tested: {TESTED[name]})" for name in newer]

@@ -98,9 +98,14 @@ def write_index(root: str | Path) -> int:
     for folder in sequence_folders(root):
         with contextlib.suppress(BlinkGLError):
             entries.append(entry(root, folder))
-    with atomic_file(root / INDEX) as path, output_errors(path), open(path, "w", encoding="utf-8") as file:
-        file.writelines(json.dumps(line, sort_keys=True) + "\n" for line in sorted(entries, key=itemgetter("path")))
+    write_lines(root, entries)
     return len(entries)
+
+
+def write_lines(root: Path, lines: list[dict[str, Any]]) -> None:
+    """Write ``index.jsonl`` of these lines. Raises OutputError."""
+    with atomic_file(root / INDEX) as path, output_errors(path), open(path, "w", encoding="utf-8") as file:
+        file.writelines(json.dumps(line, sort_keys=True) + "\n" for line in sorted(lines, key=itemgetter("path")))
 
 
 class _Line(BaseModel):

@@ -16,7 +16,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.dataset.messages import Message
 from blinkgl.dataset.plan import Plan
-from blinkgl.dataset.report import STAGES, SequenceReport, Totals
+from blinkgl.dataset.report import STAGES, SequenceReport, Totals, shares
 from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
@@ -133,7 +133,7 @@ class Display:
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, total=1.0, detail="")
             detail = (
-                f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}"
+                f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {shares(message['seconds'])}"
                 if message["fraction"] < 1
                 else "labels, files"
             )
@@ -212,13 +212,6 @@ class Display:
 
     def _say(self, text: str) -> None:
         say(self._console, text)
-
-
-def _shares(seconds: dict[str, float]) -> str:
-    """Return "render 63 %, events 12 %": the stages that took most of the time so far."""
-    total = sum(seconds.values()) or 1.0
-    largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
-    return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
 
 
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:

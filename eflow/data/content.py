@@ -4,58 +4,60 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError
 from eflow.checkpoint import find_weights
-from eflow.config import TrainConfig
+from eflow.config import SourceConfig, TrainConfig
 from eflow.data.dataset import evenly
-from eflow.data.sources import Source
+from eflow.data.folders import below
 
-_READ = 256
-_END = 1 << 16
+_ENDINGS = {".h5", ".hdf5", ".npz", ".npy", ".png", ".txt", ".csv", ".json", ".yaml"}
+_OPENED, _END = 256, 1 << 16
 """Files of which both ends are read, and the bytes of each: those of a small set whole, of a large one a sample."""
 
 
-def content_of(config: TrainConfig, train: list[Source], validation: list[Source]) -> dict[str, str]:
+def content_of(config: TrainConfig) -> dict[str, str]:
     """Return key -> digest of every set, and of the initial weights where they are still there."""
-    found = {}
-    for name, sources in (("train", train), ("validate_on", validation)):
-        for k, (source, s) in enumerate(zip(sources, getattr(config.data, name), strict=True)):
-            where = f"data.{name}.{k}."
-            if s.recipe is not None:
-                found[where + "recipe"] = _of_recipe(s.recipe, s.set)
-            else:
-                found[where + "path"] = digest_of_files(source.files())
-    if config.init_from:
-        with suppress(AssetError):
-            found["init_from"] = hashlib.sha256(find_weights(config.init_from).read_bytes()).hexdigest()
-    return found
+    kept = {
+        f"data.{name}.{k}." + ("path" if s.recipe is None else "recipe"): _of_set(s)
+        for name in ("train", "validate_on")
+        for k, s in enumerate(getattr(config.data, name))
+    }
+    with suppress(AssetError):
+        if config.init_from:
+            kept["init_from"] = hashlib.sha256(find_weights(config.init_from).read_bytes()).hexdigest()
+    return kept
 
 
-def _of_recipe(recipe: str, overrides: tuple[str, ...]) -> str:
+def _of_set(s: SourceConfig) -> str:
+    if s.recipe is None:
+        return _of_files(Path(s.path or ""))
+    # The renderer is imported for recipes alone.
     from blinkgl.dataset.assets import check_assets
     from blinkgl.dataset.plan import Plan
 
-    plan = Plan.of(load_run(recipe, overrides))
+    plan = Plan.of(load_run(s.recipe, s.set))
     about = [plan.identity, sorted(check_assets(plan).values())]
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
-def digest_of_files(files: Iterable[tuple[str, Path]]) -> str:
-    """Return a digest of names and sizes of all (name, file), and of both ends of evenly spaced ones. Names are those
-    of the samples, not of folders."""
-    found, listed = hashlib.sha256(), list(files)
-    looked = set(evenly(len(listed), _READ))
-    for k, (name, path) in enumerate(listed):
-        size = path.stat().st_size
-        found.update(f"{name} {size}\n".encode())
-        if k in looked:
+def _of_files(root: Path) -> str:
+    """Return a digest of the names below ``root`` and sizes of all data files, and of both ends of evenly spaced ones.
+    Of a recording of MVSEC ``root`` is one of its files."""
+    beside = sorted(root.parent.glob(root.name.removesuffix("data.hdf5") + "*"))
+    files = [p for p in (below(root, "*") if root.is_dir() else beside) if p.suffix in _ENDINGS and p.is_file()]
+    base, digest, opened = root if root.is_dir() else root.parent, hashlib.sha256(), set(evenly(len(files), _OPENED))
+    for k, path in enumerate(files):
+        name, size = path.relative_to(base).as_posix(), path.stat().st_size
+        if name.startswith("."):  # .run: what is known of the run that made a set
+            continue
+        digest.update(f"{name} {size}\n".encode())
+        if k in opened:
             with open(path, "rb") as file:
-                found.update(file.read(_END))
+                digest.update(file.read(_END))
                 file.seek(max(size - _END, 0))
-                found.update(file.read(_END))
-    return found.hexdigest()
+                digest.update(file.read(_END))
+    return digest.hexdigest()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -151,11 +151,6 @@ class MvsecSource:
     def __len__(self) -> int:
         return len(self._index)
 
-    def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield (name, file) of everything that is read."""
-        for s in self._sequences:
-            yield from ((f"{s.name} {path.name}", path) for path in (s.path, s.flow_path))
-
     def __getitem__(self, index: int) -> RawSample:
         s, i = self._index[index]
         t_old, t, t_new = (int(self._stamps(s)[j]) for j in (i - self.dt, i, i + self.dt))
@@ -187,7 +182,7 @@ class _MvsecSequence:
         flow = path.with_name(f"{self.name}_gt_flow_dist.npz")
         if not flow.is_file():
             raise AssetError("no such file", where=str(flow), accepted="ground truth beside the events")
-        self.flow_path, self._flow = flow, NpzRows(flow, ("timestamps", "x_flow_dist", "y_flow_dist"))
+        self._flow = NpzRows(flow, ("timestamps", "x_flow_dist", "y_flow_dist"))
         self.t0_s = float(stamps[0])
         self.image_us = _stamps(stamps - self.t0_s, f"{path}: 'davis/left/image_raw_ts'")
         self.flow_us = _stamps(self._flow.read("timestamps") - self.t0_s, f"{flow}: 'timestamps'")

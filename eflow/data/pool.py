@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -61,10 +61,6 @@ class PoolSource:
 
     def __len__(self) -> int:
         return self.count
-
-    def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield (name, file) of everything that is read."""
-        yield from ((f"{k}", self.root / f"{k:07d}.npz") for k in range(self.count))
 
     def __getitem__(self, index: int) -> RawSample:
         path = self.root / f"{index:07d}.npz"

@@ -16,7 +16,7 @@ import csv
 import os
 import re
 from collections import OrderedDict
-from collections.abc import Iterator, Sized
+from collections.abc import Sized
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -52,7 +52,6 @@ class Source(Protocol):
 
     def __len__(self) -> int: ...
     def __getitem__(self, index: int) -> RawSample: ...
-    def files(self) -> Iterator[tuple[str, Path]]: ...
 
 
 @dataclass(frozen=True)
@@ -119,17 +118,6 @@ class FolderSource:
             backward=backward,
             backward_valid=backward_valid,
         )
-
-    def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield (name, file) of everything that is read; names do not depend on the place of the set."""
-        for s in self.sequences:
-            yield f"{s.name} events", s.events
-            if s.rectify_map:
-                yield f"{s.name} map", s.rectify_map
-        for s, e in self._index:
-            for path in (e.forward, e.backward):
-                if path is not None:
-                    yield f"{s.name} {e.index} {e.from_us} {e.to_us}", path
 
     def entry(self, index: int) -> tuple[Sequence, Entry]:
         """Return the sequence and the label of sample ``index``."""

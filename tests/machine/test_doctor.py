@@ -115,7 +115,8 @@ def test_how_frames_go_to_torch(gl, monkeypatch, answer, status, value, remedy):
 
 
 def test_libraries_that_are_newer_than_tested_are_named(monkeypatch):
-    monkeypatch.setattr(extras, "version", lambda name: {"av": "19.0.2", "numpy": "1.26.4"}.get(name, "0"))
+    here = {"av": "19.0.2", "numpy": "1.26.4", "unknown": "9", "torch": f"{extras.TESTED['torch']}+cpu"}
+    monkeypatch.setattr(extras, "distributions", lambda: [SimpleNamespace(name=k, version=v) for k, v in here.items()])
     assert extras.newer_than_tested() == [f"av 19.0.2 (tested: {extras.TESTED['av']})"]
     (check,) = [check for check in doctor._system() if check.name == "libraries"]
     assert check.value.startswith("newer than tested: av 19.0.2") and check.status == "info"

@@ -86,7 +86,8 @@ def generate(
         typer.Option(help="local: EGL devices to distribute over the workers, e.g. 0,1 (default: all GPUs)."),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a run: generate only the sequences that are not complete.")
+        bool,
+        typer.Option("--resume", help="Begin or continue a run: generate only the sequences that are not complete."),
     ] = False,
     mixed: Annotated[
         bool,

@@ -68,7 +68,7 @@ def train(
         bool, typer.Option("--print-config", help="Print the complete configuration as YAML and exit.")
     ] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the newest checkpoint in the run folder.")
+        bool, typer.Option("--resume", help="Continue from the newest checkpoint in the run folder, or begin.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:

@@ -34,9 +34,9 @@ class Cost:
         """Return the cost of a sequence of which a fraction was made; its scene is built once."""
         once = report.seconds.get("scene", 0.0)
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
-        whole = once + (spent - once) / fraction
-        counts = (round(count / fraction) for count in (size, report.frames, report.events))
-        return cls(whole, *counts, dict(report.seconds))
+        whole = lambda count: round(count / fraction)
+        seconds, frames, events = once + (spent - once) / fraction, whole(report.frames), whole(report.events)
+        return cls(seconds, whole(size), frames, events, dict(report.seconds))
 
 
 def rehearsals(template: RunTemplate, index: int, count: int, gl: GLContext | None) -> list[Cost]:

@@ -10,6 +10,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+import yaml
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
@@ -22,6 +23,7 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, GLError, OutputError
 from runs import RECIPE, Listener, assert_same, recipe_file, temporaries
+from tests.tiny_recipe import TINY
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
 NAMES = [f"train/fly_{i:06d}" for i in range(3)]
@@ -313,3 +315,22 @@ def test_what_is_renamed_has_reached_the_disk(tmp_path):
     assert renamed >= 6
     logs = tmp_path / "a/b/out/.run/logs"
     assert not {name for name in names if name.is_relative_to(tmp_path) and not name.is_relative_to(logs)}
+
+
+@pytest.mark.slow
+def test_a_long_run_keeps_its_memory_and_files(tmp_path):
+    """Five hundred sequences in one process: the last four hundred take no more than the first hundred did."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(yaml.safe_dump({**TINY, "output": {"sequences": 500}}))
+    kept = []
+
+    def look(name, message):
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        kept.append((pages * os.sysconf("SC_PAGE_SIZE") / 2**20, len(os.listdir("/proc/self/fd"))))
+        return False
+
+    outcome = run_dataset(load_run(path), tmp_path / "out", listener=Listener(look, "done"))
+    assert len(outcome.made) == 500
+    memory, files = zip(*kept, strict=True)
+    assert max(memory[400:]) < 1.05 * max(memory[:100]) + 5, "MiB"
+    assert max(files) == max(files[:10])

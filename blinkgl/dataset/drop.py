@@ -56,7 +56,9 @@ def drop(root: str | Path, names: Sequence[str] = (), where: Sequence[str] = (),
                 raise AssetError(problem, where=str(root), value=given, accepted="SPLIT/NAME_000000 of this data set")
             chosen[name] = "by name"
         # Of tens of thousands of sequences the index is read in a second, their manifests in minutes.
-        lines = read_index(root) if (root / INDEX).is_file() else [entry(root, made) for made in sequence_folders(root)]
+        lines = read_index(root) if (root / INDEX).is_file() else []
+        if not here.keys() <= {task_of(line) for line in lines}:  # of a run that was cut off
+            lines = [entry(root, made) for made in sequence_folders(root)]
         for name in _meeting(lines, where) if where else ():
             chosen.setdefault(name, " and ".join(where))
         # The record comes first: cut off here, the same command goes on.

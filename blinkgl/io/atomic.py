@@ -262,7 +262,8 @@ def make_folders(folder: Path) -> list[Path]:
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for place in missing:
-        fsync(place.parent)
+        with contextlib.suppress(PermissionError):  # a folder of others that may be entered and not read
+            fsync(place.parent)
     return missing
 
 

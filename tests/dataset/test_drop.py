@@ -102,6 +102,8 @@ def test_conditions_on_the_index(out):
         sorted(wanted), f"events<={events[1]} and split = train"
     )
     assert drop(out, where=["events < 0"]) == []
+    (out / "index.jsonl").write_text("".join((out / "index.jsonl").read_text().splitlines(True)[:1]))  # cut off
+    assert drop(out, where=["split = test"]) == sorted(NAMES[4:])
 
 
 def test_cut_off_after_the_record(out, monkeypatch, capsys):

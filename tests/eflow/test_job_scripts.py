@@ -166,7 +166,7 @@ INSTANTS = {
 @pytest.mark.parametrize("instant", INSTANTS)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_stopped_whenever(tmp_path, data, number, instant):
-    path = config_file(tmp_path, data, steps=12, run__checkpoint_every=2)
+    path = config_file(tmp_path, data, steps=12, run__checkpoint_every=2, run__threads=1)
     whole = train(load_train_config(path), tmp_path / "whole", quiet=True)
     out = tmp_path / "run"
     line = ["train", str(path), "--out", str(out), "--resume", "--quiet"]

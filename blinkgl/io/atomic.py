@@ -203,8 +203,8 @@ def locked_folder(folder: Path) -> Iterator[None]:
             make_folders(path.parent)
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             if not _lock(handle, folder):
-                # Written to standard error: the run goes on, and whoever started it decides.
-                print(f"note: {folder}: this file system has no locks; start no other run here", file=sys.stderr)  # noqa: T201
+                # The run goes on, and whoever started it decides.
+                sys.stderr.write(f"note: {folder}: this file system has no locks; start no other run here\n")
             if not is_still(path, handle):  # a run that ended removed it between our opening and our locking it
                 os.close(handle)
                 handle = None

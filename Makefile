@@ -4,7 +4,7 @@
 # make lint    ruff, formatting, types; what the tests last covered      make format  rewrite what the formatter would; make coverage
 # make docs    install into .venv, build the documentation into out/site
 # make slow    the tests that take long       make bench WHAT=events   a benchmark
-# make fuzz    damaged files (minutes)        make matrix    the tests on other Pythons, and with the oldest libraries
+# make fuzz    damaged files (minutes)        make matrix    the tests on other Pythons, and with the oldest and the newest libraries
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.

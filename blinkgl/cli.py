@@ -8,13 +8,12 @@ prints the output and returns the status; it is imported inside the function, so
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated
 
 import typer
 
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
-from blinkgl.machine.command_line import new_app, run_app
+from blinkgl.machine.command_line import new_app, run_app, safe_main
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = new_app("blinkgl", "Event-camera and optical-flow data sets by rasterisation.")
@@ -91,7 +90,8 @@ def generate(
         typer.Option(help="local: EGL devices to distribute over the workers, e.g. 0,1 (default: all GPUs)."),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a run: generate only the sequences that are not complete.")
+        bool,
+        typer.Option("--resume", help="Begin or continue a run: generate only the sequences that are not complete."),
     ] = False,
     mixed: Annotated[
         bool,
@@ -167,6 +167,29 @@ def verify(
     from blinkgl.show import verify as command
 
     return command.run(folder, deep=sample if deep else 0, seed=seed, base=base)
+
+
+@app.command()
+def drop(
+    folder: Annotated[str, typer.Argument(metavar="OUT", help="Data set.")],
+    sequences: Annotated[
+        list[str] | None, typer.Argument(metavar="SEQUENCE", help="SPLIT/NAME_000000, or folders of sequences.")
+    ] = None,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--where", metavar="'KEY < VALUE'", help="Those whose line in index.jsonl meets it; all of several."
+        ),
+    ] = None,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="Take them from the record; generate --resume makes them again.")
+    ] = False,
+) -> int:
+    """Take sequences out of a data set on purpose. Their folders are deleted, and generate --resume, verify, export and
+    report agree without them."""
+    from blinkgl.show import drop as command
+
+    return command.run(folder, sequences or [], where=where or [], undo=undo)
 
 
 @app.command()
@@ -360,12 +383,12 @@ GONE = {
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
-    return run_app(app, arguments, "blinkgl", "BlinkGL", GONE)
+    return run_app(app, arguments, "blinkgl", "BlinkGL", GONE, resumes="generate")
 
 
 def main() -> None:
     """The console script."""
-    sys.exit(run(sys.argv[1:]))
+    safe_main(run)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Reading one cannot execute code.
     000500/weights.safetensors      parameters and buffers; the metadata holds the model configuration
            ema.safetensors          their moving average, which evaluation uses (if optim.ema is set)
            optimizer.safetensors    AdamW's moments, named by parameter, and torch's generator states
-           state.json               step, seconds, configuration
+           state.json               step, seconds, configuration, digests of the data (eflow.data.content)
 """
 
 from __future__ import annotations
@@ -304,22 +304,29 @@ _OTHER = {
 """Keys that earlier versions had or lacked, with the values that reproduce what those versions computed."""
 
 
-def resume_run(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> tuple[int, float]:
-    """Restore a run from its newest checkpoint; return its step and the seconds of training so far."""
-    folder = newest(out)
-    if folder is None:
-        raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
+_PLACES = re.compile(r"data\.(train|validate_on)\.\d+\.(path|recipe)|init_from")
+"""Keys that say where something is on this machine; :func:`same_content` compares what is there."""
+
+
+def resume_run(folder: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> dict[str, Any]:
+    """Restore a run from its newest checkpoint ``folder``; return its state. A finished training may get more steps or
+    minutes."""
     state = read_state(folder)
     saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
     saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
+    done = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
     for path in sorted({*saved, *now}):
+        before, wanted = saved.get(path), now.get(path)
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
-        if not free and saved.get(path) != now.get(path):
+        if before is not None and wanted is not None:
+            free = free or ("content" in state and _PLACES.fullmatch(path))
+            free = free or (path in done and done[path] >= before and wanted > before)
+        if not free and before != wanted:
             raise ConfigError(
                 "differs from the run that is resumed",
                 where=path,
-                value=now.get(path),
-                accepted=f"{saved.get(path)!r}, or a new run with init_from",
+                value=wanted,
+                accepted=f"{before!r}, or a new run with init_from",
             )
     weights, _ = read_tensors(folder / "weights.safetensors")
     averaged = read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}
@@ -329,7 +336,21 @@ def resume_run(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema)
         if k not in averaged or averaged[k].shape != ema[k].shape:
             raise AssetError(f"lacks the tensor '{k}' of this model", where=str(folder / "ema.safetensors"))
         ema[k].copy_(averaged[k])
-    return state["step"], state["seconds"]
+    return state
+
+
+def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig) -> None:
+    """Raise ConfigError where data have another content than in the run that is resumed. A file of ``init_from`` that
+    has gone is not needed any more."""
+    places = _leaves(json.loads(config.model_dump_json()))
+    for path in sorted({*saved, *now}):
+        if saved.get(path) != now.get(path, saved.get(path) if path == "init_from" else None):
+            raise ConfigError(
+                "another content than in the run that is resumed",
+                where=path,
+                value=places.get(path),
+                accepted="the same files, wherever they are, or a new run with init_from",
+            )
 
 
 def _leaves(tree, prefix: str = "") -> dict[str, object]:

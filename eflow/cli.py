@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -11,8 +10,8 @@ import typer
 
 from blinkgl.errors import ConfigError
 from blinkgl.machine import event_options as of_events
-from blinkgl.machine.command_line import new_app, run_app
-from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.command_line import new_app, run_app, safe_main
+from blinkgl.machine.interrupts import STOPS, interruptible
 from eflow.cli_arguments import (
     Answer,
     Dataset,
@@ -69,11 +68,12 @@ def train(
         bool, typer.Option("--print-config", help="Print the complete configuration as YAML and exit.")
     ] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the newest checkpoint in the run folder.")
+        bool, typer.Option("--resume", help="Continue from the newest checkpoint in the run folder, or begin.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
+    """Train a network. Ctrl-C and SIGTERM end after the step, with a checkpoint; --resume continues. Exit status 130 or
+    143."""
     from eflow.load_config import load_train_config
     from eflow.models import preset
     from eflow.train import as_yaml, train as run_training
@@ -91,6 +91,8 @@ def train(
     if out is None:
         raise ConfigError("no run folder", where="--out", accepted="a new folder, or an existing one with --resume")
     result = run_training(whole, out, resume=resume, quiet=quiet)
+    if result.reason == "signal":
+        raise KeyboardInterrupt
     if not quiet:
         print(f"{result.reason} at step {result.step}: {result.checkpoint}", file=sys.stderr)
 
@@ -136,7 +138,7 @@ def render(
     kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
     refuse_existing(Path(out))  # before any worker starts
-    with interruptible(signal.SIGTERM), open_online(source, seed, split=split) as stream:
+    with interruptible(*STOPS), open_online(source, seed, split=split) as stream:
         done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
     if not quiet:
         print(f"{done} windows in {out}", file=sys.stderr)
@@ -390,12 +392,12 @@ GONE = {
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name) and return the exit status; errors of users do not raise."""
-    return run_app(app, arguments, "eflow", "eflow", GONE)
+    return run_app(app, arguments, "eflow", "eflow", GONE, resumes="train")
 
 
 def main() -> None:
     """The console script."""
-    sys.exit(run(sys.argv[1:]))
+    safe_main(run)
 
 
 if __name__ == "__main__":

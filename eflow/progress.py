@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import json
 import signal
 import sys
@@ -18,7 +19,8 @@ from rich.progress import BarColumn, Progress
 from torch import Tensor
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.atomic import output_errors
+from blinkgl.io.atomic import output_errors, write_whole
+from blinkgl.machine.interrupts import STOPS, Stop
 from blinkgl.machine.terminal import plain_column, plain_console
 
 T = TypeVar("T")
@@ -234,11 +236,13 @@ class Signals:
     def __enter__(self) -> Signals:
         self._old = {}
         with contextlib.suppress(ValueError):  # not in the main thread: the caller handles signals
-            for s in (signal.SIGINT, signal.SIGTERM):
-                self._old[s] = signal.signal(s, self._note)
+            for s in (signal.SIGINT, *STOPS):
+                if signal.getsignal(s) is not signal.SIG_IGN:
+                    self._old[s] = signal.signal(s, self._note)
         return self
 
     def _note(self, number: int, _) -> None:
+        Stop.number = number
         if self.reason and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.reason = "signal"
@@ -269,15 +273,17 @@ class Log:
                     for line in lines
                     if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start
                 ]
-                self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+                write_whole(self.path, "".join(line + "\n" for line in kept))
                 self._file = open(self.path, "a", encoding="utf-8")
             with output_errors(self.table):
                 kept = self._kept_rows()
-                self._table_file = open(self.table, "w", encoding="utf-8", newline="")
-                self._rows = csv.DictWriter(self._table_file, self.columns, extrasaction="ignore", lineterminator="\n")
-                self._rows.writeheader()
-                self._rows.writerows(kept)
-                self._table_file.flush()
+                text = io.StringIO()
+                rows = lambda file: csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")
+                rows(text).writeheader()
+                rows(text).writerows(kept)
+                write_whole(self.table, text.getvalue())  # a kill in between costs no row
+                self._table_file = open(self.table, "a", encoding="utf-8", newline="")
+                self._rows = rows(self._table_file)
             before = [float(kept[-1][key]) if kept else 0.0 for key in ("processor_s", "wall_s")]
             self._began = before[0] - time.process_time(), before[1] - time.monotonic()
             from torch.utils.tensorboard import SummaryWriter

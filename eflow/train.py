@@ -8,7 +8,8 @@ It runs on the CPU or a GPU (``run.device``; auto uses a GPU if there is one), o
 
 A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/, pictures/ and the
 weights of the best validation, best.safetensors. SIGINT and
-SIGTERM end the current step, write a checkpoint and exit 0. ``--resume`` continues from the newest checkpoint. On the
+SIGTERM end the current step and write a checkpoint; the command then exits 130 or 143. ``--resume`` continues from the
+newest checkpoint, and begins where there is none yet, so that a job script needs one line. On the
 CPU the result is bit for bit that of an uninterrupted run: data order and augmentation depend on (seed, step) alone,
 and the learning rate on the step. With ``optim.minutes`` the learning rate depends on the time, which checkpoints
 store; such a run does not repeat bit for bit.
@@ -26,6 +27,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -33,11 +35,12 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from blinkgl.config.reader import to_yaml
-from blinkgl.errors import ConfigError
-from blinkgl.io.atomic import lock_folder, output_errors, refuse_existing, write_whole
+from blinkgl.errors import ConfigError, OutputError
+from blinkgl.io.atomic import LOCK, locked_folder, make_folders, output_errors, refuse_existing, write_whole
 from eflow import checkpoint as ckpt
 from eflow.checkpoint import resume_run, weights_of
 from eflow.config import OptimConfig, TrainConfig
+from eflow.data.content import content_of
 from eflow.data.dataset import FlowDataset, StepSampler, batches, is_endless
 from eflow.data.sources import Source
 from eflow.devices import agree, compile_errors, setup, to_device
@@ -107,37 +110,44 @@ class Training:
             importlib.import_module("torch.utils.tensorboard")  # fail before anything is written
         if self.lead and not resume:
             refuse_existing(out)
-        spent = self._make_network(resume)
+        self.saved = ckpt.newest(out) if resume else None
+        """The checkpoint to go on from; None: the training begins, also with ``resume`` after an early end."""
+        self.begins_anew = resume and self.saved is None
+        state = self._make_network()
+        self.start = self.step = state["step"]
         self.stop = config.optim.steps if stop_after is None else min(config.optim.steps, self.start + stop_after)
         self._make_data(stack)
         if self.lead:  # now that nothing is wrong with the data
+            self.content = content_of(config)
+            ckpt.same_content(state.get("content", self.content), self.content, config)
             stack.enter_context(_held(out, resume, lambda: self.step > self.start))
         self.net = self._parallel()
         self.net.train()
         if self.lead:
+            if self.saved is None:  # a part that ended before its first checkpoint may have left weights
+                (out / "best.safetensors").unlink(missing_ok=True)
             write_whole(out / "config.yaml", as_yaml(self.config))
         self.began, self.read = time.monotonic(), Readings(out)
-        self.course = Course(config.optim, clock(), spent, clock)
+        self.course = Course(config.optim, clock(), state["seconds"], clock)
         self.done = self.course.done(self.start, self.device, self.world)
         self.path = out
         """The newest checkpoint, or the run folder on ranks that do not write."""
 
-    def _make_network(self, resume: bool) -> float:
-        """Make network, optimiser and averaged weights, new or from a checkpoint; return the seconds of training so
-        far."""
+    def _make_network(self) -> dict[str, Any]:
+        """Make network, optimiser and averaged weights, new or from a checkpoint; return its state."""
         config = self.config
         torch.manual_seed(config.seed)
         self.model = build_model(config.model)
-        if config.init_from and not resume:
+        if config.init_from and self.saved is None:
             ckpt.load_weights(self.model, *weights_of(config))
         self.model.to(self.device)
         if config.run.channels_last:
             self.model.to(memory_format=torch.channels_last)
         self.optimizer = _optimizer(self.model, config.optim, self.device)
         self.ema = {k: v.detach().clone() for k, v in self.model.state_dict().items()} if config.optim.ema else None
-        start, spent = resume_run(self.out, config, self.model, self.optimizer, self.ema) if resume else (0, 0.0)
-        self.start = self.step = start
-        return spent
+        if self.saved is None:
+            return {"step": 0, "seconds": 0.0}
+        return resume_run(self.saved, config, self.model, self.optimizer, self.ema)
 
     def _make_data(self, stack: contextlib.ExitStack) -> None:
         """Open the training and validation sets, and check that they fit the network before anything is written."""
@@ -195,6 +205,8 @@ class Training:
                 minutes=self.course.minutes_left(config.run.time_limit),
             ) as progress,
         ):
+            if self.begins_anew:
+                progress.say(f"no checkpoint in {self.out} yet: the training begins")
             waiting = Waiting(batches(self.dataset, sampler, config.data.workers, pin=device.type == "cuda"))
             for batch in waiting:
                 batch = to_device(batch, device, config.run.channels_last)
@@ -308,7 +320,8 @@ class Training:
         progress.note(self.step, scores)
 
     def _save(self) -> Path:
-        about = {"seconds": self.course.seconds, "config": json.loads(self.config.model_dump_json())}
+        config = json.loads(self.config.model_dump_json())
+        about = {"seconds": self.course.seconds, "config": config, "content": self.content}
         return ckpt.save_checkpoint(
             self.out, self.step, self.model, self.ema, self.optimizer, about, self.config.run.keep_checkpoints
         )
@@ -389,23 +402,35 @@ def as_yaml(config: TrainConfig) -> str:
     return to_yaml(json.loads(config.model_dump_json()))
 
 
+_OURS = {"config.yaml", "log.csv", "log.jsonl", "tb", "checkpoints", "pictures", "best.safetensors", "nan_batch.json"}
+
+
 @contextlib.contextmanager
 def _held(out: Path, resume: bool, begun: Callable[[], bool]) -> Iterator[None]:
     """Hold the run folder, so that no other training writes into it. A new one is removed if the training ends before
-    its first step. Raises OutputError: it exists, another run uses it."""
-    if not resume:
-        refuse_existing(out)
-    made = not out.exists() and not resume
+    its first step. Raises OutputError: it exists, with ``resume`` and files that are no training's; another run uses
+    it."""
+    made = not out.exists()
     with output_errors(out):
-        if made:
-            out.mkdir(parents=True, exist_ok=True)
-        handle = lock_folder(out) if out.is_dir() else None
-    try:
-        if not resume:
-            refuse_existing(out)  # another one may have ended in between
-        yield
-    finally:
-        if handle is not None:
-            os.close(handle)
-        if made and not begun():
-            shutil.rmtree(out, ignore_errors=True)
+        make_folders(out)
+    with locked_folder(out):
+        try:
+            _refuse_others(out, resume)
+            yield
+        finally:
+            if made and not begun():
+                shutil.rmtree(out, ignore_errors=True)
+
+
+def _refuse_others(out: Path, resume: bool) -> None:
+    """Raise OutputError for a locked run folder that holds anything, with ``resume`` anything that is no training's."""
+    others = sorted(p.name for p in out.iterdir() if p.name != LOCK.parts[0])
+    if others and not resume:  # another one may have ended in between
+        refuse_existing(out)
+    if foreign := [name for name in others if name not in _OURS and not name.startswith(".")]:
+        raise OutputError(
+            "holds other files than a training's",
+            where=str(out),
+            value=foreign[0],
+            accepted="the run folder of this training, or a new folder",
+        )

@@ -21,7 +21,7 @@ Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `
 
 `--debug`, before or after a command, shows the traceback of an error. Exit status: 0 done; 1 `shader diff` or
 `shader check` found something wrong; 2 your input or the machine (`error: …`, one line); 3 done but for
-sequences (`trade --suite`: scenes) that were set aside; 130 interrupted.
+sequences (`trade --suite`: scenes) that were set aside; 130 interrupted by Ctrl-C, 143 by SIGTERM (one line).
 """
 SHARED_BY = 2
 """An option of so many commands is described once."""
@@ -33,7 +33,7 @@ REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 def page() -> str:
     """The page as Markdown, of the commands that the package installs."""
     scripts = distribution("blinkgl").entry_points.select(group="console_scripts")
-    roots = [(script.name, import_module(script.module).app) for script in sorted(scripts)]
+    roots = [(script.name, import_module(f"{script.name}.cli").app) for script in sorted(scripts)]
     commands = [found for root, app in roots for found in _commands(root, typer.main.get_command(app))]
     rows = {name: _rows(name, command) for name, command in commands}
     count = Counter(row for found in rows.values() for row in found)

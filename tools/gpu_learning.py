@@ -65,7 +65,9 @@ def pack(folder: Path, small: bool) -> None:
 def started(words: Sequence[str], log: Path) -> subprocess.Popen:
     """Begin ``python -m eflow.cli`` with what it says in ``log``."""
     with log.open("a", encoding="utf-8") as file:
-        return subprocess.Popen([sys.executable, "-m", "eflow.cli", *words], stdout=file, stderr=subprocess.STDOUT)
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "eflow.cli", *words], stdout=file, stderr=subprocess.STDOUT
+        )
 
 
 def training(options: Namespace, data: dict[str, Any], optim: dict[str, Any]) -> list[str]:

@@ -109,7 +109,7 @@ def doctor(options: Namespace) -> Rows:
 def command(module: str, *words: str, cache: str | None = None) -> float:
     """Run ``python -m`` a module to its end; return its wall seconds. cache : numba's. Raises RuntimeError."""
     environment = os.environ | ({"NUMBA_CACHE_DIR": cache} if cache else {})
-    began, words = time.perf_counter(), (sys.executable, "-m", module, *words)
+    began, words = time.perf_counter(), (sys.executable, "-P", "-m", module, *words)
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"status {done.returncode}: {last_line(done.stderr)}")

@@ -20,6 +20,7 @@ import argparse
 import contextlib
 import importlib
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -183,9 +184,11 @@ def run_process(
     try:
         process.start()
         there.close()
-        while here.poll(max(0.0, min(row_s, deadline - time.monotonic()))):
+        at_work = False  # starting a process takes as long as the machine is busy: only rows have a limit
+        while here.poll(max(0.0, min(row_s if at_work else math.inf, deadline - time.monotonic()))):
             what, value = here.recv()
-            if what == "begin":
+            at_work = what == "begin"
+            if at_work:
                 row = value
             elif what == "rows":
                 found["rows"] += value

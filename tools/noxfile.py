@@ -1,6 +1,7 @@
-"""The tests on every Python that setup.cfg admits and this machine has, and with the oldest libraries: make matrix.
+"""The tests on every Python that setup.cfg admits and this machine has, and with the oldest and the newest libraries:
+make matrix.
 
-nox -f tools/noxfile.py [-s tests-3.12 | -s oldest] [-- tests/io]
+nox -f tools/noxfile.py [-s tests-3.12 | -s oldest | -s newest] [-- tests/io]
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ nox.options.reuse_venv = "yes"
 nox.options.envdir = str(ROOT / ".nox")  # not in tools/, where the tests would take it for code
 
 
-def run_tests(session: nox.Session, constraints: Path) -> None:
+def run_tests(session: nox.Session, *constraints: str) -> None:
     """Install the package as a developer does, and run the tests (or those after ``--``)."""
-    session.install("-c", str(constraints), "-e", EXTRAS)
+    session.install(*constraints, "-e", EXTRAS)
     session.run("python", "-m", "pytest", "-q", "-n", "auto", "--maxprocesses", "4", *session.posargs)
 
 
@@ -28,7 +29,7 @@ def run_tests(session: nox.Session, constraints: Path) -> None:
 def tests(session: nox.Session) -> None:
     """With the versions of constraints.txt."""
     session.chdir(ROOT)
-    run_tests(session, ROOT / "constraints.txt")
+    run_tests(session, "-c", str(ROOT / "constraints.txt"))
 
 
 @nox.session(python=PYTHONS[0])
@@ -41,4 +42,12 @@ def oldest(session: nox.Session) -> None:
         session.install("uv")
     resolve = ["uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct", "setup.cfg", "-o", str(constraints)]
     session.run(*resolve, external=True)
-    run_tests(session, constraints)
+    run_tests(session, "-c", str(constraints))
+
+
+@nox.session(python=PYTHONS[-1])
+def newest(session: nox.Session) -> None:
+    """With today's libraries, as who installs a wheel gets them."""
+    session.chdir(ROOT)
+    session.install("--upgrade", "--upgrade-strategy", "eager", "-e", EXTRAS)
+    run_tests(session)

@@ -105,7 +105,7 @@ PEERS = {"v2e": v2e, "voltmeter": voltmeter}
 def in_a_process(program: str, checkout: str, density: str, frames: int) -> dict[str, float]:
     """:func:`timed`, with one thread of everything."""
     one = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    command = [sys.executable, "-m", "blinkgl.tools.peers", "--answer", program, checkout, density, str(frames)]
+    command = [sys.executable, "-P", "-m", "blinkgl.tools.peers", "--answer", program, checkout, density, str(frames)]
     done = subprocess.run(command, env={**os.environ, **one}, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(done.stderr)

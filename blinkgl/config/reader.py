@@ -29,6 +29,7 @@ from blinkgl.errors import ConfigError
 MAX_BYTES = 4 << 20
 MAX_VALUES = 100_000
 MAX_DEPTH = 50
+_TOO_DEEP = f"more than {MAX_DEPTH} tables and lists inside one another"
 MAX_DIGITS = 100
 
 # libyaml's parser emits events without recursion; the composer, which counts values, is Python code in both cases.
@@ -76,9 +77,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         self._count(1, event)
         self._depth += 1
         if self._depth > MAX_DEPTH:
-            raise ComposerError(
-                None, None, f"more than {MAX_DEPTH} tables and lists inside one another", event.start_mark
-            )
+            raise ComposerError(None, None, _TOO_DEEP, event.start_mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         self._sizes[id(node)] = self._values - before
@@ -156,6 +155,8 @@ def parse_yaml(text: str, where: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        if "nesting depth" in problem:  # PyYAML has a limit of its own from 6.0.4 on, which may be met first
+            problem = _TOO_DEEP
         raise ConfigError(f"not valid YAML: {problem}", where=place) from None
     finally:
         if loader is not None:

@@ -101,7 +101,8 @@ def _sensor_name(name: str) -> str:
 
 class RigSensorConfig(Config):
     """One device on a rig: an event camera, a frame camera, an inertial unit, or several in one housing that share one
-    lens. `events` is as at the top level, but absent for a sensor with `images` or `imu` that does not give it."""
+    lens. `events` is as at the top level, but absent for a sensor with `images`, or with `imu` and no `camera`, that
+    does not give it."""
 
     name: Annotated[str, AfterValidator(_sensor_name)] = Field(
         description="name of its folder in the sequence's folder"
@@ -219,6 +220,10 @@ def _over_preset(preset: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     return merge(preset, own)
 
 
+_UNSAID = CameraConfig().model_dump(mode="json")
+"""The camera that a sequence's own configuration has for a sensor without one."""
+
+
 def _complete(
     own: dict[str, Any], number: int, tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]
 ) -> dict[str, Any]:
@@ -229,9 +234,17 @@ def _complete(
                 where=f"sensors.{number}.{key}",
                 accepted=f"{key} at the top level",
             )
-    other = own.get("images") is not None or own.get("imu") is not None
+    lens = any(own.get(key) is not None for key in ("camera", "sensor"))
+    other = own.get("images") is not None or (own.get("imu") is not None and not lens)
     events = own["events"] is not None if "events" in own else not other
     camera = events or any(own.get(key) for key in ("labels", "tracks")) or own.get("images") is not None
+    for key in ("readout",) if camera else ("camera", "sensor", "readout"):
+        if not events and own.get(key) is not None and not (key == "camera" and own[key] == _UNSAID):
+            raise ConfigError(
+                "is not used: the sensor has no " + ("events" if camera else "camera"),
+                where=f"sensors.{number}.{key}",
+                accepted="events: {} beside it, or without this key",
+            )
     keys = [key for key in INHERITED if key in tree and (events or key in ("camera", "sensor"))]
     sections = {key: own[key] for key in SECTIONS if key in own and (events or key not in ("events", "readout"))}
     above = {key: copy.deepcopy(tree[key]) for key in keys if camera}

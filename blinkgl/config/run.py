@@ -22,7 +22,6 @@ another.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 from collections.abc import Sequence
@@ -135,7 +134,7 @@ class Group:
     @property
     def identity(self) -> str:
         """Return the SHA-256 of everything that determines sequence n; the number of sequences is not part of it."""
-        tree = copy.deepcopy(self.template.tree)
+        tree = without_places(self.template.tree)
         if isinstance(tree.get("output"), dict):
             for key in ("sequences", "first_index"):
                 tree["output"].pop(key, None)
@@ -195,6 +194,16 @@ def _group(name: str, tree: dict[str, Any], template: RunTemplate, enabled: bool
 def derived_seed(seed: int, name: str) -> int:
     """Return the 63-bit seed of the group ``name``."""
     return int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little") >> 1
+
+
+def without_places(node: Any) -> Any:
+    """Return a copy of plain data with absolute paths by their last parts: another mount, node or container has the
+    same files at another place, and contents are compared."""
+    if isinstance(node, dict):
+        return {key: without_places(value) for key, value in node.items()}
+    if isinstance(node, (list, tuple)):
+        return [without_places(value) for value in node]
+    return Path(node).name if isinstance(node, str) and Path(node).is_absolute() else node
 
 
 def _plain(node: Any) -> Any:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl.config.base import placed
-from blinkgl.config.run import Group, RunTemplate
+from blinkgl.config.run import Group, RunTemplate, without_places
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan
@@ -73,9 +73,8 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
                     used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
                     if path.is_file():
-                        hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = (
-                            f"{path.stat().st_size} bytes"
-                        )
+                        name = f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"
+                        _note(hashes, name, f"{path.stat().st_size} bytes")
             continue
         check_scene(config.scene, base, config.output.split)
         _hash_scene_files(config.scene, base, hashes)
@@ -93,31 +92,43 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
 
 def _falls(tree: Any) -> bool:
     """Return whether some draw of a recipe may have physics."""
+    return any(physics is not None for physics in _values(tree, "physics"))
+
+
+def _values(tree: Any, key: str) -> Iterator[Any]:
+    """Yield what ``key`` says anywhere in plain data."""
     if isinstance(tree, dict):
-        return tree.get("physics") is not None or any(_falls(value) for value in tree.values())
-    return isinstance(tree, (list, tuple)) and any(_falls(value) for value in tree)
+        yield from [tree[key]] if key in tree else ()
+    for value in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, (list, tuple)) else ():
+        yield from _values(value, key)
+
+
+def _note(hashes: dict[str, str], name: str, value: str) -> None:
+    """Note a file by its name, without the place of its folder: the same files may be elsewhere tomorrow."""
+    while hashes.get(name, value) != value:  # of another folder that is called the same
+        name += "'"
+    hashes[name] = value
 
 
 def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
     def file(path: Path, name: str) -> None:
         data = path.read_bytes()
-        hashes[name] = content_hash(data, *dependencies(path, data))
+        _note(hashes, without_places(name), content_hash(data, *dependencies(path, data)))
 
     if isinstance(scene, RandomSceneConfig):
-        for pool in pools(scene, base):
-            hashes.update(
-                {f"{entry.source}/{entry.name}": entry.source_hash for entry in pool.entries if entry.file is not None}
-            )
+        for entry in (entry for pool in pools(scene, base) for entry in pool.entries if entry.file is not None):
+            _note(hashes, f"{without_places(entry.source)}/{entry.name}", entry.source_hash)
         for name in scene.sky.panoramas if scene.sky else ():
             path = resolve(name, base)
             for found in (
                 files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]
             ):
-                hashes[f"{name}/{found.name}"] = content_hash(found.read_bytes())
-    elif isinstance(scene, ExplicitSceneConfig):
-        for used in (mesh.file for mesh in scene.meshes.values()):
-            if used is not None:
-                file(resolve(used, base), used)
+                _note(hashes, f"{without_places(name)}/{found.name}", content_hash(found.read_bytes()))
+    tree = {} if isinstance(scene, RandomSceneConfig) else scene.model_dump()
+    for used in dict.fromkeys([*_values(tree, "file"), *_values(tree, "T_body_sensor")]):
+        if isinstance(used, str) and resolve(used, base).is_file():  # a mesh, a trajectory, a clip
+            file(resolve(used, base), used)
+    if isinstance(scene, ExplicitSceneConfig):
         for used in {used: None for m in scene.materials.values() for used in m.files.values()}:
             file(resolve(used, base), used)
     elif isinstance(scene, FileSceneConfig):

@@ -144,10 +144,12 @@ class RayCluster:
         if address not in ("auto", "local"):
             _reachable(address)
         try:
-            if address == "local":
-                self._start_own()
-            else:
-                ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=True)
+            # Ray puts the folder where it is started first on its workers' path: not the user's.
+            with contextlib.chdir("/"):
+                if address == "local":
+                    self._start_own()
+                else:
+                    ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=True)
         except BlinkGLError:
             raise
         except Exception as error:  # noqa: BLE001 - Ray raises ConnectionError, RuntimeError, ValueError, grpc's own

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.run import RunTemplate, load_run
+from blinkgl.config.run import RunTemplate, load_run, without_places
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.messages import RUN_FOLDER
-from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.records import open_regular, shown
-from blinkgl.sequence_files.index import INDEX, entry, read_index
+from blinkgl.sequence_files.index import INDEX, entry, read_index, task_of
 from blinkgl.sequence_files.sequence_dir import MANIFEST
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -37,6 +37,8 @@ class Verification:
     deep: list[str] = field(default_factory=list)
     in_part: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    dropped: int = 0
+    """Number of sequences that were taken out on purpose."""
 
     @property
     def clean(self) -> bool:
@@ -72,6 +74,7 @@ _AT_TOP = {INDEX, "report.html"}
 
 _MOST_MISSING = 1000
 """Number of missing sequences with a line each; the others are counted."""
+_SHOWN = 5
 
 
 def strangers(root: Path, folders: list[Path]) -> list[str]:
@@ -160,13 +163,16 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     failed: dict[str, str] = {}
     problems = guarded(lambda: failed.update(RunFolder(root).read("failed.json") or {}) or [])
     here = {folder.relative_to(root).as_posix() for folder in folders}
-    # A record may ask for millions: the work grows with what is here.
-    missing = len(plan.tasks) - sum(plan.tasks.number(name) is not None for name in here)
-    for task in islice((task for task in plan.tasks if task.name not in here), min(missing, _MOST_MISSING)):
+    dropped = RunFolder(root).dropped
+    for name in here & dropped.keys():
+        result.add(name, ["was dropped, and is here: run 'blinkgl drop' with it again, or with --undo"])
+    result.dropped = len(dropped)
+    missing, more = _missing(plan, here | dropped.keys(), _MOST_MISSING)
+    for task in missing:
         said = f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"
         result.add(task.name, [said])
-    if missing > _MOST_MISSING:
-        problems.append(f"and {missing - _MOST_MISSING} more sequences that the recipe asks for are missing")
+    if more:
+        problems.append(f"and {more} more sequences that the recipe asks for are missing")
     if record.get("mixed"):
         result.notes.append("the run went on with --mixed: configurations and OpenGL were not compared with its record")
         return problems
@@ -193,6 +199,30 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     return problems
 
 
+def _missing(plan: Plan, here: Set[str], most: int) -> tuple[list[Task], int]:
+    """Return up to ``most`` tasks that are not among the names ``here``, and the number of further ones."""
+    # A record may ask for millions: the work grows with what is here.
+    count = len(plan.tasks) - sum(plan.tasks.number(name) is not None for name in here)
+    found = list(islice((task for task in plan.tasks if task.name not in here), min(count, most)))
+    return found, count - len(found)
+
+
+def lost(root: Path, folders: list[Path]) -> list[str]:
+    """Return a line for sequences that the recipe, or without one the index, names and that are neither here nor
+    dropped: for programs that read a set without verifying it."""
+    here = {folder.relative_to(root).as_posix() for folder in folders}
+    if (plan := plan_of(root)) is not None:
+        tasks, more = _missing(plan, here | RunFolder(root).dropped.keys(), _SHOWN)
+        names = [task.name for task in tasks]
+    elif (root / INDEX).is_file():
+        names = sorted({task_of(line) for line in read_index(root)} - here - {"."})
+        names, more = names[:_SHOWN], max(len(names) - _SHOWN, 0)
+    else:
+        return []
+    lines = [f"{shown(name)}: missing, and was not dropped ('blinkgl drop' does that)" for name in names]
+    return lines + ([f"and {more} more are missing"] if more else [])
+
+
 def made_with(manifest: dict[str, Any]) -> dict[str, str]:
     """Return versions and OpenGL, under the names of the run's record."""
     gl = manifest.get("opengl") or {}
@@ -208,7 +238,7 @@ def _called(template: RunTemplate) -> str:
 
 def comparable(config: SequenceConfig) -> dict[str, Any]:
     """Return plain data without what a sequence's own configuration changes: its number, and which of the folders."""
-    tree = json.loads(config.model_dump_json())
+    tree = without_places(json.loads(config.model_dump_json()))
     for key in ("sequences", "first_index"):
         tree["output"].pop(key)
     if tree["frames"] is not None:

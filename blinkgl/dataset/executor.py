@@ -12,6 +12,7 @@ All have the same interface, so that the loop in :mod:`blinkgl.dataset.run` work
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import selectors
@@ -30,7 +31,7 @@ from blinkgl.gl.context import egl_devices
 from blinkgl.machine.posix import fcntl
 
 _START_S = 600.0  # compiling every kernel for the first time on a slow machine
-_STOP_S = 20.0
+_STOP_S = 2.0  # then SIGKILL: what a writer leaves is removed as that of any dead one
 _BAD_STARTS = 3
 
 
@@ -124,7 +125,7 @@ class Local:
         cores = self._cores or len(os.sched_getaffinity(0))
         # numba and OpenGL read these once, when they are loaded, so they must be in a worker's environment
         # from its start.
-        self._environment = {**os.environ, **thread_environment(self._wanted, cores)}
+        self._environment = {**os.environ, "PYTHONSAFEPATH": "1", **thread_environment(self._wanted, cores)}
         for slot in range(self._wanted):
             self._start(slot)
         # A run begins when every worker has said hello: their machines and assets are compared before any work.
@@ -168,7 +169,7 @@ class Local:
             if process.task == task:
                 process.reason = reason
                 # SIGKILL: a worker that hangs in a driver does not react to SIGTERM. ``poll`` reports its task.
-                process.popen.kill()
+                process.kill()
 
     def close(self) -> None:
         for process in self._processes:
@@ -179,7 +180,7 @@ class Local:
             try:
                 process.popen.wait(max(0.1, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
-                process.popen.kill()
+                process.kill()
                 process.popen.wait()
             process.close()
         self._processes.clear()
@@ -198,6 +199,7 @@ class Local:
         self._selector.unregister(process.channel)
         self._processes.remove(process)
         status = process.popen.wait()
+        process.kill()  # what it had started
         process.close()
         how = process.reason or (
             f"the worker was ended by {signal.Signals(-status).name}"
@@ -235,8 +237,9 @@ class _Process:
         except OSError:
             output = open(os.devnull, "ab")  # noqa: SIM115
         with output:
+            # -P: modules of the folder that the user stands in are not imported, whatever their names.
             self.popen = subprocess.Popen(
-                [sys.executable, "-m", "blinkgl.dataset.worker", str(write_end)],
+                [sys.executable, "-P", "-m", "blinkgl.dataset.worker", str(write_end)],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=output,
@@ -268,6 +271,11 @@ class _Process:
             self.popen.stdin.close()
         except OSError:
             pass
+
+    def kill(self) -> None:
+        """Kill the process and those that it started: it leads a group of its own."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.popen.pid, signal.SIGKILL)
 
     def close(self) -> None:
         try:

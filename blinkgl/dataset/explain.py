@@ -1,40 +1,34 @@
 """``blinkgl explain CONFIG``: what a run models, what it leaves out and why, and its likely cost.
 
-The scene of one sequence is built and a few of its frames are drawn and timed (or, for recorded frames, converted);
-nothing is written.
+The scene of one sequence is built, or its recorded frames are listed; for its cost it and the next ones are made, or
+begun, in a temporary folder.
 """
 
 from __future__ import annotations
 
-import math
 import platform
-import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from blinkgl.config.images import ImagesConfig
-from blinkgl.config.over_time import TracksConfig, imu_count, track_times
+from blinkgl.config.over_time import imu_count, track_times
 from blinkgl.config.quality import DEFAULT, load_quality
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import DisplacementTimeline
+from blinkgl.dataset.rehearsal import Cost, mean_cost, rehearsals
 from blinkgl.gl import create_context
 from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.tracks import track_points
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.types import Light, Scene
-from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
-from blinkgl.sequence.inertial import measured
+from blinkgl.sequence import SequenceRequest, simulate_sequence
 from blinkgl.sequence.recorded import RECORDED
-from blinkgl.sequence.rendered import surfaces_at
+from blinkgl.sequence.rendered import nothing_in_view
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Time steps and filters of a configuration compared with the default preset.
@@ -83,19 +77,13 @@ def _plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-PROBES = 12
-COUNTING_S = 3.0
-"""Wall seconds in which times of frames are counted; those of a longer sequence are estimated from these."""
-
-
 @dataclass(frozen=True)
 class Pass:
-    """One kind of drawing; ``count`` and ``seconds`` in the whole sequence."""
+    """One kind of drawing or computation; ``count`` in the whole sequence."""
 
     name: str
     why: str
     count: int
-    seconds: float
 
 
 @dataclass
@@ -107,22 +95,23 @@ class Explanation:
     left_out: list[tuple[str, str]] = field(default_factory=list)
     frames: int = 0
     seconds: float = 0.0
+    """Wall time of a sequence in a process that has made one before."""
+    bytes: int = 0
     seconds_per_simulated_second: float = 0.0
+    sequences: int = 1
+    """Sequences of the run or group, which take ``run_seconds`` in one process."""
+    run_seconds: float = 0.0
     machine: str = ""
 
-    def add(self, name: str, why: str, count: int, each_s: float) -> None:
-        """Add one more pass, from the time of a single one."""
-        self.passes.append(Pass(name, why, count, each_s * count))
+    stages: dict[str, float] = field(default_factory=dict)
+    """Seconds by stage, of the sequence that is explained."""
+
+    def add(self, name: str, why: str, count: int) -> None:
+        self.passes.append(Pass(name, why, count))
 
     def leave_out(self, *parts: tuple[str, Any, str]) -> None:
         """List those parts, (name, whether it is there, why not), that are not there."""
         self.left_out += [(name, why) for name, there, why in parts if not there]
-
-    def ended(self, duration: float) -> Explanation:
-        """Return itself with the sums over all passes. duration : s of the sequence."""
-        self.seconds = sum(one.seconds for one in self.passes)
-        self.seconds_per_simulated_second = self.seconds / duration
-        return self
 
 
 def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
@@ -135,21 +124,38 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     config = template.sequence(template.sequence(0).output.first_index if sequence is None else sequence)
     index = config.output.first_index if sequence is None else sequence
     if config.frames is not None:
-        return _explain_frames(config, index, template.base)
+        result = Explanation(machine=platform.processor() or platform.machine())
+        costs = rehearsals(template, index, 1, None)
+        return _priced(result, costs, config, _explain_frames(config, index, template.base, costs[0], result))
     with create_context(config.gl.backend, config.gl.device) as gl:
-        scene = sequence_scene(config, index, template.base)
-        result = Explanation(machine=gl.renderer)
-        for number, name, own, events in config.cameras():
+        costs = rehearsals(template, index, config.output.sequences, gl)  # first: with empty caches, as a run begins
+        scene, result = sequence_scene(config, index, template.base), Explanation(machine=gl.renderer)
+        cameras = list(config.cameras())
+        frames = costs[0].frames // max(sum(events for *_, events in cameras), 1)
+        rate = costs[0].events * 1e9 / (scene.t1_ns - scene.t0_ns)
+        for number, name, own, events in cameras:
             own, seen = own.model_copy(update={"preview": config.preview}), scene.seen_by(number)
             with Renderer(gl, seen, config.render) as renderer:
-                one = Explanation(scene=_describe(renderer.scene, renderer, config))
+                one = Explanation(scene=_describe(renderer.scene, renderer, config), frames=frames)
                 if events:
-                    _passes(own, index, seen, renderer, one)
+                    _passes(own, seen, renderer, rate, one)
                 elif own.images is not None:
                     one.passes.append(_frame_camera(own.images, renderer, seen))
                 _left_out(own, seen, one)
             _join(result, name, one)
-    return result.ended((scene.t1_ns - scene.t0_ns) * 1e-9)
+        # What only making it shows, such as motion too fast for the shortest step.
+        if told := [line for line in costs[0].notes if line not in (*scene.log, *scene.omissions)]:
+            result.scene["when made"] = "; ".join(told)
+        return _priced(result, costs, config, (scene.t1_ns - scene.t0_ns) * 1e-9)
+
+
+def _priced(result: Explanation, costs: list[Cost], config: SequenceConfig, duration: float) -> Explanation:
+    """Return ``result`` with the cost of its sequence of ``duration`` s, and of its run."""
+    result.seconds, result.bytes = mean_cost(costs)
+    result.seconds_per_simulated_second, result.stages = result.seconds / duration, costs[0].stages
+    result.sequences = config.output.sequences
+    result.run_seconds = costs[0].seconds + (result.sequences - 1) * result.seconds
+    return result
 
 
 def _join(result: Explanation, name: str, one: Explanation) -> None:
@@ -162,13 +168,12 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
     result.frames = max(result.frames, one.frames)
 
 
-def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
-    """Explain a sequence of recorded frames: nothing is rendered; the first few frames are converted and timed."""
+def _explain_frames(config: SequenceConfig, index: int, base: Path, cost: Cost, result: Explanation) -> float:
+    """Explain a sequence of recorded frames, of which nothing is rendered; return its duration, s."""
     frames = config.frames
     probe = simulate_sequence(SequenceRequest(config, index, base, labels=False)).alone
     files, flows, masks, way = probe.files, probe.flow.files, probe.flow.masks, probe.flow.direction
     duration = (len(files) - 1) / frames.fps
-    result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
     between = {
         "linear": "no frames in between",
         "motion": f"at most {frames.max_px:g} px per step, dense-flow warp",
@@ -179,17 +184,9 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
         "not used": "camera, time, timeline, scene and render: nothing is rendered",
     }
-    count = min(PROBES, len(files)) - 1
-    until_ns, started, steps = round(count * 1e9 / frames.fps), time.perf_counter(), 0
-    for chunk in probe.chunks():
-        steps += 1
-        if chunk.t_ns >= until_ns:
-            break
-    each, rate = (time.perf_counter() - started) / count, probe.events / (1e-9 * until_ns)
-    result.frames = 1 + round((steps - 1) * (len(files) - 1) / count)
+    result.frames, rate = cost.frames, cost.events / duration
     said = f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
-    seconds = each * (len(files) - 1)
-    result.passes.append(Pass("frames and event kernel", said, result.frames, seconds))
+    result.add("frames and event kernel", said, result.frames)
     request = asked_for(config.labels)
     result.leave_out(
         ("images", "images" in request, "labels.images: false"),
@@ -206,7 +203,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     headings = [*(label.heading for label in LABELS.values()), "what made each event"]
     others = dict.fromkeys(heading for heading in headings if heading not in brought)
     result.left_out.append((", ".join(others), "recorded frames bring none"))
-    return result.ended(duration)
+    return duration
 
 
 def _living(scene: Scene) -> dict[str, str]:
@@ -244,7 +241,7 @@ def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[
         else "none: every surface is unlit",
         **_fog(scene),
         "quality": quality_in_words(config),
-        "notes": "; ".join(scene.log) or "–",
+        "notes": "; ".join(scene.log + nothing_in_view(scene)) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
 
@@ -271,101 +268,50 @@ def _shining(light: Light) -> str:
     return ", ".join(names or ["nothing"]) + (", coloured" if is_coloured(light) else "")
 
 
-def _timed(run, times) -> float:
-    run(times[0])
-    started = time.perf_counter()
-    for t in times:
-        run(t)
-    return (time.perf_counter() - started) / len(times)
-
-
-def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, result: Explanation) -> None:
-    """Add every kind of drawing, a few of each timed."""
-    times = [int(t) for t in np.linspace(scene.t0_ns, scene.t1_ns, PROBES)]
-    probe = simulate_sequence(SequenceRequest(config, index, labels=False, scene=scene, renderer=renderer)).alone
-    seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short part of the real sequence
-    event_s = _timed(lambda t: renderer.luminance(t).view(), times)
-    result.frames = _event_frames(config, probe, times, (scene.t1_ns - scene.t0_ns) * 1e-9)
-    if probe.timeline.notes:
-        result.scene["times"] = "; ".join(probe.timeline.notes)
-    result.add("event frames", f"timeline: {config.timeline.kind}", result.frames, event_s)
+def _passes(config: SequenceConfig, scene: Scene, renderer: Renderer, rate: float, result: Explanation) -> None:
+    """Add every kind of drawing and computation. rate : events per simulated second."""
+    result.add("event frames", f"timeline: {config.timeline.kind}", result.frames)
     if config.timeline.kind != "uniform":
         name, why = "speeds", "of surfaces, decide the step; nothing is drawn"
         if config.timeline.kind == "brightness":
             name = "brightness, and velocity of edges"
             why = f"decide the step; every {config.timeline.sample_every}. pixel; displacement misses fewer events"
-        count = int(1.1 * result.frames)  # a step is sometimes shortened
-        result.add(name, why, count, _timed(probe.timeline.pace, times))
-    _pictures(config, renderer, times[:3], (scene.t1_ns - scene.t0_ns) * 1e-9, result)
-    _over_time(config, scene, renderer, result)
+        result.add(name, why, int(1.1 * result.frames))  # a step is sometimes shortened
+    _pictures(config, (scene.t1_ns - scene.t0_ns) * 1e-9, result)
+    _over_time(config, scene, result)
     if config.images is not None:
         result.passes.append(_frame_camera(config.images, renderer, scene))
-    each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - scene.t0_ns), 1e-9)
     said = f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
-    result.add("event kernel", said, result.frames, each)
+    result.add("event kernel", said, result.frames)
 
 
-def _event_frames(config: SequenceConfig, probe: SensorSimulation, times: list[int], duration: float) -> int:
-    """Return the number of event frames: of displacement the times themselves, or as many as a few seconds give; of
-    brightness from the pace at a few times."""
-    timeline = config.timeline
-    if timeline.kind == "uniform":
-        return math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, at any rate
-    if timeline.kind == "displacement":
-        count, until = 0, time.perf_counter() + COUNTING_S
-        for t_ns in probe.timeline:
-            count += 1
-            if time.perf_counter() > until:
-                return round(count * duration / max((t_ns - probe.t0_ns) * 1e-9, 1e-9))
-        return count
-    steps = np.clip(
-        [1 / max(probe.timeline.pace(t), 1e-12) for t in times],
-        timeline.min_step_us * 1e-6,
-        timeline.max_step_us * 1e-6,
-    )
-    return int(duration * np.mean(1 / steps)) + 1
-
-
-def _pictures(
-    config: SequenceConfig, renderer: Renderer, times: list[int], duration: float, result: Explanation
-) -> None:
+def _pictures(config: SequenceConfig, duration: float, result: Explanation) -> None:
     """Add images, labels, the truth of events and the preview."""
     request, labels = asked_for(config.labels), config.time.label_count
     if "images" in request:
         why = f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}"
-        result.add("colour", why, labels + 1, _timed(lambda t: renderer.colour(t).read(), times))
+        result.add("colour", why, labels + 1)
     request = request.without(*(name for name in request if LABELS[name].anti_aliased))
     if request:
-        interval = config.time.interval_ns
-        each = _timed(lambda t: renderer.labels(t, request, t + interval, t - interval), config.time.label_times_ns[:3])
-        result.add("labels", ", ".join(request) + _over_intervals(request, config), labels, each)
+        result.add("labels", ", ".join(request) + _over_intervals(request, config), labels)
     if config.labels.events:
-        each = _timed(lambda t: surfaces_at(renderer, t), times)
-        result.add("what made each event", "surfaces at every event frame (labels.events)", result.frames, each)
+        result.add("what made each event", "surfaces at every event frame (labels.events)", result.frames)
     if config.preview.enabled:
-        each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times)
         pictures = int(duration * config.preview.rate) + 1
-        result.add("preview", f"{config.preview.rate:g} pictures per simulated second", pictures, each)
+        result.add("preview", f"{config.preview.rate:g} pictures per simulated second", pictures)
 
 
-def _over_time(config: SequenceConfig, scene: Scene, renderer: Renderer, result: Explanation) -> None:
+def _over_time(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
     """Add the inertial unit and the point tracks."""
-    t0, t1 = scene.t0_ns, scene.t1_ns
     if config.imu is not None:
-        count = imu_count(config.imu.rate, t0, t1)
-        started = time.perf_counter()
-        measured(scene.camera_path, config.imu, t0, min(t1, t0 + (t1 - t0) // 8), np.random.default_rng(0))
-        each = 8 * (time.perf_counter() - started) / count
+        count = imu_count(config.imu.rate, scene.t0_ns, scene.t1_ns)
         said = f"{count} measurements at {config.imu.rate:g} Hz, {'noisy and ' if config.imu.noisy else ''}ideal"
-        result.add("inertial unit", said, count, each)
+        result.add("inertial unit", said, count)
     if config.tracks is not None:
         ends = config.time.label_times_ns[0], config.time.t1_ns, config.time.interval_ns
-        moments, few = track_times(config.tracks.rate, *ends), TracksConfig(points=64)
-        started = time.perf_counter()
-        track_points(renderer.scene, few, moments[:2], np.random.default_rng(0))
-        each = (time.perf_counter() - started) / 2
+        moments = track_times(config.tracks.rate, *ends)
         said = f"at most {config.tracks.points} points ({config.tracks.choose}) at {len(moments)} times, float64"
-        result.add("point tracks", said, len(moments), each)
+        result.add("point tracks", said, len(moments))
 
 
 def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
@@ -382,17 +328,10 @@ def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
 
 
 def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pass:
-    """Return the pass of a few of its images, timed."""
+    """Return the pass of its images."""
     camera = FrameCamera(renderer, images, 0, (scene.t0_ns, scene.t1_ns))
-    count = min(3, len(camera))
-    camera.take()
-    camera.rewind()
-    started = time.perf_counter()
-    taken = [camera.take() for _ in range(count)]
-    each = (time.perf_counter() - started) / count
     shutter = f"rows {images.row_us:g} µs apart" if images.row_us else "all rows at once"
     said = [f"{len(camera)} images, exposed {images.exposure_us:g} µs, {shutter}"]
-    said += [f"about {np.mean([image.instants for image in taken]):.0f} instants each"]
     said += [
         name
         for name, on in (
@@ -406,7 +345,7 @@ def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pas
         )
         if on
     ]
-    return Pass("frame camera", ", ".join(said), len(camera), each * len(camera))
+    return Pass("frame camera", ", ".join(said), len(camera))
 
 
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:

@@ -103,6 +103,13 @@ class Totals:
         }
 
 
+def shares(seconds: dict[str, float]) -> str:
+    """Return "render 63 %, events 12 %": the stages that took most of the time so far."""
+    total = sum(seconds.values()) or 1.0
+    largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
+    return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
+
+
 _NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images", "fog", "rig", "sensors")
 """Keys added after the first data sets: without them a sequence keeps its bytes."""
 

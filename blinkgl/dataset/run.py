@@ -9,7 +9,6 @@ not affect it, and a run may be interrupted at any point and continued.
 from __future__ import annotations
 
 import contextlib
-import signal
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.interrupts import STOPS, interruptible
 from blinkgl.sequence_files.index import INDEX, write_index
 
 ATTEMPTS = 3
@@ -90,7 +89,7 @@ def run_dataset(
     # Absolute: workers on other machines start in other folders, and a link may change during the run.
     job = Job(str(out.resolve()), str(template.base.resolve()), plan.recipe_text(), num)
     # Batch systems and `docker stop` end a run like Ctrl-C.
-    with interruptible(signal.SIGTERM), folder.locked(plan.tasks.splits):
+    with interruptible(*STOPS), folder.locked(plan.tasks.splits):
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
         keep_logs = False
@@ -156,8 +155,11 @@ def _leave(plan: Plan, folder: RunFolder, outcome: Outcome, assets: dict[str, st
 
 def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
     """Return what exists already. Raises OutputError for existing sequences without ``resume``."""
-    outcome = Outcome(len(plan.tasks))
+    dropped = folder.dropped
+    outcome = Outcome(len(plan.tasks) - sum(plan.tasks.number(name) is not None for name in dropped))
     for _, task in plan.tasks.present(folder.out):
+        if task.name in dropped:
+            continue
         state = folder.state(task.name)
         if state is None:  # an empty folder
             continue
@@ -179,7 +181,8 @@ def _loop(
 ) -> None:
     running: dict[int, tuple[int, float]] = {}  # task -> attempt, since when
     # Existing entries were checked before; damaged ones have been moved away by now.
-    fresh = ((number, 1) for number, task in enumerate(plan.tasks) if not folder.occupied(task.name))
+    tasks, dropped = enumerate(plan.tasks), folder.dropped
+    fresh = ((n, 1) for n, task in tasks if task.name not in dropped and not folder.occupied(task.name))
     again: deque[tuple[int, int]] = deque()
 
     def tell(message: Message) -> None:

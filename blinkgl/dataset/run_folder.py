@@ -4,6 +4,7 @@
     .run/recipe.yaml    the recipe with all overrides      .run/assets.json   content hashes of the pools' files
     .run/costs.jsonl    one line per sequence made: wall seconds by stage, CPU seconds, bytes, memory, attempts
     .run/failed.json    sequences that were set aside, and why
+    .run/dropped.json   sequences that were taken out on purpose (blinkgl drop), and why
     .run/checksums.json SHA-256 of the files above, as the run left them
     .run/logs/          one log per sequence, one per worker
     .run/damaged/       what was found under a sequence's name and was not whole
@@ -28,7 +29,15 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from blinkgl.dataset.messages import RUN_FOLDER, Message, SequenceLog
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file, lock_folder, output_errors, remove_stale
+from blinkgl.io.atomic import (
+    atomic_file,
+    fsync,
+    is_still,
+    locked_folder,
+    make_folders,
+    output_errors,
+    remove_stale,
+)
 from blinkgl.io.records import entries_below, inside, parse, read_text, shown
 from blinkgl.machine.posix import fcntl
 from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
@@ -36,7 +45,7 @@ from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
 FORMAT = "blinkgl-run"
 CHECKSUMS = "checksums.json"
 _BEGUN = ("run.json", "recipe.yaml", "assets.json")
-_ENDED = ("costs.jsonl", "failed.json")
+_ENDED = ("costs.jsonl", "failed.json", "dropped.json")
 """Records that are complete when a run begins, and when it ends."""
 
 
@@ -73,7 +82,8 @@ class _Cost(BaseModel):
 
 
 _TABLE = TypeAdapter(dict[str, str])
-_RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE, CHECKSUMS: _TABLE}
+_RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE, "dropped.json": _TABLE}
+_RECORDS[CHECKSUMS] = _TABLE
 _COST = TypeAdapter(_Cost)
 
 
@@ -130,16 +140,16 @@ class RunFolder:
         """Lock the folder for one run; the lock ends with the process. The folder is made, and removed if it is empty
         in the end: a refused run leaves nothing.   splits : the folders that it writes. Raises OutputError: in use, not
         writable, or a symbolic link where the run writes."""
-        made = self._make()
-        self._handle = self._lock()
+        with output_errors(self.out):
+            made = make_folders(self.out)
         try:
+            # Before the lock, which is a file below .run.
             self._refuse_links(splits)
             self._fresh = not self.path.exists()
-            self._logs = set(self._worker_logs())
-            yield
+            with self._handle(), locked_folder(self.out):
+                self._logs = set(self._worker_logs())
+                yield
         finally:
-            if self._handle is not None:
-                os.close(self._handle)
             with contextlib.suppress(OSError):  # non-empty folders stay
                 for folder in made:
                     folder.rmdir()
@@ -160,30 +170,20 @@ class RunFolder:
         """Return the path of a record. Raises AssetError for a symbolic link."""
         return inside(self.out, f"{RUN_FOLDER}/{name}")
 
-    def _make(self) -> list[Path]:
-        """Return the folders that were made, innermost first."""
-        missing = [folder for folder in (self.out, *self.out.parents) if not folder.exists()]
-        with output_errors(self.out):
-            self.out.mkdir(parents=True, exist_ok=True)
-        return missing
-
-    def _lock(self) -> int | None:
-        """Return the open, locked folder; None where the system has no locks, so that two runs in one folder are not
-        detected."""
-        while fcntl is not None:
-            with output_errors(self.out):
-                handle = lock_folder(self.out)
-            if _same(self.out, handle):
-                return handle
-            # Another run was refused and removed the folder between our opening and our locking it.
-            os.close(handle)  # type: ignore[arg-type]
-            self._make()
-        return None
+    @contextlib.contextmanager
+    def _handle(self) -> Iterator[None]:
+        """Keep the folder open, by which it is known again."""
+        self._opened = None if fcntl is None else os.open(self.out, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            yield
+        finally:
+            if self._opened is not None:
+                os.close(self._opened)
 
     def check_in_place(self) -> None:
         """Raise OutputError when the locked folder is no longer the one at ``out``: deleted, moved or replaced during
         the run."""
-        if not _same(self.out, self._handle):
+        if not self.in_place:
             raise OutputError(
                 "was deleted, moved or replaced during the run",
                 where=str(self.out),
@@ -192,7 +192,7 @@ class RunFolder:
 
     @property
     def in_place(self) -> bool:
-        return _same(self.out, self._handle)
+        return self.out.is_dir() if self._opened is None else is_still(self.out.resolve(), self._opened)
 
     def _worker_logs(self) -> Iterator[Path]:
         return (self.path / "logs").glob("worker-*.log")
@@ -278,6 +278,8 @@ class RunFolder:
         """Write the checksums of the existing records. Raises OutputError."""
         with output_errors(self.path):
             there = [name for name in names if (self.path / name).is_file()]
+            for name in there:  # costs.jsonl grows by appending
+                fsync(self.path / name)
             self._write(CHECKSUMS, {name: digest_of(self.path / name)["sha256"] for name in there})
 
     def altered(self) -> list[str]:
@@ -339,6 +341,19 @@ class RunFolder:
                 self._write("failed.json", still)
             self.seal((*_BEGUN, *_ENDED))
 
+    @property
+    def dropped(self) -> dict[str, str]:
+        """Return the sequences that were taken out on purpose, and why."""
+        return self.read("dropped.json") or {}
+
+    def write_dropped(self, dropped: dict[str, str]) -> None:
+        """Write them, where a run is recorded; they are no failures any more. Raises OutputError."""
+        if self.read("run.json") is not None:
+            failed = self.read("failed.json") or {}
+            self._write("failed.json", {name: why for name, why in failed.items() if name not in dropped})
+            self._write("dropped.json", dropped)
+            self.seal((*_BEGUN, *_ENDED))
+
     def costs(self) -> list[dict[str, Any]]:
         """Return the last line of each sequence; a line cut by a crash is left out."""
         found: dict[str, dict[str, Any]] = {}
@@ -371,13 +386,3 @@ class RunFolder:
 
 def _text(data: dict[str, Any]) -> str:
     return json.dumps(data, indent=1, sort_keys=True) + "\n"
-
-
-def _same(path: Path, handle: int | None) -> bool:
-    if handle is None:
-        return path.is_dir()
-    try:
-        found, held = os.stat(path), os.fstat(handle)
-    except OSError:
-        return False
-    return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)

@@ -8,7 +8,7 @@ messages (dicts that JSON can carry):
     {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
      "notes": what was guessed or is not drawn}
     {"kind": "said", "task", "text": a line for the user, about compiling}
-    {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
+    {"kind": "done", "task", "first": of this process, "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use
     trying again, "stop": nor anything else}
 """
@@ -26,6 +26,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from importlib import resources
+from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -45,6 +46,25 @@ from blinkgl.machine.posix import peak_kib
 from blinkgl.version import __version__
 
 _NEWS_EVERY_S = 0.25
+
+MAKES_BYTES = (
+    *("camera", "config", "events", "gl", "imaging", "io", "labels", "render", "scene", "sequence", "sequence_files"),
+    *("tensors", "timeline", "types", "errors.py", "rng.py", "srgb.py", "version.py"),
+    *(f"dataset/{name}.py" for name in ("__init__", "assets", "generate", "plan", "report")),
+    *(f"machine/{name}.py" for name in ("__init__", "closing", "compiling", "extras", "interrupts", "kernels")),
+    *(f"machine/{name}.py" for name in ("plugins", "posix")),
+    *(f"recordings/{name}.py" for name in ("__init__", "decoding", "fitting", "frame_checks", "frame_noise")),
+    "recordings/simulation.py",
+)
+"""The code that can change a sequence's bytes: what ``generate_run`` imports (a test walks its imports). An edit of
+anything else ends no run."""
+SHIPPED_TABLES = "emulators", "quality", "rigs", "sensors"
+"""Folders of ``configs/`` whose files a recipe uses by name, so that its hash does not cover them."""
+NUMERICS = (
+    *("numpy", "scipy", "numba", "llvmlite", "h5py", "hdf5plugin", "av", "pillow", "tifffile", "trimesh"),
+    *("mapbox_earcut", "python-fcl", "scikit-image", "matplotlib", "PyYAML"),
+)
+"""Distributions whose versions can change bytes, besides OpenCV, whose distribution has several names."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +112,7 @@ class Maker:
         self.job, self.device = job, device
         self.plan = job.plan()
         self.gl: GLContext | None = None
+        self._first = True
 
     @classmethod
     def of(cls, job: Mapping[str, Any], device: int | None) -> Maker:
@@ -178,9 +199,11 @@ class Maker:
             f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} "
             f"labels, {size} bytes; " + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items())
         )
+        first, self._first = self._first, False
         return {
             "kind": "done",
             "task": number,
+            "first": first,
             "bytes": size,
             "cpu_s": time.process_time() - cpu,
             "peak_rss_kib": peak_kib(),
@@ -217,17 +240,14 @@ def report_of(message: Message) -> SequenceReport:
 def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
     """Return everything that affects the bytes: two machines with the same values make the same sequences.
     libraries : versions of those that not every run uses."""
-    import numba
-    import numpy
-    import scipy
+    import cv2
 
     return {
-        "blinkgl": f"{__version__} ({_source_hash()})",
+        **_code(),
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "numpy": numpy.__version__,
-        "scipy": scipy.__version__,
-        "numba": numba.__version__,
+        **{name: version(name) for name in NUMERICS},
+        "opencv": cv2.__version__,
         "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used",
         **libraries,
         **plugin_versions(),
@@ -240,19 +260,25 @@ def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:
 
 
 @lru_cache(maxsize=1)
-def _source_hash() -> str:
-    """Return 12 hex digits of the running code and shaders: a version number does not identify a checkout.
-    BLINKGL_BUILD replaces it (the tag of a container image; tests while the code is edited)."""
+def _code() -> dict[str, str]:
+    """Return the version, and 12 hex digits of each room of the running code: a version number does not identify a
+    checkout. BLINKGL_BUILD replaces them (the tag of a container image; tests while the code is edited)."""
     if build := os.environ.get("BLINKGL_BUILD"):
-        return build
-    # Rooms that do not affect a sequence's bytes are left out, so that editing them does not end a run.
-    found, apart = hashlib.sha256(), {"configs", "tools", "report", "shader_debugger"}  # code that makes no sequence
-    for package in ("blinkgl", "blinkgl.shaders"):
-        root = resources.files(package)
-        for path in sorted(Path(str(root)).rglob("*")):
-            if path.suffix in (".py", ".glsl") and not apart & set(path.parts):
+        return {"blinkgl": f"{__version__} ({build})"}
+    package, shaders, tables = (
+        Path(str(resources.files(name))) for name in ("blinkgl", "blinkgl.shaders", "blinkgl.configs")
+    )
+    rooms = [(f"blinkgl/{name}", package / name) for name in MAKES_BYTES] + [("shaders", shaders)]
+    rooms += [(f"configs/{name}", tables / name) for name in SHIPPED_TABLES]
+    sums: dict[str, Any] = {}
+    for name, place in rooms:
+        found = sums.setdefault(
+            f"code of {name.rpartition('/')[0] if name.endswith('.py') else name}", hashlib.sha256()
+        )
+        for path in [place] if place.is_file() else sorted(place.rglob("*")):
+            if path.suffix in (".py", ".glsl", ".yaml"):
                 found.update(path.name.encode() + b"\0" + path.read_bytes())
-    return found.hexdigest()[:12]
+    return {"blinkgl": __version__, **{name: found.hexdigest()[:12] for name, found in sums.items()}}
 
 
 def _disk_is_full(error: BaseException) -> bool:

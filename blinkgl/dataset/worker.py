@@ -16,7 +16,7 @@ import threading
 
 from blinkgl.machine.interrupts import interruptible
 
-_GRACE_S = 20.0
+_GRACE_S = 2.0
 
 
 def main() -> int:
@@ -69,7 +69,7 @@ def _listen(tasks: queue.Queue) -> None:
     # Idle workers end at the None. A busy one gets the signal; one that hangs must not outlive the driver either.
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(_GRACE_S)
-    os._exit(1)
+    os.killpg(0, signal.SIGKILL)  # with what it started: it leads a group of its own
 
 
 if __name__ == "__main__":

@@ -15,6 +15,8 @@ import os
 import re
 import shutil
 import socket
+import struct
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -133,7 +135,7 @@ def _appearing(final: Path) -> Iterator[Path]:
     """Give a hidden name beside ``final``, whose folder is made. What is there is deleted on any exception, and one
     that names it names ``final`` instead."""
     with output_errors(final):
-        final.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(final.parent)
         remove_stale(final.parent)
     temporary = temporary_beside(final)
     try:
@@ -181,30 +183,88 @@ def atomic_folder(final: str | os.PathLike, *, overwrite: bool = False) -> Itera
             fsync(final.parent)
 
 
-def lock_folder(folder: Path) -> int | None:
-    """Return the open, locked folder for one run that writes into it; the lock ends when it is closed, or with the
-    process. None where the system has no locks. Raises OutputError: another run has it, not writable; OSError: no
-    folder."""
+LOCK = Path(".run/lock")
+"""The file, below a folder, that the one run that writes into the folder has locked. It goes with the run."""
+
+
+@contextlib.contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Hold ``folder``, which exists, for one run that writes into it, also over NFS: a file that is open for writing is
+    locked. The lock ends with the process; what a dead one leaves locks nothing. Where there are no locks, a line says
+    so. Raises OutputError: another run has it, not writable."""
     if fcntl is None:
-        return None
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        yield
+        return
+    path, handle = folder / LOCK, None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError("cannot be written", where=str(folder), accepted="a folder with write permission")
+    with output_errors(folder):
+        while handle is None:
+            make_folders(path.parent)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+            if not _lock(handle, folder):
+                # The run goes on, and whoever started it decides.
+                sys.stderr.write(f"note: {folder}: this file system has no locks; start no other run here\n")
+            if not is_still(path, handle):  # a run that ended removed it between our opening and our locking it
+                os.close(handle)
+                handle = None
     try:
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise OutputError("cannot be written", where=str(folder), accepted="a folder with write permission")
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        with contextlib.suppress(OSError):  # a full disk: the line is for the message alone
+            os.truncate(handle, 0)
+            os.write(handle, f"process {os.getpid()} of {socket.gethostname()}".encode())
+        yield
+    finally:
+        if is_still(path, handle):
+            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a refused run leaves nothing; records stay
+                path.parent.rmdir()
         os.close(handle)
-        raise OutputError(
-            "another run uses this folder",
-            where=str(folder),
-            accepted="another --out, or --resume after it has ended",
-        ) from None
-    except OSError:  # a file system without locks
-        pass
-    except BaseException:
-        os.close(handle)
-        raise
-    return handle
+
+
+def _lock(handle: int, folder: Path) -> bool:
+    """Lock an open file; return False where neither kind of lock exists. Raises OutputError: another run has it."""
+    assert fcntl is not None
+    # fcntl's lock of the open file, which NFS sends to its server, and flock: over NFS they are the same, so that the
+    # first that exists is taken alone. struct flock: type, whence, start, length (0: to the end), pid.
+    whole = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+    by_fcntl = lambda: fcntl.fcntl(handle, fcntl.F_OFD_SETLK, whole)
+    by_flock = lambda: fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    for take in (by_fcntl, by_flock):
+        try:
+            take()
+            return True
+        except (BlockingIOError, PermissionError):
+            who = os.pread(handle, 200, 0).decode(errors="replace")
+            os.close(handle)
+            raise OutputError(
+                "another run uses this folder",
+                where=str(folder),
+                value=who or None,
+                accepted="another --out, or --resume after it has ended",
+            ) from None
+        except OSError:
+            continue
+    return False
+
+
+def is_still(path: Path, handle: int) -> bool:
+    """Return whether the open file or folder is the one at ``path``: not deleted, moved or replaced."""
+    try:
+        found, held = os.stat(path, follow_symlinks=False), os.fstat(handle)
+    except OSError:
+        return False
+    return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)
+
+
+def make_folders(folder: Path) -> list[Path]:
+    """Make a folder and its missing parents, each synced into its own parent: they outlast a power cut. Return those
+    that were made, innermost first. Raises OSError."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in missing:
+        with contextlib.suppress(PermissionError):  # a folder of others that may be entered and not read
+            fsync(place.parent)
+    return missing
 
 
 def refuse_existing(final: str | os.PathLike) -> None:

@@ -348,13 +348,14 @@ class VideoReader:
 def _orientation(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
     """Return (transposed, mirrored left to right, upside down), in the order of application, by which a frame becomes
     upright: x' = a x + c y, y' = b x + d y of its display matrix (ISO 14496-12, 8.3.2)."""
-    for data in frame.side_data:
-        if data.type.name == "DISPLAYMATRIX":
-            # The matrix has nine 32-bit numbers, row by row: a b u, c d v, x y w.
-            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-            if abs(b) > abs(a):
-                return True, c < 0, b < 0
-            return False, a < 0, d < 0
+    # By its key: what iterating yields differs between versions of PyAV.
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is not None:
+        # The matrix has nine 32-bit numbers, row by row: a b u, c d v, x y w.
+        a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+        if abs(b) > abs(a):
+            return True, c < 0, b < 0
+        return False, a < 0, d < 0
     return False, False, False
 
 

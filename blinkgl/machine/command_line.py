@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
 from blinkgl.errors import BlinkGLError, ConfigError, printable
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.extras import EXTRAS, install
-from blinkgl.machine.interrupts import interruptible
+from blinkgl.machine.interrupts import STOPS, Stop, interruptible
 from blinkgl.machine.plugins import load_plugins
 from blinkgl.machine.terminal import never_fail_to_print
 from blinkgl.version import __version__
+
+_CTRL_C = 130
 
 
 def _print_version(context: typer.Context, wanted: bool) -> None:
@@ -56,30 +59,59 @@ def pages() -> Path:
 
 
 def run_app(
-    app: typer.Typer, arguments: list[str], program: str, project: str, gone: Mapping[str, str] | None = None
+    app: typer.Typer,
+    arguments: list[str],
+    program: str,
+    project: str,
+    gone: Mapping[str, str] | None = None,
+    resumes: str = "generate",
 ) -> int:
     """Run ``app`` with ``arguments`` and return the exit status: 2 and one line for an error of the user or the
-    machine, 130 when interrupted, 1 and a traceback for a bug.
+    machine, 130 (Ctrl-C) or 143 (SIGTERM) and one line when interrupted, 1 and a traceback for a bug.
 
     program : name of the command.   project : for reports of unforeseen errors.   gone : "command" or "command
-    --option" of earlier versions, and what to use instead."""
+    --option" of earlier versions, and what to use instead.   resumes : the command that has --resume."""
     never_fail_to_print()
+    Stop.number = None
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
         # Not standalone: typer then raises errors instead of printing its own boxes.
-        with interruptible(), announced_compiling(lambda text: print(text, file=sys.stderr)):
+        with interruptible(*STOPS), announced_compiling(lambda text: print(text, file=sys.stderr)):
             status = app(arguments, prog_name=program, standalone_mode=False)
-        return status if isinstance(status, int) else 0
+        # typer turns KeyboardInterrupt into this status, earlier versions into Abort.
+        if status != _CTRL_C:
+            return status if isinstance(status, int) else 0
+        return _interrupted(arguments, resumes)
     except (KeyboardInterrupt, typer.Abort):
-        print("interrupted", file=sys.stderr)
-        return 130
+        return _interrupted(arguments, resumes)
     except BrokenPipeError:  # `blinkgl … | head`: the reader has gone, which is not an error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:  # noqa: BLE001 - every error leaves as a line for the user
+        if Stop.number is not None and not debug:  # some library turned the interrupt into an error of its own
+            return _interrupted(arguments, resumes)
         said = _said_of_gone(arguments, gone or {}) if _is_usage_error(error) else None
         return _report(error if said is None else said, debug, project)
+
+
+def _interrupted(arguments: list[str], resumes: str) -> int:
+    print("interrupted" + ("; --resume continues" if resumes in arguments else ""), file=sys.stderr)
+    return Stop.status()
+
+
+def safe_main(run: Callable[[list[str]], int]) -> NoReturn:
+    """Run the command line of this process and leave with its status. Processes that it starts, those of libraries,
+    too, import nothing from the folder that the user stands in (-P of Python)."""
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
+    status = run(sys.argv[1:])
+    if Stop.number is not None:
+        # An interrupt that passed through exec() makes Python end itself by SIGINT, whatever the status.
+        atexit._run_exitfuncs()  # noqa: SLF001
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def _is_usage_error(error: Exception) -> bool:

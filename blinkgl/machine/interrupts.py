@@ -16,13 +16,26 @@ import time
 from collections.abc import Iterator
 
 _AGAIN_AFTER_S = 0.05
+STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals that end a command as Ctrl-C does: of batch systems and containers, and of a terminal that is closed."""
+
+
+class Stop:
+    """The signal that ends this process's work: ``number``, or None."""
+
+    number: int | None = None
+
+    @classmethod
+    def status(cls) -> int:
+        """Return the exit status that a shell gives for it."""
+        return 128 + (cls.number or signal.SIGINT)
 
 
 @contextlib.contextmanager
 def interruptible(*numbers: int) -> Iterator[None]:
     """Inside, signals ``numbers`` raise KeyboardInterrupt as SIGINT does, and one that was raised where Python drops
-    exceptions is sent again 50 ms later, until it takes effect. This works only in a main thread; in another nothing
-    changes."""
+    exceptions is sent again 50 ms later, until it takes effect. A signal that is ignored (nohup, a script's background)
+    stays so. :class:`Stop` keeps the number. This works only in a main thread; in another nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -31,7 +44,7 @@ def interruptible(*numbers: int) -> Iterator[None]:
 
     def interrupt(number: int, _) -> None:
         nonlocal last
-        last = number
+        last = Stop.number = number
         raise KeyboardInterrupt
 
     def again() -> None:
@@ -48,7 +61,10 @@ def interruptible(*numbers: int) -> Iterator[None]:
     # An exception raised in a destructor or a callback of C code is reported here and lost: the interrupt
     # is sent again.
     hook_before, sys.unraisablehook = sys.unraisablehook, unraisable
-    before = {number: signal.signal(number, interrupt) for number in numbers}
+    heard = [n for n in numbers if signal.getsignal(n) not in (signal.SIG_IGN, None)]
+    # A program of the user may have its own way with Ctrl-C.
+    heard += [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.default_int_handler else []
+    before = {number: signal.signal(number, interrupt) for number in heard}
     try:
         yield
     finally:

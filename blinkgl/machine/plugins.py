@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -20,7 +21,7 @@ from blinkgl.errors import BlinkGLError, ConfigError
 GROUP = "blinkgl.plugins"
 """Entry point group of packages that register something when they are imported."""
 _VARIABLE = "BLINKGL_PLUGINS"
-"""Files for the processes that this one starts, separated as paths are."""
+"""Files for the processes that this one starts, as a JSON list: a path may hold any separator."""
 _PREFIX = "plug-in "
 _LOADED: dict[str, str] = {}
 _PATHS: dict[str, Path] = {}
@@ -30,7 +31,7 @@ def load_plugins(files: Iterable[str | os.PathLike] = ()) -> None:
     """Import the files, those of the process that started this one, and the entry points; each once.
 
     Raises ConfigError: a file is missing, fails, or has the name of another."""
-    started_with = filter(None, os.environ.get(_VARIABLE, "").split(os.pathsep))
+    started_with = json.loads(os.environ.get(_VARIABLE) or "[]")
     for path in [Path(file).absolute() for file in (*started_with, *files)]:
         # Workers inherit the variable and are given the files, too: each is loaded once.
         if _PATHS.get(path.stem) == path:
@@ -49,7 +50,7 @@ def load_plugins(files: Iterable[str | os.PathLike] = ()) -> None:
         # The manifest names 64 bits of the sum: enough to tell two versions of a file apart.
         _LOADED[path.stem] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     # Processes that are started from here load the same files before their first job.
-    os.environ[_VARIABLE] = os.pathsep.join(map(str, _PATHS.values()))
+    os.environ[_VARIABLE] = json.dumps(plugin_files())
     for point in entry_points(group=GROUP):
         if point.name not in _LOADED:
             _guarded(f"{GROUP}: {point.name}", point.load)

@@ -92,3 +92,14 @@ def causes_line(causes: dict[str, int], seconds: float) -> str:
     whole = max(sum(causes.values()), 1)
     parts = (f"{name} {n / max(seconds, 1e-9):,.4g}/s ({100 * n / whole:.1f} %)" for name, n in causes.items())
     return "by cause: " + ", ".join(parts)
+
+
+def clock(seconds: float) -> str:
+    """Return "1:02:03"."""
+    return f"{int(seconds // 3600)}:{int(seconds // 60) % 60:02d}:{int(seconds) % 60:02d}"
+
+
+def size(count: float) -> str:
+    """Return a number of bytes as "0.21 GB", "35.2 MB" or "4 kB"."""
+    unit, name = (1e9, "GB") if count >= 1e8 else (1e6, "MB") if count >= 1e5 else (1e3, "kB")
+    return f"{count / unit:.{0 if unit < 1e6 else 1 if unit < 1e9 else 2}f} {name}"

@@ -4,7 +4,7 @@ parameters."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
-from blinkgl.sequence_files.index import entry, sequence_folders
+from blinkgl.sequence_files.index import entry, sequence_folders, task_of
 from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
@@ -73,6 +73,8 @@ class Collected:
     examples: list[Example] = field(default_factory=list)
     parameters: list[Parameter] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    dropped: dict[str, str] = field(default_factory=dict)
+    """Sequences that were taken out on purpose."""
     damaged: set[str] = field(default_factory=set)
     """Paths of sequences that differ from their manifests: they are counted, but none of their files is opened."""
 
@@ -83,12 +85,6 @@ class Collected:
         for line in self.sequences:
             spans[task_of(line)] = max(spans.get(task_of(line), 0), line["duration_us"] or 0)
         return spans
-
-
-def task_of(line: dict[str, Any]) -> str:
-    """Return the folder of the task that made a line of the index: the rig's folder for one of its cameras."""
-    path = PurePosixPath(line["path"])
-    return str(path.parent if "sensor" in line else path)
 
 
 def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
@@ -121,6 +117,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         record.get("environment", {}),
         failed,
         run.costs(),
+        dropped=run.dropped,
         unreadable=unreadable,
         damaged=damaged,
     )

@@ -86,8 +86,9 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
         return []
     paths = {task_of(x) for x in found.sequences}
     numbers = [number for path in paths if (number := found.plan.tasks.number(path)) is not None]
-    here = Counter(found.plan.tasks[number].group for number in numbers)
-    return [(name or "all", here[name], count) for name, count in found.plan.counts.items()]
+    tasks, here = found.plan.tasks, Counter(found.plan.tasks[number].group for number in numbers)
+    apart = Counter(tasks[number].group for name in found.dropped if (number := tasks.number(name)) is not None)
+    return [(name or "all", here[name], count - apart[name]) for name, count in found.plan.counts.items()]
 
 
 def _example(e: Example) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class RenderedSequence(SensorSimulation):
         size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
         self.scene, self.renderer = scene, renderer
         # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
-        self._notes = scene.omissions + (() if config.scene.kind == "random" else scene.log)
+        self._notes = scene.omissions + (() if config.scene.kind == "random" else scene.log) + nothing_in_view(scene)
         if scene.dynamics is not None:
             self.libraries = {scene.dynamics.engine: scene.dynamics.version}
         if request.labels:
@@ -168,9 +168,9 @@ class RenderedSequence(SensorSimulation):
         return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:
-        """Return t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M,
-        4, 4) float64 in the order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near;
-        for a camera with distortion lens, its kind, and distortion (k,)."""
+        """Return t_ns (M,) int64, the start and every label's time (label k has index k + 1); T_world_cam (M, 4, 4)
+        float64; T_world_obj (n, M, 4, 4) float64 in the order of object_ids (n,) and object_names (n,); K (3, 3);
+        resolution (width, height); near; for a camera with distortion lens, its kind, and distortion (k,)."""
         scene, times = self.scene, [self.config.time.t0_ns, *self.config.time.label_times_ns]
         T_world_cam, T_world_obj = poses_at(scene, times)
         return {
@@ -248,6 +248,21 @@ class RenderedSequence(SensorSimulation):
             **physics,
             **({} if self.frame_camera is None else {"frame_camera": self.frame_camera.facts()}),
         }
+
+
+_LOOKS = 64
+
+
+def nothing_in_view(scene: Scene) -> tuple[str, ...]:
+    """Return a line where bounding spheres of bodies never meet the camera's picture, at evenly spaced times."""
+    times = np.linspace(scene.t0_ns, scene.t1_ns, _LOOKS).astype(np.int64)
+    world, planes = np.linalg.inv(scene.camera_path.poses(times)), scene.camera.frustum_planes()
+    bodies = [one for one in scene.objects if one.category == "object"]
+    for one in bodies:
+        at = world @ one.path.poses(times)
+        if (at[:, :3, 3] @ planes.T >= -one.radius).all(axis=1).any():
+            return ()
+    return ("no body is ever in the camera's view: its pose may be meant otherwise",) if bodies else ()
 
 
 def _described(one: SceneObject) -> dict[str, Any]:

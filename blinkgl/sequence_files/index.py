@@ -14,7 +14,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from operator import itemgetter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter
@@ -84,6 +84,12 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
     }
 
 
+def task_of(line: dict[str, Any]) -> str:
+    """Return the folder of the task that made a line of the index: the rig's folder for one of its cameras."""
+    path = PurePosixPath(line["path"])
+    return str(path.parent if "sensor" in line else path)
+
+
 def write_index(root: str | Path) -> int:
     """Write ``index.jsonl`` of the sequences below ``root`` (without damaged ones); return their number. Raises
     OutputError."""
@@ -92,9 +98,14 @@ def write_index(root: str | Path) -> int:
     for folder in sequence_folders(root):
         with contextlib.suppress(BlinkGLError):
             entries.append(entry(root, folder))
-    with atomic_file(root / INDEX) as path, output_errors(path), open(path, "w", encoding="utf-8") as file:
-        file.writelines(json.dumps(line, sort_keys=True) + "\n" for line in sorted(entries, key=itemgetter("path")))
+    write_lines(root, entries)
     return len(entries)
+
+
+def write_lines(root: Path, lines: list[dict[str, Any]]) -> None:
+    """Write ``index.jsonl`` of these lines. Raises OutputError."""
+    with atomic_file(root / INDEX) as path, output_errors(path), open(path, "w", encoding="utf-8") as file:
+        file.writelines(json.dumps(line, sort_keys=True) + "\n" for line in sorted(lines, key=itemgetter("path")))
 
 
 class _Line(BaseModel):

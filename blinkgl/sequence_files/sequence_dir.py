@@ -36,7 +36,7 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.over_time import ImuConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.io import imu as imu_files
-from blinkgl.io.atomic import fsync, output_errors, refuse_existing, remove_stale, temporary_beside
+from blinkgl.io.atomic import fsync, make_folders, output_errors, refuse_existing, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
 from blinkgl.io.frame_camera import (
@@ -137,7 +137,7 @@ class SequenceWriter:
     def __enter__(self) -> SequenceWriter:
         refuse_existing(self.final)
         with output_errors(self.final):
-            self.final.parent.mkdir(parents=True, exist_ok=True)
+            make_folders(self.final.parent)
             remove_stale(self.final.parent)
             # Beside the final name, on the same file system, so that the last step is one rename.
             self._tmp = temporary_beside(self.final)

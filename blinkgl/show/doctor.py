@@ -17,7 +17,7 @@ from rich.text import Text
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.machine.cpu import bf16_instructions
-from blinkgl.machine.extras import EXTRAS, install, python
+from blinkgl.machine.extras import EXTRAS, install, newer_than_tested, python
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.version import __version__
 
@@ -72,15 +72,22 @@ def _try(section: str, name: str, action: Callable[[], str], remedy: str) -> Che
 
 def _system() -> Iterator[Check]:
     yield Check("System", "blinkgl", "info", __version__)
-    new_enough = sys.version_info >= (3, 10)
+    new_enough = sys.version_info >= (3, 11)
     yield Check(
         "System",
         "Python",
         "ok" if new_enough else "missing",
         platform.python_version(),
-        "" if new_enough else "use Python 3.10 or newer",
+        "" if new_enough else "use Python 3.11 or newer",
     )
     yield Check("System", "platform", "info", platform.platform())
+    newer = newer_than_tested()
+    yield Check(
+        "System",
+        "libraries",
+        "info",
+        ("newer than tested: " + ", ".join(newer)) if newer else "none is newer than tested",
+    )
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     yield Check("System", "cores, memory", "info", f"{cores} cores, {memory:.1f} GiB")

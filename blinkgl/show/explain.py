@@ -9,7 +9,8 @@ from rich.table import Table
 
 from blinkgl.config.run import load_run
 from blinkgl.dataset.explain import Explanation, explain
-from blinkgl.machine.terminal import plain_console, say
+from blinkgl.dataset.report import shares
+from blinkgl.machine.terminal import clock, plain_console, say, size
 
 
 def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: Sequence[str] = ()) -> int:
@@ -24,16 +25,11 @@ def show(result: Explanation, console: Console) -> None:
     for key, value in result.scene.items():
         scene.add_row(key, value)
     console.print(scene)
-    passes = Table(title=f"what is computed (timed on {result.machine})", title_justify="left")
-    for column, side in (
-        ("pass", "left"),
-        ("why", "left"),
-        ("times", "right"),
-        ("seconds", "right"),
-    ):
+    passes = Table(title="what is computed", title_justify="left")
+    for column, side in (("pass", "left"), ("why", "left"), ("times", "right")):
         passes.add_column(column, justify=side)
     for p in result.passes:
-        passes.add_row(p.name, p.why, f"{p.count:,}", f"{p.seconds:.2f}")
+        passes.add_row(p.name, p.why, f"{p.count:,}")
     console.print(passes)
     left = Table(title="what is left out", title_justify="left", show_header=False)
     for what, why in result.left_out:
@@ -41,6 +37,8 @@ def show(result: Explanation, console: Console) -> None:
     console.print(left)
     say(
         console,
-        f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
-        f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video",
+        f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s and {size(result.bytes)} a sequence "
+        f"({result.seconds_per_simulated_second:.1f} s per simulated second; {shares(result.stages)}; on "
+        f"{result.machine}); {result.sequences:,} in one process: "
+        f"{clock(result.run_seconds)} and {size(result.sequences * result.bytes)}",
     )

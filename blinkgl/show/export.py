@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from blinkgl.dataset.cross_checks import strangers
+from blinkgl.dataset.cross_checks import guarded, lost, strangers
 from blinkgl.dataset.shards import export_shards
 from blinkgl.errors import ConfigError
 from blinkgl.io.atomic import refuse_existing
@@ -40,7 +40,8 @@ def run(
     layout = layout or SHARDS
     left_out = lambda line: say(console, f"left out: {line}")
     if Path(root).is_dir() and not (Path(root) / MANIFEST).is_file():
-        for line in strangers(Path(root), list(made_folders(root))):
+        folders = list(made_folders(root))
+        for line in guarded(lambda: [*strangers(Path(root), folders), *lost(Path(root), folders)]):
             left_out(line)
     if layout == SHARDS:
         with console.status("writing shards"):

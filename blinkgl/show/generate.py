@@ -16,20 +16,16 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.dataset.messages import Message
 from blinkgl.dataset.plan import Plan
-from blinkgl.dataset.report import STAGES, SequenceReport, Totals
+from blinkgl.dataset.report import STAGES, SequenceReport, Totals, shares
 from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
 from blinkgl.layouts.export import refuse_plan
-from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
+from blinkgl.machine.terminal import causes_line, clock, plain_column, plain_console, say, size
 from blinkgl.show import export
 
 MAX_NOTES = 20
 """Number of files whose undrawn features are listed."""
-BYTES_PER_EVENT = 3.3
-"""Size of a data set by its events, labels included: sets of `demo` and README's example have 3.0 and 3.5."""
-FORETOLD_AT = 0.3
-"""Part of the first sequence after which time and size of the run are foretold."""
 SET_ASIDE = 3
 """Exit status of a finished run with missing sequences."""
 
@@ -111,11 +107,14 @@ class Display:
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
         self._notes: set[str] = set()
         self._foretold = False
+        # Pace counts from the end of the last sequence that was the first of its process, which filled the caches.
+        self._warm_since, self._warm_from = 0.0, 0.0
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
-        self._todo, self._started = len(plan.tasks) - outcome.found, time.monotonic()
+        self._todo = outcome.planned - outcome.found
+        self._started = self._warm_since = time.monotonic()
         if outcome.found:
-            self._say(f"{outcome.found} of {len(plan.tasks)} sequences are complete already")
+            self._say(f"{outcome.found} of {outcome.planned} sequences are complete already")
         for name, problem in outcome.damaged.items():
             self._say(f"{name} was damaged ({problem}); moved to .run/damaged, will be made again")
         self._bars.start()
@@ -134,17 +133,11 @@ class Display:
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, total=1.0, detail="")
             detail = (
-                f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}"
+                f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {shares(message['seconds'])}"
                 if message["fraction"] < 1
                 else "labels, files"
             )
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
-            if not self._foretold and message["fraction"] >= FORETOLD_AT:
-                self._foretold = True
-                whole = self._todo / message["fraction"]
-                seconds = sum(message["seconds"].values()) * whole / len(self._at_work)  # without compiling
-                size = message["events"] * whole * BYTES_PER_EVENT
-                self._say(f"expected: about {_clock(seconds)} and {_size(size)}")
         else:
             self._at_work.pop(name, None)
             if name in self._tasks:
@@ -157,6 +150,12 @@ class Display:
                 self._events + report.events,
             )
             self._bytes += message["bytes"]
+            if message.get("first"):
+                self._warm_since, self._warm_from = time.monotonic(), self._made()
+            elif not self._foretold:
+                self._foretold = True
+                whole = time.monotonic() - self._started + self._left()
+                self._say(f"expected: about {clock(whole)} and {size(self._bytes / self._done * self._todo)}")
             if not self._console.is_terminal or self._todo > 1:
                 self._say(_line(report) + (f"; {self.summary()}" if self._todo > 1 else ""))
         elif kind == "failed":
@@ -180,16 +179,21 @@ class Display:
             f"{frames / elapsed:.0f} frames/s",
             f"{events / elapsed / 1e6:.2f} M events/s",
         ]
-        if made := self._made():
-            left = (self._todo - self._given_up - made) * elapsed / made
-            parts.append(f"{_clock(left)} left")
+        if self._made():
+            parts.append(f"{clock(self._left())} left")
         if self._done:
             expected = self._bytes / self._done * self._todo
             room = shutil.disk_usage(self._out).free
-            parts.append(f"{_size(self._bytes)} of about {_size(expected)}")
+            parts.append(f"{size(self._bytes)} of about {size(expected)}")
             if expected - self._bytes > room:
-                parts.append(f"DISK: only {_size(room)} free")
+                parts.append(f"DISK: only {size(room)} free")
         return ", ".join(parts)
+
+    def _left(self) -> float:
+        """Return the wall time of what is left, s, by the pace of warm sequences, where there are some."""
+        now, made = time.monotonic(), self._made()
+        since, before = (self._warm_since, self._warm_from) if made > self._warm_from + 0.5 else (self._started, 0.0)
+        return (self._todo - self._given_up - made) * (now - since) / (made - before)
 
     def _made(self) -> float:
         """Return the sequences made so far, those in progress by their part."""
@@ -208,21 +212,6 @@ class Display:
 
     def _say(self, text: str) -> None:
         say(self._console, text)
-
-
-def _shares(seconds: dict[str, float]) -> str:
-    """Return "render 63 %, events 12 %": the stages that took most of the time so far."""
-    total = sum(seconds.values()) or 1.0
-    largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
-    return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
-
-
-def _clock(seconds: float) -> str:
-    return f"{int(seconds // 3600)}:{int(seconds // 60) % 60:02d}:{int(seconds) % 60:02d}"
-
-
-def _size(size: float) -> str:
-    return f"{size / 1e9:.2f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB"
 
 
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:

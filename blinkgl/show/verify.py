@@ -34,6 +34,8 @@ def last_line(result: Verification, deep: bool) -> str:
     """Return "20 sequences, 3 made again and compared bit by bit: no problem found"; it also counts what was compared
     in part or not at all."""
     parts = [f"{result.sequences} sequences"]
+    if result.dropped:
+        parts.append(f"{result.dropped} dropped on purpose")
     if deep:
         parts.append(f"{len(result.deep) - len(result.in_part)} made again and compared bit by bit")
     if result.in_part:

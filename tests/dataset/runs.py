@@ -80,7 +80,7 @@ def temporaries(out: Path) -> list[Path]:
     return [p for p in out.rglob(".*blinkgl-tmp-*") if p.is_dir()] if out.is_dir() else []
 
 
-def wait_for(condition, timeout_s: float = 90.0):
+def wait_for(condition, timeout_s: float = 600.0):
     """The first true value of ``condition()``."""
     deadline = time.monotonic() + timeout_s
     while not (value := condition()):

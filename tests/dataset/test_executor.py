@@ -42,8 +42,8 @@ def job(tmp_path, monkeypatch):
     """What a run is, of workers as above."""
 
     def popen(command, **options):
-        assert command[:3] == [sys.executable, "-m", "blinkgl.dataset.worker"]
-        return subprocess.Popen([sys.executable, "-ISc", WORKER, command[3]], **options)
+        assert command[:4] == [sys.executable, "-P", "-m", "blinkgl.dataset.worker"]
+        return subprocess.Popen([sys.executable, "-ISc", WORKER, command[4]], **options)
 
     monkeypatch.setattr(executor, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": popen}))
     monkeypatch.setattr(executor, "several_cards", lambda job: None)
@@ -68,7 +68,7 @@ def local():
         assert pool._processes == [] and pool.free() == 0
 
 
-def gathered(pool: Local, *kinds: str, seconds: float = 20.0) -> list[dict]:
+def gathered(pool: Local, *kinds: str, seconds: float = 600.0) -> list[dict]:
     """Messages up to the first of one of these kinds."""
     found, end = [], time.monotonic() + seconds
     while not any(m["kind"] in kinds for m in found):

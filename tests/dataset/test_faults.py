@@ -2,11 +2,15 @@
 second drivers, links, refusals."""
 
 import os
+import re
 import shutil
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 
 import pytest
+import yaml
 
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
@@ -19,6 +23,7 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, GLError, OutputError
 from runs import RECIPE, Listener, assert_same, recipe_file, temporaries
+from tests.tiny_recipe import TINY
 
 FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
 NAMES = [f"train/fly_{i:06d}" for i in range(3)]
@@ -83,7 +88,7 @@ def test_workers_that_cannot_start_leave_the_log_their_error_names(tmp_path, mon
     recipe = template(tmp_path)
     (tmp_path / "blinkgl").mkdir()
     (tmp_path / "blinkgl/__init__.py").write_text("raise ImportError('half an installation')")
-    monkeypatch.chdir(tmp_path)  # where 'python -m' looks first
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(BlinkGLError, match="workers cannot start: .*worker-0.log") as failure:
         run_dataset(recipe, tmp_path / "out", Local(1))
@@ -203,3 +208,129 @@ def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
             with pytest.raises(OutputError, match="deleted"):
                 first.check_in_place()
     assert not out.exists()
+
+
+# ---- locks and power cuts --------------------------------------------------------------------------------------------
+
+NO_LOCKS = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
+int flock(int fd, int op) { errno = ENOLCK; return -1; }
+static int call(const char *name, int fd, int cmd, void *arg) {
+    if (cmd == F_OFD_SETLK) { errno = ENOLCK; return -1; }
+    return ((int (*)(int, int, ...))dlsym(RTLD_NEXT, name))(fd, cmd, arg);
+}
+int fcntl(int fd, int cmd, ...) { va_list a; va_start(a, cmd); return call("fcntl", fd, cmd, va_arg(a, void *)); }
+int fcntl64(int fd, int cmd, ...) { va_list a; va_start(a, cmd); return call("fcntl64", fd, cmd, va_arg(a, void *)); }
+"""
+NFS_FLOCK = """
+#define _GNU_SOURCE
+#include <errno.h>
+#include <fcntl.h>
+#include <sys/file.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+int flock(int fd, int op) {  /* flock(2), "NFS details" */
+    if ((op & LOCK_EX) && (fcntl(fd, F_GETFL) & O_ACCMODE) == O_RDONLY) { errno = EBADF; return -1; }
+    return syscall(SYS_flock, fd, op);
+}
+"""
+
+
+@pytest.mark.parametrize(
+    "system, exclusive", [("", True), (NFS_FLOCK, True), (NO_LOCKS, False)], ids=["", "nfs", "none"]
+)
+def test_one_run_at_a_time_where_the_system_has_locks(tmp_path, system, exclusive):
+    """Two processes; without locks a line says so, and both may go on."""
+    environment = dict(os.environ)
+    if system:
+        if shutil.which("cc") is None:
+            pytest.skip("no C compiler to emulate the file system with")
+        (tmp_path / "fs.c").write_text(system)
+        command = ["cc", "-shared", "-fPIC", "-o", tmp_path / "fs.so", tmp_path / "fs.c", "-ldl"]
+        subprocess.run(command, check=True, capture_output=True)
+        environment["LD_PRELOAD"] = str(tmp_path / "fs.so")
+    program = (
+        "import sys, pathlib\nfrom blinkgl.io.atomic import locked_folder\nfrom blinkgl.errors import OutputError\n"
+        "try:\n    with locked_folder(pathlib.Path(sys.argv[1])):\n        print('held', flush=True)\n"
+        "        sys.stdin.read()\n"
+        "except OutputError as error:\n    print(error)\n"
+    )
+
+    def start():
+        command = [sys.executable, "-c", program, str(tmp_path / "out")]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment)
+
+    (tmp_path / "out/.run").mkdir(parents=True)
+    # Of a machine that died: a file locks nothing.
+    (tmp_path / "out/.run/lock").write_text("process 1 of a dead machine, and more of it than the next one writes " * 2)
+    first = start()
+    assert first.stdout.readline() == "held\n"
+    second = start()
+    said = second.stdout.readline()
+    if exclusive:
+        assert re.fullmatch(
+            rf".*out: another run uses this folder \(got 'process {first.pid} of .*'\); expected another --out, or "
+            "--resume after it has ended\n",
+            said,
+        )
+    else:
+        assert said == "held\n"
+    notes = [process.communicate()[1] for process in (first, second)]
+    assert [note.count("has no locks; start no other run here\n") for note in notes] == [not exclusive] * 2
+    assert not (tmp_path / "out/.run").exists()
+
+
+@pytest.mark.slow
+def test_what_is_renamed_has_reached_the_disk(tmp_path):
+    """The order of the system calls of a run in a new folder below new folders: contents before their names, and every
+    name, those of OUT and its parents, too, before the run ends."""
+    if shutil.which("strace") is None:
+        pytest.skip("no strace")
+    recipe, log = recipe_file(tmp_path, groups=FLY), tmp_path / "calls"
+    calls = "trace=mkdir,rename,renameat2,fsync"
+    traced = ["strace", "-f", "-y", "-qq", "-s", "4096", "-e", calls, "-o", str(log)]
+    words = ["generate", str(recipe), "--out", str(tmp_path / "a/b/out"), "--num", "1", "--quiet"]
+    done = subprocess.run([*traced, sys.executable, "-m", "blinkgl.cli", *words], capture_output=True, text=True)
+    if "ptrace" in done.stderr:
+        pytest.skip("this machine lets nobody trace")
+    assert done.returncode == 0, done.stderr
+    names, synced, renamed = set(), set(), 0
+    for line in log.read_text().splitlines():
+        if made := re.search(r'mkdir\("([^"]+)".* = 0', line):
+            names.add(Path(made[1]))
+        elif found := re.search(r"fsync\(\d+<([^>]+)>\) += 0", line):
+            synced.add(path := Path(found[1]))
+            names -= {name for name in names if name.parent == path}
+        elif moved := re.search(r'rename\w*\([^"]*"([^"]+)"[^"]*"([^"]+)".* = 0', line):
+            before, after = map(Path, moved.groups())
+            if after.is_relative_to(tmp_path):
+                renamed += 1
+                assert before in synced, f"{before} was renamed before it was synced"
+                names = {name for name in names if not name.is_relative_to(before)} | {after}
+    assert renamed >= 6
+    logs = tmp_path / "a/b/out/.run/logs"
+    assert not {name for name in names if name.is_relative_to(tmp_path) and not name.is_relative_to(logs)}
+
+
+@pytest.mark.slow
+def test_a_long_run_keeps_its_memory_and_files(tmp_path):
+    """Five hundred sequences in one process: the last four hundred take no more than the first hundred did."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(yaml.safe_dump({**TINY, "output": {"sequences": 500}}))
+    kept = []
+
+    def look(name, message):
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        kept.append((pages * os.sysconf("SC_PAGE_SIZE") / 2**20, len(os.listdir("/proc/self/fd"))))
+        return False
+
+    outcome = run_dataset(load_run(path), tmp_path / "out", listener=Listener(look, "done"))
+    assert len(outcome.made) == 500
+    memory, files = zip(*kept, strict=True)
+    assert max(memory[400:]) < 1.05 * max(memory[:100]) + 5, "MiB"
+    assert max(files) == max(files[:10])

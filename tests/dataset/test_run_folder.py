@@ -130,15 +130,17 @@ def test_what_the_next_sequence_would_meet_too(error, stops):
 
 
 def test_who_answers_for_the_code(monkeypatch):
-    work._source_hash.cache_clear()
+    work._code.cache_clear()
     monkeypatch.setenv("BLINKGL_BUILD", "image-7")
     assert work.environment(None)["blinkgl"].endswith(" (image-7)") and work.environment(None)["opengl"] == "not used"
-    work._source_hash.cache_clear()
+    work._code.cache_clear()
     monkeypatch.delenv("BLINKGL_BUILD")
-    assert re.fullmatch("[0-9a-f]{12}", work._source_hash())
+    code = work._code()
+    assert "code of shaders" in code and "code of blinkgl/render" in code
+    assert all(re.fullmatch("[0-9a-f]{12}", v) for k, v in code.items() if k != "blinkgl")
     card = SimpleNamespace(renderer="Voodoo", version="4.5")
     assert work.environment(card)["opengl"] == "Voodoo, 4.5"
-    work._source_hash.cache_clear()
+    work._code.cache_clear()
 
 
 def recipe(tmp_path: Path, **groups) -> Job:

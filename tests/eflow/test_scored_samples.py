@@ -136,6 +136,6 @@ def test_a_script_without_a_guard_is_a_line(folder, tmp_path):
         f"c = load_train_config(None, ['data.batch=2', 'data.workers=1', 'optim.steps=2'], model={ONE},\n"
         f"    data=[{str(folder)!r}])\ntrain(c, 'out', quiet=True)\n"
     )
-    ended = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    ended = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 1 and "if __name__ == '__main__':" in ended.stderr.splitlines()[-1]
     assert ended.stderr.count("Traceback") == 1 and not (tmp_path / "out").exists()

@@ -297,7 +297,7 @@ def test_an_error_in_a_helper_is_raised_in_the_caller():
     both = threading.Barrier(2)
 
     def kernel(taken, start):
-        both.wait(10)
+        both.wait(600)
         if start:
             raise MemoryError("no room")
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import configparser
 import json
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +13,7 @@ import pytest
 from blinkgl import cli
 from blinkgl.errors import GLError
 from blinkgl.gl import context as context_module
+from blinkgl.machine import extras
 from blinkgl.show import doctor as doctor
 
 
@@ -108,3 +112,21 @@ def test_how_frames_go_to_torch(gl, monkeypatch, answer, status, value, remedy):
     assert (check.status, check.value) == (status, value)
     assert remedy in check.remedy and bool(check.remedy) == bool(remedy)
     assert doctor._to_torch(SimpleNamespace(is_software=True), "OpenGL").status == "info"
+
+
+def test_libraries_that_are_newer_than_tested_are_named(monkeypatch):
+    here = {"av": "19.0.2", "numpy": "1.26.4", "unknown": "9", "torch": f"{extras.TESTED['torch']}+cpu"}
+    monkeypatch.setattr(extras, "distributions", lambda: [SimpleNamespace(name=k, version=v) for k, v in here.items()])
+    assert extras.newer_than_tested() == [f"av 19.0.2 (tested: {extras.TESTED['av']})"]
+    (check,) = [check for check in doctor._system() if check.name == "libraries"]
+    assert check.value.startswith("newer than tested: av 19.0.2") and check.status == "info"
+
+
+def test_tested_versions_are_those_of_the_constraints():
+    root = Path(__file__).parents[2]
+    pinned = dict(re.findall(r"^([\w-]+)==([^\s;]+)", (root / "constraints.txt").read_text().lower(), re.M))
+    assert {name.lower(): version for name, version in extras.TESTED.items()}.items() <= pinned.items()
+    setup = configparser.ConfigParser()
+    setup.read(root / "setup.cfg")
+    needed = re.findall(r"^([\w-]+)", setup["options"]["install_requires"].strip(), re.M)
+    assert set(needed) <= extras.TESTED.keys()

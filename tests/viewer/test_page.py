@@ -268,7 +268,7 @@ def test_a_browser_shows_it_and_asks_this_machine_alone(made, tmp_path, saved):
                 "--virtual-time-budget=8000", f"--log-net-log={tmp_path}/net.json",
                 f"--screenshot={tmp_path}/shot.png", address,
             ],
-            check=True, capture_output=True, timeout=120,
+            check=True, capture_output=True, timeout=600,
         )  # fmt: skip
         page.end()
         thread.join()

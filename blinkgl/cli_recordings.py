@@ -15,8 +15,7 @@ FramesTimeUnit = Annotated[
     str | None,
     typer.Option(
         "--frames-time-unit",
-        help="Of --timestamps: s, ms, us, ns, or frames of --fps (default: as its heading or name says, else guessed "
-        "from all values).",
+        help="Of --timestamps: s, ms, us, ns, or frames of --fps (default: as its heading or name says).",
     ),
 ]
 Curve = Annotated[
@@ -29,7 +28,7 @@ Curve = Annotated[
 WhiteLevel = Annotated[
     float | None,
     typer.Option("--white-level", help="Code of white: 4095 of 12 bits in 16 (default: what the file states, else "
-                 "guessed from the clip's codes)."),
+                 "from the clip's codes)."),
 ]  # fmt: skip
 Range = Annotated[
     str | None,
@@ -75,8 +74,7 @@ def simulate(
         str | None,
         typer.Option(
             "--time-unit",
-            help="Of --timestamps: s, ms, us, ns, or frames of --fps (default: as its heading or "
-            "name says, else guessed from all values).",
+            help="Of --timestamps: s, ms, us, ns, or frames of --fps (default: as its heading or name says).",
         ),
     ] = None,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count times from the first frame.")] = False,
@@ -90,6 +88,8 @@ def simulate(
     white_level: WhiteLevel = None,
     range_: Range = None,
     background: Background = None,
+    stream: of_events.Stream = None,
+    damaged: Annotated[str, typer.Option("--damaged", help="refuse, or keep the frames that are whole.")] = "refuse",
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     keep_noise: Annotated[bool, typer.Option("--keep-noise", help="Make events of the frames' noise, too.")] = False,
@@ -118,6 +118,8 @@ def simulate(
             white_level=white_level,
             range=range_,
             background=background,
+            stream=stream,
+            damaged=damaged,
         ),
         gamma=gamma,
         interpolate=interpolate,
@@ -181,6 +183,7 @@ def compare(
             white_level=white_level,
             range=range_,
             background=background,
+            damaged=damaged,
         ),
         gamma=gamma,
         frame_delay_ms=frame_delay_ms,
@@ -265,6 +268,7 @@ def calibrate(
             white_level=white_level,
             range=range_,
             background=background,
+            damaged=damaged,
         ),
         gamma=gamma,
         interpolate=interpolate,
@@ -283,7 +287,12 @@ def convert(
         str,
         typer.Argument(metavar="IN", help="Event file, of any format of docs/formats.md."),
     ],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending selects the format.")],
+    target: Annotated[
+        str | None, typer.Argument(metavar="OUT", help="Event file; its ending selects the format.")
+    ] = None,
+    look: Annotated[
+        bool, typer.Option("--look", help="Print what IN states, what is missing, its first rows; write nothing.")
+    ] = False,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, if the file does not give it.")] = None,
     zero_time: Annotated[
         bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")
@@ -301,6 +310,9 @@ def convert(
             "--write-unit", help="Times of a .txt or .csv OUT: s (six decimals), or us (integers; .csv as faery's)."
         ),
     ] = "s",
+    triggers: Annotated[
+        str | None, typer.Option("--triggers", metavar="FILE", help="Also write the triggers of IN, .csv.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
     """Convert an event file from one format to another."""
@@ -314,6 +326,8 @@ def convert(
         zero_time=zero_time,
         write_unit=write_unit,
         overwrite=overwrite,
+        triggers=triggers,
+        look=look,
     )
 
 

@@ -69,7 +69,7 @@ FILES = {
     "broken.glb": "glTF but not really\n",
     "broken.raw": "% evt 9.0\n",
     "words.txt": "not\nevents\n",
-    "outside.csv": "0.001,500,2,1\n",
+    "outside.csv": "t[s],x,y,p\n0.001,500,2,1\n",
     "notes.md": "# notes\n",
 }
 COMMANDS = [

@@ -25,7 +25,7 @@ class EventOptions(TypedDict, total=False):
     origin: str | None
     columns: str | Iterable[str] | None
     polarity: str | Iterable[float] | None
-    stream: int | None
+    stream: int | str | None
     damaged: str
     sort: bool
 
@@ -43,19 +43,19 @@ def open_events(path: str | os.PathLike, **declared: Unpack[EventOptions]) -> Ev
     """Open an event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
     ``height``, ``width`` in px, None if the file does not contain them (``file.sized()`` computes them), times in µs.
     Formats and endings: docs/formats.md. For .aedat4 and .aedat also ``file.frames()``, the camera's own frames, and
-    ``file.imu()``, its inertial unit. ``file.notes`` lists what was guessed, and after reading what was left out.
+    ``file.imu()``, its inertial unit. ``file.notes`` lists what was recognised, and after reading what was left out.
 
     time_unit : "s", "ms", "us" or "ns".   size : (height, width), px.   origin : "top" or "bottom", the row of y = 0.
-    columns : order of a table's columns, "x,y,t,p".   polarity : numbers of OFF and ON, (-1, 1).   stream : of several.
-    damaged : "refuse", or "keep" what is whole.   sort : put events in order of time. Default: as the file says; what
-    it does not say is guessed.
+    columns : order of a table's columns, "x,y,t,p".   polarity : numbers of OFF and ON, (-1, 1).   stream : of several,
+    by name or number.   damaged : "refuse", or "keep" what is whole.   sort : put events in order of time. Default: as
+    the file says; what it does not say and nobody declares is refused, with the options that declare it.
     Raises AssetError: missing file, unknown ending, or content of another format; ConfigError."""
     return formats.open_events(check.path(path, "path"), event_reading(declared))
 
 
 @check.public(EventOptions)
 def read_events(path: str | os.PathLike, *, truth: bool = False, **declared: Unpack[EventOptions]) -> Events:
-    """Return all :class:`Events` of a file, t in µs, in memory. A guess, or something left out, is a warning.
+    """Return all :class:`Events` of a file, t in µs, in memory. What is left out is a warning.
 
     truth : also read their causes (``Events.truth``), from ``event_labels.h5`` beside a sequence's ``events.h5``.
     declared : as of :func:`open_events`. Raises AssetError and EventDataError (decreasing times …)."""

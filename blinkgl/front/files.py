@@ -281,6 +281,8 @@ def simulate_file(
     timestamps: str | os.PathLike | None = None,
     time_unit: str | None = None,
     background: str | None = None,
+    stream: int | str | None = None,
+    damaged: str = "refuse",
     size: tuple[int, int] | None = None,
     preview: str | os.PathLike | None = None,
     overwrite: bool = True,
@@ -290,16 +292,17 @@ def simulate_file(
     ``blinkgl simulate``; files appear complete or not at all.
 
     timestamps : file of times, one a frame.   time_unit : of these, "s", "ms", "us", "ns" or "frames" of fps; None: as
-    the file says, else guessed from all.   background : below transparent pixels, "black", "grey", "white" or
-    "#rrggbb".   size : (height, width), px, to which frames are cropped and scaled; None:
-    that of ``sensor``, or else the frames' own.   preview : a video of frames and events to write.
-    frames : fps, zero_time, white_level, range, emulator, gamma, interpolate, max_px, keep_noise, seed, sensor as of
-    :func:`simulate`. Returns a report: frames, steps, events, lost, notes on what was guessed … Raises AssetError,
-    OutputError, EventDataError, ConfigError."""
+    the file says.   background : below transparent pixels, "black", "grey", "white" or "#rrggbb".   stream : of several
+    arrays, videos or cameras, by name or number.   damaged : "refuse", or "keep" the frames that are whole.   size :
+    (height, width), px, to which frames are cropped and scaled; None: that of ``sensor``, or else the frames' own.
+    preview : a video of frames and events to write. frames : fps, zero_time, white_level, range, emulator, gamma,
+    interpolate, max_px, keep_noise, seed, sensor as of :func:`simulate`. Returns a report: frames, steps, events, lost,
+    notes on what was left out … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
     use, options = _options(**frames)
     given: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
+    given |= {"stream": stream, "damaged": damaged}
     options = {key: options[key] for key in ("emulator", "seed", "readout")}
     return simulation.file_to_events(
         check.path(source, "source"),
@@ -366,6 +369,9 @@ def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:
         None if white is None else check.number(white, "white_level", above=0, most=1e9),
         given.get("range"),
         given.get("background"),
+        # The events' stream is no frames' stream: which frames belong to it is found where both are opened.
+        None if unit != "time_unit" or given.get("stream") is None else str(given["stream"]),
+        given.get("damaged", "refuse"),
     )
 
 

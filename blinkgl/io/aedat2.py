@@ -1,4 +1,4 @@
-"""AEDAT 2.0 (jAER) of DAVIS cameras: events, frames and IMU samples, decoded by numba kernels.
+"""AEDAT 2.0 (jAER) of DAVIS cameras: events, frames and IMU samples, decoded by numba kernels; and events of a DVS128.
 
 A header of lines that begin with ``#``; then records of eight bytes, big-endian: an address and a time in µs, 32 bits
 each. Addresses (jAER's ``DavisChip`` and iniVation's page "AEDAT file formats"):
@@ -8,6 +8,7 @@ each. Addresses (jAER's ``DavisChip`` and iniVation's page "AEDAT file formats")
                 IMU value     30..28 which: acceleration x y z, temperature, rate x y z   27..12 value   11..10: 3
 
 y counts from the bottom, and x of events (alone) from the right. A time is counted modulo 2^32 (71.6 minutes).
+Of a DVS128: bit 15 = 1: no pixel   14..8 y   7..1 x, from the right   0 polarity, inverted.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import CameraFrame, G, ImuSamples
 from blinkgl.io.fixed_records import read_records
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.reading import AS_FILE, Damage, EventReading
 from blinkgl.io.records import input_errors
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
@@ -34,8 +35,13 @@ SIZES = {
     "DAVIS240": (180, 240),
     "DAVIS346": (260, 346),
     "DAVIS640": (480, 640),
+    "DVS128": (128, 128),
+    "Tmpdiff128": (128, 128),
 }
 """(height, width) of chips; further letters of their names do not matter here."""
+_DVS128 = ("DVS128", "Tmpdiff128")
+_UNUSED = 0x3FF
+"""Bits that no event of a DAVIS sets, and most of a DVS128 do."""
 # A larger header, in bytes, is damaged.
 _MAX_LINE, _MAX_HEADER = 1 << 16, 1 << 26
 # Big-endian records of 8 bytes, see the module.
@@ -59,28 +65,59 @@ class Aedat2Reader:
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path, self._keep = Path(path), reading.keep
         self._header, self._start = _read_header(self.path)
+        self.notes: list[str] = []
         # jAER names the chip by its Java class, whose last part is such as DAVIS346B.
         chip = re.search(r"^#\s*AEChip:\s*(\S+)", self._header, re.M)
         name = chip.group(1).rpartition(".")[2] if chip else None
-        size = next((size for known, size in SIZES.items() if name and name.upper().startswith(known)), None)
-        size = size or (reading.size if chip is None else None)
+        known = next((known for known in SIZES if name and re.match(rf"{known}(?!\d)", name, re.I)), None)
+        if chip is None:
+            known = self._unnamed(reading)
+        size = SIZES[known] if known else None if chip else reading.size
         if size is None:
             raise AssetError(
                 "a camera with unknown addresses" if chip else "no camera named in the header ('# AEChip: …')",
                 where=str(path),
                 value=name,
-                accepted=", ".join(SIZES) + ("" if chip else "; or --size WIDTHxHEIGHT"),
+                accepted=", ".join(SIZES) + ("" if chip else "; of a DAVIS or v2e --size WIDTHxHEIGHT says it, too"),
             )
+        self._single = known in _DVS128
         self.height, self.width = size
+        if self._single:
+            self.notes.append("y as in the file, which jAER shows from the bottom (--origin bottom turns it)")
+
+    def _unnamed(self, reading: EventReading) -> str | None:
+        """Return "DVS128" where only its addresses explain all records of a file whose header names no camera. Raises
+        AssetError: a size is declared, and no DAVIS has these addresses, either."""
+        largest = bits = 0
+        for _, raw in read_records(self.path, self._start, _RECORD, 1 << 17):
+            largest = max(largest, int(raw["address"].max()))
+            # The low bits of frame samples and IMU values are in use.
+            events = raw["address"][(raw["address"] >> 31 == 0) & (raw["address"] >> 10 & 1 == 0)]
+            bits |= int(np.bitwise_or.reduce(events)) & _UNUSED if len(events) else 0
+        if bits and largest < 1 << 16 and reading.size in (None, SIZES["DVS128"]):
+            self.notes.append("all addresses are a DVS128's, and no DAVIS's: read as such")
+            return "DVS128"
+        if bits:
+            raise AssetError(
+                "addresses that no DAVIS has, and no camera named in the header ('# AEChip: …')",
+                where=str(self.path),
+                value=f"bits 0x{bits:x}",
+                accepted=", ".join(SIZES),
+            )
+        return None
 
     def chunks(self, records: int = 1 << 17) -> Iterator[Events]:
         """Yield all events, decoded from ``records`` records at a time."""
         for _, address, t in self._kind(_DVS, records):
-            # The file counts x of events from the right and y from the bottom.
-            x = self.width - 1 - (address >> 12 & 0x3FF)
-            y = self.height - 1 - (address >> 22 & 0x1FF)
+            if self._single:
+                x, y, on = self.width - 1 - (address >> 1 & 0x7F), address >> 8 & 0x7F, ~address & 1
+            else:
+                # The file counts x of events from the right and y from the bottom.
+                x = self.width - 1 - (address >> 12 & 0x3FF)
+                y = self.height - 1 - (address >> 22 & 0x1FF)
+                on = address >> 11 & 1
             # An address outside is negative here, and beyond every sensor as uint16.
-            yield Events(x.astype(np.uint16), y.astype(np.uint16), t, (address >> 11 & 1).astype(np.uint8))
+            yield Events(x.astype(np.uint16), y.astype(np.uint16), t, on.astype(np.uint8))
 
     def frames(self, records: int = 1 << 17) -> Iterator[CameraFrame]:
         """Yield frames in their order: reset minus signal sample, (H, W) uint16 of 0 … 1023, 0 where it would be
@@ -126,9 +163,11 @@ class Aedat2Reader:
         for first, raw in read_records(self.path, self._start, _RECORD, records, last):
             # int64, so that shifts and differences cannot overflow.
             address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
-            kinds = _kinds(address)
+            kinds = np.where(address >> 15, _PIN, _DVS) if self._single else _kinds(address)
             t = np.empty(len(raw), np.int64)
-            bad, why = _unwrap(address, kinds, stamp, state, self.height, self.width, self._keep and kind == _DVS, t)
+            keep = self._keep and kind == _DVS
+            sides = (1 << 10, 1 << 10) if self._single else (self.height, self.width)  # a DVS128 has no others
+            bad, why = _unwrap(address, kinds, stamp, state, *sides, keep, t)
             if bad >= 0:
                 self._refuse(first + bad, int(address[bad]), int(stamp[bad]), why, state)
             chosen = kinds == kind
@@ -142,13 +181,13 @@ class Aedat2Reader:
         at = f"record {record}, at byte {self._byte(record)}"
         if why == 1:
             place = (address >> 12 & 0x3FF, address >> 22 & 0x1FF)
-            raise AssetError(
+            raise Damage(
                 f"an address outside the sensor: {at}",
                 where=str(self.path),
                 value=f"x {place[0]}, y {place[1]} (address 0x{address:08x})",
                 accepted=f"x < {self.width}, y < {self.height}",
             )
-        raise AssetError(
+        raise Damage(
             f"times decrease: {at}",
             where=str(self.path),
             value=stamp,

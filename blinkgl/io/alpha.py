@@ -20,11 +20,14 @@ def background_of(text: str | None) -> tuple[int, int, int] | None:
     raise ConfigError("unknown colour", where="--background", value=text, accepted="black, grey, white or #rrggbb")
 
 
-def over(image: np.ndarray, background: tuple[int, int, int] | None) -> tuple[np.ndarray, str | None]:
+def over(
+    image: np.ndarray, background: tuple[int, int, int] | None, *, associated: bool | None = None
+) -> tuple[np.ndarray, str | None]:
     """Return (H, W, 2) or (H, W, 4) without its alpha, (H, W) or (H, W, 3), composited over ``background`` (0 to 255 of
     full scale; None: black), and the line that says so; None where every pixel is opaque.
 
-    Codes are mixed as viewers and browsers do, alpha being straight; floats (OpenEXR) are premultiplied light."""
+    Codes are mixed as viewers and browsers do, alpha being straight, and floats (OpenEXR) are premultiplied light,
+    unless the file states whether alpha is ``associated``, multiplied already."""
     colour, alpha = image[..., :-1], image[..., -1:]
     top = 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype).max)
     grey = colour.shape[-1] == 1
@@ -33,7 +36,8 @@ def over(image: np.ndarray, background: tuple[int, int, int] | None) -> tuple[np
     below = np.asarray(background or (0, 0, 0), np.float64) / 255 * top
     below = below @ [0.2126, 0.7152, 0.0722] if grey else below
     share = alpha / top
-    mixed = (colour if image.dtype.kind == "f" else colour * share) + below * (1 - share)
-    mixed = mixed.astype(np.float32) if image.dtype.kind == "f" else np.rint(mixed).astype(image.dtype)
+    multiplied = image.dtype.kind == "f" if associated is None else associated
+    mixed = (colour if multiplied else colour * share) + below * (1 - share)
+    mixed = mixed.astype(np.float32) if image.dtype.kind == "f" else np.rint(np.minimum(mixed, top)).astype(image.dtype)
     name = "black" if background is None else "#{:02x}{:02x}{:02x}".format(*background)
     return (mixed[..., 0] if grey else mixed), f"transparent pixels are shown over {name} (--background for another)"

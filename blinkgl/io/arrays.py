@@ -7,7 +7,8 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,16 @@ from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.io.tables import Table, TableReader, named_columns, slot_of, table_of_columns, table_of_rows
+from blinkgl.io.tables import (
+    Candidate,
+    Table,
+    TableReader,
+    choose,
+    named_columns,
+    table_of_columns,
+    table_of_records,
+    table_of_rows,
+)
 from blinkgl.types.events import Events
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -122,65 +132,119 @@ DTYPE = np.dtype([(("us", "t"), "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")]
 """Of the .npy files that are written; the title of t says its unit."""
 
 
+_EVIMO = {"index", "discretization", "K", "D", "meta"}
+"""Arrays beside the events of EV-IMO's files: ``events`` and two of these mark the layout, t x y p in seconds."""
+_KNOWN = ("height", "width", "time_unit", "cause")
+_LAYOUTS = (
+    ("vid2e's arrays: ns", {"x": "i2", "y": "i2", "t": "i8", "p": "i1"}, "ns"),
+    ("Metavision's records of events: µs", {"x": "u2", "y": "u2", "p": "i2", "t": "i8"}, "us"),
+    ("eventVision's variables: µs", {"x": "u1", "y": "u1", "ts": "u4", "pol": "u1"}, "us"),
+)
+"""Layouts of columns that state no unit, by the names and types that no other known writer has."""
+
+
 class ArrayReader(TableReader):
-    """Reads ``.npz`` with four columns or one (N, 4) array, and ``.npy``, structured or (N, 4)."""
+    """Reads ``.npz`` with four columns or (N, 4) arrays, of which only the chosen one is loaded, and ``.npy``,
+    structured or (N, 4). Raises AssetError: several arrays that may be the events, which it lists; a member that would
+    have to be unpickled, if it is the chosen one."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        path = Path(path)
+        path, skipped = Path(path), []
         with numpy_errors(path):
             if path.suffix.lower() == ".npy":
-                arrays: dict[str, Any] = {"": read_npy(path)}
+                table = _table_of_npy(read_npy(path), str(path), reading)
             else:
                 with NpzReader(path) as archive, zipfile.ZipFile(path) as members:
                     _check_ratio(sum(one.file_size for one in members.infolist()), path.stat().st_size, path)
-                    wanted = [
-                        n for n in archive.names if slot_of(n) != "_" or n in _KNOWN or n in reading.named.values()
-                    ]
-                    whole = set("txyp") <= set(named_columns(wanted, reading))
-                    arrays = {name: archive[name] for name in (wanted if whole else archive.names)}
-            super().__init__(path, reading, [_table(arrays, str(path), reading)])
+                    shapes, skipped = archive.shapes()
+                    candidates = _candidates(shapes, archive.__getitem__, str(path), reading, skipped)
+                    table = choose(candidates, reading, str(path), archive.names)
+            super().__init__(path, reading, table)
+        self.notes += [f"left out: {', '.join(skipped)}, which would have to be unpickled"] if skipped else []
 
 
-_KNOWN = ("height", "width", "time_unit", "cause")
+def _table_of_npy(array: np.ndarray, where: str, reading: EventReading) -> Table:
+    if not array.dtype.names:
+        plain: list[Candidate] = [("", lambda: table_of_rows(array, where, reading.columns))]
+        return choose(plain if array.ndim == 2 else [], reading, where, ["a plain array"])
+    arrays = {name: array[name] for name in array.dtype.names}
+    titles = [field[2] for field in (array.dtype.fields or {}).values() if len(field) > 2]
+    arrays |= {"time_unit": np.array(titles[0])} if titles else {}
+    shapes = {name: (one.shape, one.dtype) for name, one in arrays.items()}
+    return choose(_candidates(shapes, arrays.__getitem__, where, reading), reading, where, list(shapes))
 
 
-def _table(arrays: Mapping[str, Any], where: str, reading: EventReading) -> Table:
-    """Return the table of arrays by their names. Raises AssetError: a column is missing, and no array has four."""
-    if "" in arrays and arrays[""].dtype.names:  # a structured .npy
-        table = arrays[""]
-        arrays = {name: table[name] for name in table.dtype.names}
-        if titles := [field[2] for field in table.dtype.fields.values() if len(field) > 2]:
-            arrays["time_unit"] = np.array(titles[0])
-    named = named_columns(arrays, reading)
-    sides = [_declared(arrays[side], side, where) for side in ("height", "width") if side in arrays]
-    unit = named_unit(f"[{arrays['time_unit']}]") if "time_unit" in arrays else None
-    known: dict[str, Any] = {"unit": unit, "size": (sides[0], sides[1]) if len(sides) == 2 else None}
-    rows = next((a for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 2 and a.shape[1] >= 4), None)
-    if missing := [slot for slot in "txyp" if slot not in named]:
-        if rows is not None and rows.dtype.kind in "iuf":
-            return table_of_rows(rows, where, reading, **known)
-        raise AssetError(
-            f"no column '{missing[0]}'",
-            where=where,
-            value=list(arrays) if any(arrays) else "a plain array",
-            accepted="x, y, t, p in the file, or --columns x=NAME,y=NAME,t=NAME,p=NAME",
-        )
-    columns = {slot: np.asarray(arrays[name]) for slot, name in named.items()}
+def _candidates(
+    shapes: Mapping[str, tuple[tuple[int, ...], np.dtype]],
+    load: Callable[[str], np.ndarray],
+    where: str,
+    reading: EventReading,
+    others: Collection[str] = (),
+) -> list[Candidate]:
+    """Return what may be the events among arrays, of which a name may be declared: columns x, y, t, p; else records or
+    arrays of four columns, those called "events" before others.   others : names that are in the file beside
+    ``shapes``."""
+    columns = named_columns(shapes, reading, where)
+    beside = {name: load(name) for name in _KNOWN if name in shapes and name != "cause"}
+    sides = [_declared(beside[side], side, where) for side in ("height", "width") if side in beside]
+    known: dict[str, Any] = {"size": (sides[0], sides[1]) if len(sides) == 2 else None}
+    if "time_unit" in beside:
+        known["unit"] = named_unit(f"[{beside['time_unit']}]")
+
+    def table(name: str) -> Table:
+        array = load(name)
+        if array.dtype.names:
+            return table_of_records(array, named_columns(array.dtype.names, reading, where), place=name, **known)
+        marks = _EVIMO & {*shapes, *others}
+        evimo = name == "events" and len(marks) >= 2 and array.dtype.kind == "f" and not reading.columns
+        layout = {"unit": "s", "layout": "EV-IMO's arrays: t x y p, seconds"} if evimo else {}
+        order = ("t", "x", "y", "p") if evimo else reading.columns
+        return table_of_rows(array, where, order, place=name, **{**known, **layout})
+
+    for layout, types, unit in _LAYOUTS:
+        if set(columns.values()) == types.keys() and all(shapes[k][1] == np.dtype(kind) for k, kind in types.items()):
+            known = {"unit": unit, "layout": layout, **known}
+    if set("txyp") <= columns.keys() and reading.stream not in shapes:
+        used = [*columns.values(), *(["cause"] if "cause" in shapes else [])]
+        arrays = {name: load(name) for name in used}
+        return [("", lambda: _of_columns(columns, arrays, where, **known))]
+    wide = 4 if not reading.columns or reading.named else len(reading.columns)
+    rows = [
+        name
+        for name, (shape, dtype) in shapes.items()
+        if (len(shape) == 2 and shape[1] == wide and dtype.kind in "iuf")
+        or (len(shape) == 1 and set("txyp") <= named_columns(dtype.names or (), reading, where).keys())
+    ]
+    # A name may mean any of them; a number counts those that the refusal lists.
+    called = [name for name in rows if _called_events(name)] if reading.stream not in rows else rows
+    return [(name, lambda name=name: table(name)) for name in called or rows]
+
+
+def _called_events(place: str) -> bool:
+    return place.rpartition("/")[2].lower() in ("events", "event")
+
+
+def _of_columns(columns: Mapping[str, str], arrays: Mapping[str, np.ndarray], where: str, **known: Any) -> Table:
+    chosen_ = {slot: np.asarray(arrays[name]) for slot, name in columns.items()}
     if isinstance(arrays.get("cause"), np.ndarray):
-        columns["cause"] = arrays["cause"]
-    return table_of_columns(columns, where, heading=named["t"], **known)
+        chosen_["cause"] = arrays["cause"]
+    return table_of_columns(chosen_, where, heading=columns["t"], **known)
 
 
 class MatReader(TableReader):
-    """Reads ``.mat`` of version 7 or older with variables, or one struct or array of structs, of such names. y is as in
+    """Reads ``.mat`` of version 7 or older with variables, or structs or arrays of structs, of such names. y is as in
     the file."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        found = read_mat(path)
-        tables = [found, *(one for one in found.values() if isinstance(one, dict))]
-        whole = [table for table in tables if set("txyp") <= set(named_columns(table, reading))]
-        arrays = {name: one for name, one in (whole or tables[-1:])[0].items() if isinstance(one, np.ndarray)}
-        super().__init__(Path(path), reading, [_table(arrays, os.fspath(path), reading)])
+        found, where = read_mat(path), os.fspath(path)
+        tables = {"": found} | {name: one for name, one in found.items() if isinstance(one, dict)}
+        candidates: list[Candidate] = []
+        for name, table in tables.items():
+            arrays = {key: one for key, one in table.items() if isinstance(one, np.ndarray)}
+            shapes = {key: (one.shape, one.dtype) for key, one in arrays.items()}
+            inner = _candidates(shapes, arrays.__getitem__, where, replace(reading, stream=None))
+            candidates += [("/".join(filter(None, (name, key))), make) for key, make in inner]
+        super().__init__(Path(path), reading, choose(candidates, reading, where, list(found)))
 
 
 class ArrayWriter(CheckedWriter):
@@ -196,7 +260,7 @@ class ArrayWriter(CheckedWriter):
     def close(self, t_end_us: int | None = None) -> None:
         e = Events.concatenate(self._chunks)
         with output_errors(self.path), open(self.path, "wb") as file:
-            if self.path.suffix == ".npz":
+            if self.path.suffix.lower() == ".npz":
                 columns = {k: getattr(e, k) for k in e.columns}
                 if None not in self._size:
                     columns |= {"height": self._size[0], "width": self._size[1]}

@@ -23,6 +23,12 @@ from blinkgl.machine.closing import Finishing
 from blinkgl.types.events import Cause, Events
 
 MAX_SIDE, MAX_PIXELS = 65536, 1 << 25
+
+
+class BadEvent(EventDataError):
+    """A value that no event has: NaN, a place or a time out of all bounds. ``--damaged keep`` leaves it out."""
+
+
 _MAX_TIME = 1 << 62
 """µs; sums and differences of two such times still fit int64."""
 
@@ -59,7 +65,7 @@ def events_of(
     y = whole(columns["y"], "y", np.uint16, 0, MAX_SIDE - 1, where, first)
     # Times have to be in the range after the offset, too.
     t = whole(columns["t"], "t", np.int64, -_MAX_TIME - min(offset, 0), _MAX_TIME - max(offset, 0), where, first)
-    accepted = "0 or 1, -1 or 1; or --polarity OFF/ON" if signed else None
+    accepted = _SIGNED if signed else None
     p = whole(columns["p"], "p", np.int8, -1 if signed else 0, 1, where, first, accepted)
     if cause is not None:
         cause = whole(columns["cause"], "cause", np.uint8, 0, max(Cause), where, first)
@@ -78,7 +84,7 @@ def microseconds(times: np.ndarray, where: str, first: int = 0, unit_ns: int = 1
     rounded = np.rint(times.astype(np.float64, copy=False) * scale)
     if len(times) and not (good := np.abs(rounded) < _MAX_TIME).all():  # NaN compares False
         i = int(np.argmin(good))
-        raise EventDataError(
+        raise BadEvent(
             f"time of event {first + i}", where=where, value=times[i].item(), accepted="times that fit int64 µs"
         )
     if times.dtype.kind == "f":
@@ -254,9 +260,24 @@ def whole(
     return out
 
 
+_SIGNED = "0 or 1, -1 or 1"
+
+
+def proposed_polarity(p: np.ndarray) -> str:
+    """Return the option to paste for two numbers of OFF and ON, where there are two."""
+    values = np.unique(p[np.isfinite(p)]) if p.dtype.kind in "iuf" else p[:0]
+    return f"--polarity {values[0]:.17g}/{values[1]:.17g}" if len(values) == 2 else "--polarity OFF/ON"
+
+
 def _refuse(column: np.ndarray, good: np.ndarray, name: str, accepted: str, where: str, first: int) -> None:
     i = int(np.argmin(good))
-    raise EventDataError(f"{name} of event {first + i}", where=where, value=column[i].item(), accepted=accepted)
+    value = column[i].item()
+    if accepted == _SIGNED:
+        accepted += f"; or {proposed_polarity(column)}"
+    # Codes of polarity, and places between pixels, are sound values that the reader does not know: no damage.
+    sound = value == value and (name in ("p", "polarity") or accepted == "whole numbers")
+    kind = EventDataError if sound else BadEvent
+    raise kind(f"{name} of event {first + i}", where=where, value=value, accepted=accepted)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

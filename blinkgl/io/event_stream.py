@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.reading import AS_FILE, Damage, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -54,7 +54,7 @@ class EventStreamReader:
                 n = _decode(np.frombuffer(data, np.uint8), state, made.x, made.y, made.t, made.p)
                 yield made.part(slice(n)).copy()
         if state[1]:
-            raise AssetError("truncated: the last event is not whole", where=str(self.path))
+            raise Damage("truncated: the last event is not whole", where=str(self.path))
 
 
 @kernel

@@ -1,9 +1,8 @@
 """Formats whose events are records of one length: Prophesee's ``.dat`` and the ``.bin`` of N-MNIST and N-Caltech101.
 
-.dat (Prophesee, "DAT format" page): lines that begin with ``%``, of which ``% Height`` and ``% Width`` matter; two
-bytes, type of event (0 and 12: x, y, polarity) and bytes a record (8); then t uint32 µs, which wraps after 71.6
-minutes, and an address, x in bits 13..0, y 27..14, polarity from 28 (version 2; of version 1 x in bits 8..0, y 16..9,
-polarity 17).
+.dat (Prophesee, "DAT format" page): lines that begin with ``%``, of which ``% Height``, ``% Width`` and ``% Version``
+matter; two bytes, type of event (0 and 12: x, y, polarity) and bytes a record (8); then t uint32 µs, which wraps after
+71.6 minutes, and an address: x in bits 13..0, y 27..14, polarity 31..28.
 .bin (Orchard et al. 2015): 40 bits, big-endian: x 8, y 8, polarity 1, t 23 bits µs. y = 240 marks no event but that
 2^13 µs have passed.
 """
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.reading import AS_FILE, Damage, EventReading, listed
 from blinkgl.io.records import input_errors
 from blinkgl.types.events import Events
 
@@ -26,8 +25,12 @@ _DAT = np.dtype([("t", "<u4"), ("address", "<u4")])
 _NMNIST = np.dtype([("x", "u1"), ("y", "u1"), ("high", "u1"), ("low", ">u2")])
 _LONGEST_HEADER = 1 << 16
 _PASSES, _PASSED_US = 240, 1 << 13
-_SHORT, _LONG = (0x1FF, 9, 0xFF, 17), (0x3FFF, 14, 0x3FFF, 28)
-"""Masks and shifts of a .dat address: x, then y, then polarity; of version 1 and 2."""
+_SHORT, _LONG = (0x1FF, 9, 0xFF, 17, 1), (0x3FFF, 14, 0x3FFF, 28, 0xF)
+_VERSIONS = {"": _LONG, "1": _SHORT, "2": _LONG}
+"""Version of a .dat, as its header states it -> masks and shifts of an address: x, then y, then polarity. Prophesee's
+own tools read files without a version as version 2."""
+_EVENT_TYPES = {0: "TD", 12: "CD"}
+"""Types of .dat records that are contrast changes."""
 
 
 def read_records(
@@ -45,41 +48,53 @@ def read_records(
                 yield first, np.frombuffer(data, dtype, whole)
             first += whole
             if stray:
-                raise AssetError(f"truncated: {stray} stray bytes after {last(first)}", where=str(path))
+                raise Damage(f"truncated: {stray} stray bytes after {last(first)}", where=str(path))
 
 
 class DatReader:
-    """Size and events of a .dat file. Raises AssetError: another type of events, truncated."""
+    """Size and events of a .dat file. Raises AssetError: a version, a type of events or a polarity that is not known,
+    truncated."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path = Path(path)
-        with open(path, "rb") as file:
+        with input_errors(path), open(path, "rb") as file:
             begin = file.read(_LONGEST_HEADER)
-        found = re.match(rb"(?:% [^\n]*\n)*", begin)
+        found = re.match(rb"(?:%[^\n]*\n)*", begin)
         # Two bytes follow the header's lines: the type of events and the size of a record.
         header, self._start = found[0].decode("latin-1") if found else "", found.end() + 2 if found else 2
         kind = begin[self._start - 2 : self._start]
-        if len(kind) < 2 or kind[0] not in (0, 12) or kind[1] != _DAT.itemsize:
+        if len(kind) < 2 or kind[0] not in _EVENT_TYPES or kind[1] != _DAT.itemsize:
             raise AssetError(
-                "not a .dat file of events", where=str(path), value=kind, accepted="type 0 or 12, 8 bytes an event"
+                "not a .dat file of events",
+                where=str(path),
+                value=f"type {kind[0]}, {kind[1]} bytes an event" if len(kind) == 2 else "no type of events",
+                accepted="type 0 or 12, 8 bytes an event",
             )
-        sides = {k.lower(): int(v) for k, v in re.findall(r"^% (Height|Width) (\d{1,5})\s*$", header, re.M)}
-        self.height, self.width = sides.get("height"), sides.get("width")
-        version = re.search(r"^% Version (\d)", header, re.M)
-        self._places = _LONG if version and version[1] == "2" else _SHORT
+        # The last line of a name counts, as in Prophesee's tools.
+        said = dict(re.findall(r"^%\s*(\w+)[ \t:]+(\S.*?)\s*$", header, re.M))
+        sides = [said.get(name) for name in ("Height", "Width")]
+        if not all(side is None or re.fullmatch(r"\d{1,5}", side) for side in sides):
+            raise AssetError("a size in the header is no number", where=str(path), value=sides, accepted="px")
+        self.height, self.width = (None if side is None else int(side) for side in sides)
+        self._places = listed(_VERSIONS, said.get("Version", ""), "unknown Version of .dat", path, "1, 2 or none")
 
     def chunks(self, count: int = 1 << 20) -> Iterator[Events]:
         """Yield all events."""
-        x_mask, y_from, y_mask, p_from = self._places
+        x_mask, y_from, y_mask, p_from, p_mask = self._places
         wraps, last = 0, 0
-        for _, rows in read_records(self.path, self._start, _DAT, count):
+        for first, rows in read_records(self.path, self._start, _DAT, count):
             t, address = rows["t"].astype(np.int64), rows["address"]
             # A step back by more than half of the counter's range is its wrap.
             turns = wraps + np.cumsum(np.diff(t, prepend=last) < -(1 << 31))
             wraps, last = int(turns[-1]), int(t[-1])
             x, y = address & x_mask, address >> y_from & y_mask
-            p = (address >> p_from & 1).astype(np.uint8)
-            yield Events(x.astype(np.uint16), y.astype(np.uint16), t + (turns << 32), p)
+            p = address >> p_from & p_mask
+            if (p > 1).any():
+                i = int(np.argmax(p > 1))
+                raise AssetError(
+                    f"polarity of event {first + i}", where=str(self.path), value=int(p[i]), accepted="0 or 1"
+                )
+            yield Events(x.astype(np.uint16), y.astype(np.uint16), t + (turns << 32), p.astype(np.uint8))
 
 
 class NMnistReader:

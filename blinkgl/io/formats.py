@@ -16,9 +16,18 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
-from blinkgl.io.atomic import atomic_file
-from blinkgl.io.columns import MAX_SIDE, CameraFrame, CheckedWriter, ImuSamples, check_events, check_size, on_or_off
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.columns import (
+    MAX_SIDE,
+    BadEvent,
+    CameraFrame,
+    CheckedWriter,
+    ImuSamples,
+    check_events,
+    check_size,
+    on_or_off,
+)
+from blinkgl.io.reading import AS_FILE, Damage, EventReading
 from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
 
@@ -85,6 +94,7 @@ for _one in (
     EventFormat("text", (".txt",), fixed={"separator": " "}, **_TEXT),
     EventFormat("csv", (".csv",), fixed={"separator": ","}, **_TEXT),
     EventFormat("gzip", (".txt.gz", ".csv.gz"), "text", "TextReader"),
+    EventFormat("zip", (".zip",), "text", "TextReader"),
     EventFormat("es", (".es",), "event_stream", "EventStreamReader"),
     EventFormat("dat", (".dat",), "fixed_records", "DatReader"),
     EventFormat("nmnist", (".bin",), "fixed_records", "NMnistReader"),
@@ -99,6 +109,8 @@ SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 128
 """(height, width) of event cameras, smallest first: the guess for files without a size."""
 _FOUND = ("moved", "late", "cut", "outside")
 """Lines about what salvage found, which every pass over a file finds anew."""
+_REMEDIED = (Damage, BadEvent)
+"""What ``--damaged keep`` reads past: nothing else is damage."""
 _OVERLAP_US = 10_000
 """With ``damaged="keep"``, events that come up to so much too late are put in their place."""
 
@@ -121,6 +133,11 @@ class EventFile(Closing):
     told: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
+    def triggers(self) -> np.ndarray | None:
+        """Return the triggers read so far, (N, 3) int64 µs, channel and edge; None: the format has none."""
+        return getattr(self._reader, "triggers", None)
+
+    @property
     def causes(self) -> bool:
         """Return whether its events have causes."""
         return getattr(self._reader, "causes", False)
@@ -132,10 +149,11 @@ class EventFile(Closing):
 
     @property
     def notes(self) -> list[str]:
-        """Return a line for each thing that was guessed, with the option that overrules it, and, after reading, for
-        each that was left out or moved."""
-        unit = getattr(self._reader, "unit", None)
-        lines = [*getattr(self._reader, "notes", ()), unit.line if unit else None]
+        """Return a line for each thing that was recognised by a layout's name, and, after reading, for each that was
+        left out or moved."""
+        lines = [*getattr(self._reader, "notes", ())]
+        if "triggers" in self.told:
+            lines = [line for line in lines if "--triggers" not in line]
         if self.guessed_size:
             known = (self.height, self.width) in SENSORS
             why = "the smallest sensor that holds all events" if known else "as far as events go, beyond known sensors"
@@ -159,7 +177,7 @@ class EventFile(Closing):
             try:
                 last = check_events(events, str(self.path), count, height=self.height, width=self.width, after=last)
             except EventDataError as error:
-                raise _with_remedy(error) from None
+                raise self._with_remedy(error) from None
             count += len(events)
             if flipped:
                 events = replace(events, y=(self.height - 1 - events.y.astype(np.int32)).astype(np.uint16))
@@ -172,7 +190,7 @@ class EventFile(Closing):
         try:
             for events in self._reader.chunks():
                 yield replace(events, p=on_or_off(events.p, pair, str(self.path))) if pair else events
-        except (AssetError, EventDataError) as error:
+        except _REMEDIED as error:
             raise type(error)(
                 error.problem,
                 where=error.where,
@@ -216,11 +234,13 @@ class EventFile(Closing):
             for events in self._declared():
                 count += len(events)
                 yield events
-        except (AssetError, EventDataError) as error:
+        except _REMEDIED as error:
+            if not count:
+                raise AssetError(f"no event is whole: {error.problem}", where=str(self.path)) from error
             self.told["cut"] = f"kept: events before the damage: {count:,} ({error.problem})"
 
     def _inside(self, whole: Iterable[Events]) -> Iterator[Events]:
-        outside, first = 0, ""
+        outside, inside, first = 0, 0, ""
         for events in whole:
             good = np.ones(len(events), bool)
             if self.reading.keep and self.height is not None and self.width is not None:
@@ -230,9 +250,23 @@ class EventFile(Closing):
                 first = first or f"x {events.x[i]}, y {events.y[i]}"
                 outside += int(np.count_nonzero(~good))
                 events = events.part(good)
+            inside += len(events)
             yield events
+        if outside and not inside:
+            raise AssetError(f"all events are outside {self.width}x{self.height}", where=str(self.path), value=first)
         if outside:
             self.told["outside"] = f"left out: events outside {self.width}x{self.height}: {outside:,} (first: {first})"
+
+    def _with_remedy(self, error: EventDataError) -> EventDataError:
+        """Return a refusal of :func:`check_events` that names the option which helps."""
+        if "decrease" in error.problem:
+            accepted = "times that do not; or --sort" + (", or --damaged keep" if self.fixed_unit else "")
+        elif "outside" in error.problem:
+            remedy = "a larger --size" if self.reading.size else "--damaged keep, or a larger --size"
+            accepted = f"{error.accepted}; or {remedy}"
+        else:
+            return error
+        return EventDataError(error.problem, where=error.where, value=error.value, accepted=accepted)
 
     def frames(self) -> Iterator[CameraFrame]:
         """Yield the camera's own frames, one in memory at a time. Raises AssetError: the format, or the recording, has
@@ -274,13 +308,6 @@ class EventFile(Closing):
         height, width = next(fits, tuple(int(v) + 1 for v in largest))
         check_size(height, width, str(self.path))
         return replace(self, height=height, width=width, guessed_size=True)
-
-
-def _with_remedy(error: EventDataError) -> EventDataError:
-    """Return a refusal of :func:`check_events` that names the options which help."""
-    remedy = "--sort, or --damaged keep" if "decrease" in error.problem else "a larger --size, or --damaged keep"
-    accepted = f"{error.accepted}; or {remedy}" if error.accepted else f"times that do not; or {remedy}"
-    return EventDataError(error.problem, where=error.where, value=error.value, accepted=accepted)
 
 
 def ending_of(path: Path) -> str:
@@ -410,12 +437,14 @@ def convert(
     zero_time: bool = False,
     write_unit: str = "s",
     overwrite: bool = True,
+    triggers: str | os.PathLike | None = None,
 ) -> tuple[EventFile, int]:
     """Copy events from one format to another, streaming. A size that neither the source nor the user gives is not
     written.
 
     reading : what is declared of the source. write_unit : of text and CSV, "s" or "us". zero_time : shift times so that
-    the first event is at 0, for EVT3, which counts from the start.
+    the first event is at 0, for EVT3, which counts from the start.   triggers : CSV of the source's triggers, t[us],
+    channel, edge, on the times of the events that are written.
     Causes of events are left out where the format cannot store them.
     Returns the source, and the number of events written.
     """
@@ -428,6 +457,8 @@ def convert(
                 value=reading.time_unit,
                 accepted="no --time-unit for them; --write-unit is the unit of text that is written",
             )
+        if triggers is not None and file.triggers is None:
+            raise ConfigError(f"{file.format} has no triggers", where="--triggers", accepted=".raw, .aedat4 or a bag")
         # Read beforehand: a writer is given DSEC's offset before the first event.
         first = next((int(e.t[0]) for e in file.chunks()), 0)
         shift = first if zero_time else 0
@@ -445,4 +476,10 @@ def convert(
             write_unit=write_unit,
             overwrite=overwrite,
         )
+        if triggers is not None and file.triggers is not None:
+            rows = file.triggers - [shift, 0, 0]
+            lines = ["t[us],channel,edge", *(",".join(map(str, row)) for row in rows.tolist())]
+            with atomic_file(triggers, overwrite=overwrite) as temporary, output_errors(triggers):
+                temporary.write_text("\n".join(lines) + "\n")
+            file.told["triggers"] = f"{len(rows):,} triggers written to {triggers}"
     return file, count

@@ -9,6 +9,7 @@ frame_camera/
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 from collections.abc import Iterable, Iterator
@@ -16,9 +17,11 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from blinkgl.config.images import ImagesConfig
-from blinkgl.errors import AssetError
+from blinkgl.config.reader import read_yaml
+from blinkgl.errors import AssetError, BlinkGLError
 
 FOLDER = "frame_camera"
 STAMPS = f"{FOLDER}/images/timestamps.txt"
@@ -70,6 +73,18 @@ def exposures_csv(lines: Iterable[ExposureLine]) -> str:
 def stamps_txt(lines: Iterable[ExposureLine]) -> str:
     """Return the text of ``images/timestamps.txt``."""
     return "".join(f"{e.middle_us}\n" for e in lines)
+
+
+def camera_of(folder: Path) -> ImagesConfig | None:
+    """Return the frame camera whose pictures are in a folder, as the sequence's ``config.yaml`` says; None: the folder
+    is none of a sequence's, or the sequence does not say it."""
+    sequence = folder.absolute().parent.parent
+    if folder.absolute().parent.name != FOLDER or not (sequence / EXPOSURES).is_file():
+        return None
+    for place in (sequence, sequence.parent):  # a camera of a rig has its configuration in the rig's folder
+        with contextlib.suppress(BlinkGLError, ValidationError, OSError, TypeError, KeyError):
+            return ImagesConfig(**read_yaml(place / "config.yaml")["images"])
+    return None
 
 
 def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:

@@ -3,33 +3,45 @@ a time (.npz: all)."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.alpha import background_of
+from blinkgl.io.alpha import background_of, over
 from blinkgl.io.clock import NANOSECONDS, checked_unit
+from blinkgl.io.frame_camera import camera_of
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors
 from blinkgl.io.names import Series, series
+from blinkgl.io.reading import Damage, EventReading, chosen
 from blinkgl.io.records import inside
 from blinkgl.io.stamps import Stamps, read_timestamps, stamps_of_array
 from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills
 
-VIDEO = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".wmv", ".3gp", ".flv", ".mxf"}
+VIDEO = frozenset(
+    ".mp4 .avi .mkv .mov .webm .m4v .mpg .mpeg .ts .mts .m2ts .vob .wmv .3gp .flv .mxf .ogv .qt .y4m .h264".split()
+)
 STACK = {".tif", ".tiff", ".gif", ".webp", ".apng"}
 RECORDING = {".aedat", ".aedat4"}
 RANGES = ("full", "limited")
-_STAMP_FILES = ("timestamps.txt", "images.txt", "timestamps.csv", "data.csv")
+_STAMP_FILES = ("timestamps.txt", "timestamp.txt", "images.txt", "timestamps.csv", "data.csv")
+_OURS = ("exposures.csv", "manifest.json")
+"""Beside a folder of images of a sequence that BlinkGL wrote: its list of times is in µs."""
+_CALLED = ("frames", "images", "video", "luminance")
+"""Names of arrays of frames."""
 _LOOKED_AT = 16
 """Frames, spread over the clip, whose largest code tells 8, 10, 12 or 14 bits in 16."""
 _ENDINGS = tuple(f"_{unit}" for unit in NANOSECONDS)
 _BITS = (8, 10, 12, 14)
 
-Frames = Iterator[tuple[np.ndarray, int | None, str]]
+Frames = Iterator[tuple[np.ndarray | None, int | None, str]]
+"""Frame, own time and name; None: a damaged frame, which is left out."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +51,8 @@ class Declared:
     fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.stamps`).
     time_unit : of these, "s", "ms", "us", "ns", or "frames" of ``fps``.   zero_time : count times from the first frame.
     white_level : code of white.   range : "full" or "limited" (16 to 235 of 8 bits).   background : colour below
-    transparent pixels, "black", "grey", "white" or "#rrggbb".
+    transparent pixels, "black", "grey", "white" or "#rrggbb".   stream : name or number of one of several arrays or
+    streams of frames.   damaged : "refuse", or "keep" the frames that are whole.
 
     Raises ConfigError: values that are none of these, fps beside timestamps."""
 
@@ -50,8 +63,12 @@ class Declared:
     white_level: float | None = None
     range: str | None = None
     background: str | None = None
+    stream: str | None = None
+    damaged: str = "refuse"
 
     def __post_init__(self) -> None:
+        if self.damaged not in ("refuse", "keep"):
+            raise ConfigError("cannot read --damaged", where="--damaged", value=self.damaged, accepted="refuse or keep")
         if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
             raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
         if self.time_unit != "frames":
@@ -85,7 +102,8 @@ class FrameSource:
     own_times : whether the file itself has times. fps, times_ns : what is used in their place, or None. origin :
     "camera" (a camera's own frames beside its events, proportional to light), "video" or "images". transfer : curve
     that the file states: "linear", "pq", "hlg", an exponent; None: it states none. levels : codes of black and white
-    that the file states or that were guessed, None: the ends of the type. notes : what was read that is unusual,
+    that the file states or that were guessed, None: the ends of the type. exact : whether whoever wrote the frames says
+    that they have no noise. notes : what was read that is unusual,
     guessed or left out, a line each; more may be added while iterating.
 
     Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do
@@ -105,11 +123,16 @@ class FrameSource:
     fps: float | None = None
     times_ns: list[int] | None = None
     zero_time: bool = False
+    exact: bool = False
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int, str]]:
         last = first = None
-        count = 0
+        count = kept = 0
         for frame, own, name in self._frames():
+            if frame is None:  # damaged, and left out: the others keep their times
+                count += 1
+                continue
+            kept += 1
             if frame.shape[:2] != (self.height, self.width):
                 raise EventDataError(
                     "frame size changed",
@@ -129,8 +152,8 @@ class FrameSource:
             first = t_ns if first is None else first
             yield frame, t_ns - first if self.zero_time else t_ns, name
             count += 1
-        if count < 2:
-            raise EventDataError("events need at least two frames", where=str(self.path), value=f"{count} frame(s)")
+        if kept < 2:
+            raise EventDataError("events need at least two frames", where=str(self.path), value=f"{kept} frame(s)")
         self.check_count(count)
 
     def _time(self, number: int, own: int | None) -> int:
@@ -192,7 +215,7 @@ def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameS
     if suffix in (".npy", ".npz"):
         return _array(path, declared).timed(declared)
     if suffix in RECORDING:
-        return _recording(path).timed(declared)
+        return _recording(path, declared).timed(declared)
     raise AssetError(
         "unknown input",
         where=str(path),
@@ -217,12 +240,24 @@ def _folder(folder: Path, declared: Declared) -> FrameSource:
         if declared.time_unit != "frames":
             found.notes.append(f"{list_file.name} beside the images is not used, because of --fps")
             list_file = None
-    stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps)
+    written = list_file is not None and any((list_file.parent.parent / name).is_file() for name in _OURS)
+    usual = "us" if written else None
+    stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps, usual=usual)
     if not found.files and list_file is not None and stamps is not None and stamps.names:
         found = Series([p for name in stamps.names if (p := inside(list_file.parent, name)).is_file()])
     if not found.files:
-        raise AssetError("no images in the folder", where=str(folder), accepted=" ".join(sorted(IMAGE)))
+        there = sorted({p.suffix.lower() for p in folder.iterdir() if p.is_file()} - {""})
+        arrays = {".npz", ".npy"} & set(there)
+        other = "" if not arrays else f"; of arrays, one file of all frames, or images ({len(there)} endings are there)"
+        raise AssetError(
+            "no images in the folder",
+            where=str(folder),
+            value=" ".join(there) or "no files",
+            accepted=" ".join(sorted(IMAGE)) + other,
+        )
     source = _stacks(folder, found, declared)
+    if (ours := camera_of(folder)) is not None:
+        source = _of_our_camera(source, ours, folder.name)
     if stamps is not None and stamps.names is not None and source.count == len(found.files):
         stamps = _by_name(stamps, found, str(list_file))
     return source.timed(replace(declared, timestamps=None), stamps)
@@ -247,17 +282,34 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
         notes += found.missing()
         times = [round(int(place) * 1e9 / declared.fps) for place in places]
 
+    mixed = not stacked and _mixed(files)
+    if mixed:
+        notes.append("grey and colour pictures in one folder: all are taken as colour")
+
     def frames() -> Frames:
         number = 0
         for path in files:
             one = open_stills(path)
-            for image in one.iterate(background):
-                yield image, own and own[number], path.name if one.pages == 1 else f"{path.name} page {number}"
+            try:
+                for image in one.iterate(background):
+                    image = np.repeat(image[..., None], 3, axis=2) if mixed and image.ndim == 2 else image
+                    yield image, own and own[number], path.name if one.pages == 1 else f"{path.name} page {number}"
+                    number += 1
+            except Damage as error:
+                if declared.damaged != "keep":
+                    accepted = "a whole picture; or --damaged keep"
+                    raise Damage(error.problem, where=error.where, accepted=accepted) from None
+                note = f"left out: {path.name}: {error.problem}"
+                notes.extend([note] if note not in notes else [])
+                # Its time stays empty: that of the others does not move.
+                yield None, None, path.name
                 number += 1
             notes.extend(note for note in one.notes if note not in notes)
 
-    image = next(first.iterate(background))
-    levels = None if first.white is None else (0.0, float(first.white))
+    image = next((image for image, _, _ in frames() if image is not None), None)
+    if image is None:
+        raise Damage("no picture of the folder can be decoded", where=str(where))
+    levels = None if first.white is None else (0.0, first.white)
     if image.dtype == np.uint16 and declared.white_level is None and declared.range is None:
         chosen = [files[int(k)] for k in np.unique(np.linspace(0, len(files) - 1, _LOOKED_AT))]
         top = max(int(one.max()) for path in chosen for one in open_stills(path).iterate(background))
@@ -268,6 +320,32 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
     return FrameSource(
         where, *size, pages, frames, has, transfer=first.transfer, levels=levels, notes=notes, times_ns=times
     )
+
+
+def _of_our_camera(source: FrameSource, camera: ImagesConfig, pictures: str) -> FrameSource:
+    """Return the frames with what the sequence's frame camera says of their codes and noise."""
+    top = float(2**camera.bits - 1)
+    transfer = {"linear": "linear", "gamma": camera.gamma}.get(camera.response)
+    quiet = pictures == "clean" or not (camera.photon_noise or camera.read_noise)
+    said = f"{camera.response}, {camera.bits} bits" + (f", {camera.bayer} filters" if camera.bayer else "")
+    notes = [note for note in source.notes if not note.startswith("16-bit codes")]
+    notes.append(f"the sequence's frame camera: {said}, {'no noise' if quiet else 'with its noise'}")
+    # No light has the black level, on the scale of light.
+    levels = (camera.black * top, top) if camera.response == "linear" else (0.0, top)
+    return replace(source, transfer=transfer, levels=levels, notes=notes, exact=quiet)
+
+
+def _mixed(files: list[Path]) -> bool:
+    """Return whether some pictures are grey and some colour, by their headers."""
+    kinds = set()
+    for path in files:
+        if path.suffix.lower() in _HEADERS:
+            with contextlib.suppress(Exception), Image.open(path) as image:  # what cannot be opened is refused later
+                kinds.add(image.mode in ("1", "L", "LA", "I;16", "I;16B", "I", "F"))
+    return len(kinds) == 2
+
+
+_HEADERS = {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pnm", ".pbm", ".tga", ".jp2", ".avif"}
 
 
 def _white_of(top: int, notes: list[str]) -> tuple[float, float] | None:
@@ -297,10 +375,20 @@ def _video(path: Path, declared: Declared) -> FrameSource:
     from blinkgl.io.video import VideoReader
 
     below = background_of(declared.background)
-    reader = VideoReader(path, range=declared.range, background=below, zero_time=declared.zero_time)
+    keep = declared.damaged == "keep"
+    reader = VideoReader(
+        path,
+        range=declared.range,
+        background=below,
+        zero_time=declared.zero_time,
+        keep=keep,
+        stream=declared.stream,
+    )
     frames = lambda: ((frame, t_ns, f"#{i}") for i, (frame, t_ns) in enumerate(reader))
     size, timed = (reader.height, reader.width), None not in reader.times_ns
-    return FrameSource(path, *size, reader.count, frames, timed, "video", reader.transfer, reader.levels, reader.notes)
+    # Some packets hold no picture, so a list of times is compared at the end.
+    count = reader.count if declared.timestamps is None else None
+    return FrameSource(path, *size, count, frames, timed, "video", reader.transfer, reader.levels, reader.notes)
 
 
 def _array(path: Path, declared: Declared) -> FrameSource:
@@ -312,10 +400,14 @@ def _array(path: Path, declared: Declared) -> FrameSource:
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
             with NpzReader(path) as data:
-                name = next((k for k in ("frames", "images", "video", "luminance") if k in data), None)
-                if name is None:
-                    raise AssetError("no array 'frames'", where=str(path), value=data.names)
-                frames = data[name]
+                held = [k for k in _CALLED if k in data]
+                if declared.stream is not None and declared.stream in data:
+                    held = [declared.stream]
+                if not held:
+                    raise AssetError(
+                        "no array 'frames'", where=str(path), value=data.names, accepted="--array NAME, or one 'frames'"
+                    )
+                frames = data[held[chosen(declared.stream, held, str(path), "arrays of frames")]]
                 called = [f"{k}{unit}" for k in ("timestamps", "times", "time", "ts", "t") for unit in ("", *_ENDINGS)]
                 stamp = next((k for k in called if k in data), None)
                 if stamp is not None and declared.fps is None and declared.timestamps is None:
@@ -323,8 +415,10 @@ def _array(path: Path, declared: Declared) -> FrameSource:
                     own, notes = stamps.times_ns, [stamps.note] if stamps.note else []
                 elif stamp is not None:
                     notes.append(f"'{stamp}' in the file is not used, because of --fps or --timestamps")
-    if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
-        raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W) or (N, H, W, 3)")
+    if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3, 4))) or not frames.shape[0]:
+        raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W), (N, H, W, 3 or 4)")
+    if frames.dtype == bool:
+        frames = frames.view(np.uint8) * np.uint8(255)
     if frames.dtype not in (np.uint8, np.uint16) and frames.dtype.kind != "f":
         raise AssetError(
             "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
@@ -335,17 +429,20 @@ def _array(path: Path, declared: Declared) -> FrameSource:
     def read() -> Frames:
         for i, frame in enumerate(frames):
             frame = frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame
+            if frame.ndim == 3 and frame.shape[2] == 4:
+                frame, note = over(np.asarray(frame), background_of(declared.background))
+                notes.extend([note] if note and note not in notes else [])
             yield np.asarray(frame, np.float32 if frame.dtype.kind == "f" else None), None, f"#{i}"
 
     size, has = frames.shape[1:3], own is not None
     return FrameSource(path, *size, len(frames), read, has, levels=levels, notes=notes, times_ns=own)
 
 
-def _recording(path: Path) -> FrameSource:
+def _recording(path: Path, declared: Declared) -> FrameSource:
     """Frames that a camera recorded beside its events."""
     from blinkgl.io.formats import open_events
 
-    file = open_events(path)
+    file = open_events(path, EventReading.of(stream=declared.stream))
     first = next(file.frames(), None)
     if first is None:
         raise EventDataError("events need at least two frames", where=str(path), value="0 frames")

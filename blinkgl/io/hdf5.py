@@ -32,9 +32,11 @@ CODECS = {"zstd": 5, "lz4": 1}
 _NAMES = {number: name.encode() for name, number in CODECS.items()}
 _BLOSC_VALUES = 4
 """Parameters that Blosc's filter reads without checking their number; with fewer it crashes."""
-_FILTERS = {1: "gzip", 2: "shuffle", 32000: "lzf", 32001: "Blosc", 32004: "LZ4", 32015: "zstd"}
-"""Filters that are run on files of strangers. Others that HDF5 or hdf5plugin know (szip, Fletcher32, SZ, ZFP …) end the
-process on a damaged chunk."""
+_FILTERS = {1: "gzip", 2: "shuffle", 3: "Fletcher32", 32000: "lzf", 32001: "Blosc", 32004: "LZ4", 32015: "zstd"}
+"""Filters that are run on files of strangers. Others that HDF5 or hdf5plugin know (szip, SZ, ZFP …) end the process on
+a damaged chunk."""
+_SUM, _SUM_BYTES = 3, 4
+"""Fletcher32 ends the process on chunks shorter than its sum, so it has to be the last filter: their sizes show it."""
 _BLOSC, _PLUGGED = 32001, frozenset((32001, 32004, 32015))
 """Blosc, and all filters that hdf5plugin brings."""
 _ECF = 0x8ECF
@@ -145,7 +147,16 @@ def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
     """Check how a data set is stored before a value of it is read. Raises AssetError: a filter that is not run, values
     that were never written, huge chunks, a filter without its parameters."""
     layout = found.id.get_create_plist()
-    for code, _, values, called in (layout.get_filter(k) for k in range(layout.get_nfilters())):
+    count = layout.get_nfilters()
+    summed = [k for k in range(count) if layout.get_filter(k)[0] == _SUM]
+    if summed and (summed != [count - 1] or _shortest_chunk(found) <= _SUM_BYTES):
+        raise AssetError(
+            f"dataset '{name}' is packed by an HDF5 filter that is not run here",
+            where=str(path),
+            value="Fletcher32 within others, or over less than its sum",
+            accepted=f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
+        )
+    for code, _, values, called in (layout.get_filter(k) for k in range(count)):
         if code not in _FILTERS:
             raise AssetError(
                 f"dataset '{name}' is packed by an HDF5 filter that is not run here",
@@ -172,6 +183,11 @@ def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
         whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
     if not whole:
         raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
+
+
+def _shortest_chunk(found: h5py.Dataset) -> int:
+    sizes = (found.id.get_chunk_info(k).size for k in range(found.id.get_num_chunks()))
+    return min(sizes, default=_SUM_BYTES + 1)
 
 
 def attribute(file: h5py.HLObject, name: str, path: Path) -> Any:

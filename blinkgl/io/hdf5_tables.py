@@ -6,7 +6,9 @@ such as MVSEC's ``davis/left/events``, or an array of records. ``t_offset`` and 
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,27 +20,43 @@ from blinkgl.errors import AssetError
 from blinkgl.io.hdf5 import attribute, check_storage, hdf5_errors, open_hdf5
 from blinkgl.io.mvsec import EVENTS
 from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.io.tables import Table, TableReader, named_columns, table_of_columns, table_of_records, table_of_rows
+from blinkgl.io.tables import (
+    Candidate,
+    Table,
+    TableReader,
+    choose,
+    named_columns,
+    table_of_columns,
+    table_of_records,
+    table_of_rows,
+)
 from blinkgl.types.events import Events
+
+_MILLISECONDS = ("ms_to_idx", "ms_map_idx")
+"""Tables of milliseconds beside integer times, as DSEC, BlinkFlow, TUM-VIE and M3ED have them: these are µs."""
+_EVENT_UTILS = {"xs": "iu", "ys": "iu", "ts": "f", "ps": "b"}
+"""The group ``events`` of event_utils' and HQF's files, names and kinds of numbers: times are in seconds."""
+_SIZES = ("sensor_resolution", "geometry", "resolution")
+"""Attributes or data sets that hold a size; ``geometry`` of Metavision is WIDTHxHEIGHT, ``sensor_resolution`` of
+event_utils (height, width), ``calib/resolution`` of M3ED (width, height)."""
 
 
 class Hdf5TableReader(TableReader):
-    """Events of the first table of a file, or of another by ``stream``; its file stays open."""
+    """Events of the only table of a file, or of the one that ``stream`` names; its file stays open. Raises AssetError:
+    several and none is chosen, which it lists."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            tables = [table for named in (True, False) for table in _tables(self._file, self.path, reading, named)]
-            if not tables:
-                raise AssetError(
-                    "no columns of events",
-                    where=str(path),
-                    value=list(self._file)[:12],
-                    accepted="x, y, t, p in one group, an (N, 4) array, or --columns x=NAME,y=NAME,t=NAME,p=NAME",
-                )
-            super().__init__(self.path, reading, tables)
-        self.version = "mvsec" if tables[reading.stream or 0].place in EVENTS else "hdf5"
+            found = _candidates(self._file, self.path, reading)
+            called = [one for one in found[1] if one[0] in EVENTS or one[0].rpartition("/")[2] == "events"]
+            every = [*found[0], *found[1]]
+            # A name may mean any of them; a number counts those that the refusal lists.
+            candidates = every if reading.stream in dict(every) else found[0] or called or found[1]
+            table = choose(candidates, reading, str(path), self._file)
+            super().__init__(self.path, reading, table)
+        self.version = "mvsec" if table.place in EVENTS else "hdf5"
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events in pieces of ``size``."""
@@ -49,34 +67,49 @@ class Hdf5TableReader(TableReader):
         self._file.close()
 
 
-def _tables(file: h5py.File, path: Path, reading: EventReading, named: bool) -> Iterator[Table]:
-    """Yield the tables of events, in the order of the groups' names, ``events`` and the root first: columns and fields
-    with names, or (not ``named``) arrays of four columns, which may be anything."""
-    groups = [""]
+def _candidates(file: h5py.File, path: Path, reading: EventReading) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the tables of events, in the order of the groups' names, ``events`` and the root first: columns and fields
+    with names, and arrays of four columns, which may be anything."""
+    groups, named, plain = [""], [], []
     file.visititems(lambda name, found: groups.append(name) if isinstance(found, h5py.Group) else None)
     for name in sorted(groups, key=lambda name: (name != "events", name != "", name)):
         group = file[name] if name else file
         held = {key: group[key] for key in group if isinstance(group[key], h5py.Dataset)}
-        columns = named_columns(held, reading)
+        columns = named_columns(held, reading, f"{path}: '{name}'")
         if set("txyp") <= set(columns):
-            if named:
-                yield _of_columns(file, group, {slot: held[key] for slot, key in columns.items()}, columns["t"], path)
+            chosen_ = {slot: held[key] for slot, key in columns.items()}
+            named.append((name, lambda g=group, c=chosen_, t=columns["t"]: _of_columns(file, g, c, t, path)))
             continue
         for key, data in held.items():
-            place, size = f"{name}/{key}".lstrip("/"), _size(file, group, path)
-            fields = named_columns(data.dtype.names or (), reading)
-            if named and len(data.shape or ()) == 1 and set("txyp") <= set(fields):
-                check_storage(data, place, path)
-                yield table_of_records(data, fields, place=place, size=size)
-            rows = data.dtype.kind in "iuf" and len(data.shape or ()) == 2
-            if not named and rows and data.shape[1] in (4, len(reading.columns or ())):
-                check_storage(data, place, path)
-                if place in EVENTS:
-                    # MVSEC's columns, in seconds, of its sensor of 346x260 px.
-                    asked = reading if reading.columns else EventReading(columns=("x", "y", "t", "p"))
-                    yield table_of_rows(data, str(path), asked, place=place, unit="s", size=(260, 346))
-                else:
-                    yield table_of_rows(data, str(path), reading, place=place, size=size)
+            place = f"{name}/{key}".lstrip("/")
+            fields = named_columns(data.dtype.names or (), reading, f"{path}: '{place}'")
+            if len(data.shape or ()) == 1 and set("txyp") <= set(fields):
+                named.append((place, lambda d=data, f=fields, g=group: _of_records(file, g, d, f, path)))
+            elif (
+                data.dtype.kind in "iuf"
+                and len(data.shape or ()) == 2
+                and data.shape[1] in (4, len(reading.columns or ()))
+            ):
+                plain.append((place, lambda d=data, g=group: _of_rows(file, g, d, reading, path)))
+    return named, plain
+
+
+def _of_records(file: h5py.File, group: Any, data: h5py.Dataset, fields: dict[str, str], path: Path) -> Table:
+    place = data.name.strip("/")
+    check_storage(data, place, path)
+    geometry = "geometry" in data.attrs or "geometry" in file.attrs
+    layout = {"unit": "us", "layout": "Metavision's records of events: µs"} if place == "CD/events" or geometry else {}
+    return table_of_records(data, fields, place=place, size=_size(file, group, path), **layout)
+
+
+def _of_rows(file: h5py.File, group: Any, data: h5py.Dataset, reading: EventReading, path: Path) -> Table:
+    place = data.name.strip("/")
+    check_storage(data, place, path)
+    if place in EVENTS:
+        # MVSEC's columns, in seconds, of its sensor of 346x260 px.
+        order = reading.columns or ("x", "y", "t", "p")
+        return table_of_rows(data, str(path), order, place=place, unit="s", size=(260, 346))
+    return table_of_rows(data, str(path), reading.columns, place=place, size=_size(file, group, path))
 
 
 def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, path: Path) -> Table:
@@ -89,40 +122,63 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
             )
         check_storage(data, data.name, path)
     units = next((attribute(columns["t"], key, path) for key in ("unit", "units") if key in columns["t"].attrs), None)
+    place = columns["t"].parent.name.strip("/")
+    layout: dict[str, Any] = {}
+    if any(key in holder for key in _MILLISECONDS for holder in (file, group)) and columns["t"].dtype.kind in "iu":
+        layout = {"unit": "us"}
+    elif place == "events" and all(
+        name in group and isinstance(group[name], h5py.Dataset) and group[name].dtype.kind in kinds
+        for name, kinds in _EVENT_UTILS.items()
+    ):
+        layout = {"unit": "s", "layout": "event_utils' group of events: seconds"}
     return table_of_columns(
         columns,
         str(path),
         heading=f"t [{units}]" if isinstance(units, str) else heading,
-        # A table of milliseconds, as DSEC and BlinkFlow have, counts µs.
-        unit="us" if ("ms_to_idx" in file or "ms_to_idx" in group) and columns["t"].dtype.kind in "iu" else None,
         offset=_number(file, "t_offset", path) or 0,
         size=_size(file, group, path),
-        place=columns["t"].parent.name.strip("/"),
+        place=place,
+        **({} if isinstance(units, str) else layout),
     )
 
 
-def _number(holder: Any, name: str, path: Path) -> Any:
-    """Return the number under a name, a data set of one value or an attribute; None: there is none. Raises AssetError:
-    it is none."""
+def _value(holder: Any, name: str, path: Path) -> np.ndarray | None:
+    """Return the few numbers or the text under a name, a data set or an attribute; None: there is none."""
     data = holder.get(name)
-    if data is None:
-        data = attribute(holder, name, path)
-        value = np.asarray(0 if data is None else data)
-    elif isinstance(data, h5py.Dataset) and data.size == 1:
-        check_storage(data, name, path)
-        value = np.asarray(data[()])
-    else:
-        value = np.asarray(None)
-    if value.size != 1 or value.dtype.kind not in "iuf":
-        raise AssetError(f"'{name}' is no number", where=str(path), value=str(getattr(data, "shape", data)))
-    return None if data is None else value.ravel()[0].item()
+    if not isinstance(data, h5py.Dataset):
+        return None if (found := attribute(holder, name, path)) is None else np.asarray(found)
+    check_storage(data, name, path)
+    return np.asarray(data[()] if 0 <= (data.size or 0) <= _FEW else data.shape[:1])
+
+
+_FEW = 16
+
+
+def _number(holder: Any, name: str, path: Path) -> Any:
+    """Return the number under a name; None: there is none. Raises AssetError: it is none."""
+    value = _value(holder, name, path)
+    if value is not None and (value.size != 1 or value.dtype.kind not in "iuf"):
+        raise AssetError(f"'{name}' is no number", where=str(path), value=str(value.shape if value.ndim else value))
+    return None if value is None else value.ravel()[0].item()
 
 
 def _size(file: h5py.File, group: Any, path: Path) -> tuple[int, int] | None:
+    """Return the (height, width) that a file states, in any of the known ways. Raises AssetError: it is none."""
     for holder in (group, file):
         height, width = (_number(holder, side, path) for side in ("height", "width"))
         if isinstance(height, int) and isinstance(width, int):
             return height, width
+    places = (holder for holder in (group, group.get("calib"), file) if isinstance(holder, h5py.Group))
+    for holder, name in itertools.product(places, _SIZES):
+        if (value := _value(holder, name, path)) is None:
+            continue
+        if value.dtype.kind in "SUO":
+            text = value.item() if isinstance(value.item(), str) else value.item().decode("latin-1")
+            value = np.array([int(side) for side in re.findall(r"\d{1,9}", text)])
+        if value.shape != (2,) or value.dtype.kind not in "iu":
+            raise AssetError(f"'{name}' is no size", where=str(path), value=str(value), accepted="two numbers of px")
+        first, second = value.tolist()
+        return (first, second) if name == "sensor_resolution" else (second, first)
     return None
 
 

@@ -104,9 +104,7 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
 
     Raises AssetError: objects (they would be unpickled), or a shape that does not match the bytes; and what NumPy
     raises."""
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read(file)
+    shape, fortran, dtype = _header(file)
     if dtype.hasobject:
         raise AssetError(
             "array of Python objects, which can run any code when loaded; refused",
@@ -124,6 +122,12 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
     return shape, fortran, dtype
 
 
+def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(file)
+
+
 class NpzReader(Closing):
     """The arrays of an .npz by name; each is read when requested. Never unpickles. Use as a context manager.
 
@@ -136,6 +140,21 @@ class NpzReader(Closing):
 
     def close(self) -> None:
         self._archive.close()
+
+    def shapes(self) -> tuple[dict[str, tuple[tuple[int, ...], np.dtype]], list[str]]:
+        """Return shape and type of each array, of which only the headers are read, and the names of the members that
+        would have to be unpickled."""
+        found, pickled = {}, []
+        for name in self.names:
+            member = f"{name}.npy"
+            if member in self._archive.namelist():
+                with self._archive.open(member) as file:
+                    shape, _, dtype = _header(file)
+                if dtype.hasobject:
+                    pickled.append(name)
+                else:
+                    found[name] = shape, dtype
+        return found, pickled
 
     def __contains__(self, name: str) -> bool:
         return name in self.names
@@ -255,10 +274,9 @@ def decode_image(data: bytes, path: str | os.PathLike) -> np.ndarray:
 def _image_problem(data: bytes) -> str | None:
     """Return a problem of an image file that OpenCV would ignore: it fills missing parts with grey."""
     if data[:8] == _PNG_MAGIC:
-        return _png_problem(data)
-    # A whole JPEG file has the end marker, FFD9, behind its last scan, FFDA.
-    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-        return "cannot decode image (truncated)"
+        return png_problem(data)
+    if data[:2] == b"\xff\xd8":
+        return "a JPEG, where pictures without loss are read"
     if data[:2] == b"#?":
         found = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
         size = found and (int(found[2]), int(found[1]))
@@ -273,7 +291,7 @@ def _image_problem(data: bytes) -> str | None:
     return size_problem(*size) if size else "cannot decode image (no size in its header)"
 
 
-def _png_problem(data: bytes) -> str | None:
+def png_problem(data: bytes) -> str | None:
     """Return a problem of the chunks (length, type, content, CRC) up to IEND. (PNG specification, section 5)"""
     # 33 bytes are the signature and the chunk IHDR.
     if data[12:16] != b"IHDR" or len(data) < 33:

@@ -69,8 +69,10 @@ def series(folder: Path, suffixes: Iterable[str], wanted: Callable[[Path], bool]
     Hidden files, a second file of the same name stem, and few names unlike all others are left out, with a line each.
     Raises EventDataError: two series in one folder."""
     endings = {suffix.lower() for suffix in suffixes}
-    files = [path for path in folder.iterdir() if path.suffix.lower() in endings and wanted(path) and path.is_file()]
-    notes: list[str] = []
+    named = [path for path in folder.iterdir() if path.suffix.lower() in endings and wanted(path)]
+    files, notes = [path for path in named if path.is_file()], []
+    if gone := [path for path in named if path.is_symlink() and not path.exists()]:
+        notes.append(f"{_named(sorted(gone))}: left out, since the link leads to no file")
     hidden = [path for path in files if path.name.startswith(".")]
     if hidden:
         notes.append(f"{_named(hidden)}: hidden, so left out")

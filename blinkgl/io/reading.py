@@ -1,28 +1,42 @@
-"""What a user declares about an event file. What is not declared is read from the file; the rest is guessed, and said.
+"""What a user declares about an event file. What is not declared is read from the file, and nothing is guessed.
 
 One value of :class:`EventReading` passes from a command's options, or a Python function's arguments, to every reader.
 """
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from blinkgl.errors import ConfigError
+from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.clock import checked_unit
 
 _MOST_SIDE = 65536
 
 
+def listed(table: Mapping[Any, Any], value: Any, problem: str, where: str | os.PathLike, accepted: str = "") -> Any:
+    """Return what a closed list has for a value of a file's field. Raises AssetError: the value is not in it."""
+    if value not in table:
+        accepted = accepted or ", ".join(map(str, table))
+        raise AssetError(problem, where=os.fspath(where), value=value, accepted=accepted)
+    return table[value]
+
+
+class Damage(AssetError):
+    """Bytes of a recording that are cut or no part of its format. Of all refusals, these alone are what
+    ``--damaged keep`` reads past: a value that is whole, but unknown, is none."""
+
+
 @dataclass(frozen=True)
 class EventReading:
-    """Declarations about an event file; None: as the file says, else guessed.
+    """Declarations about an event file; None: as the file says.
 
     time_unit : "s", "ms", "us" or "ns".   size : (height, width), px.   origin : "top" or "bottom", the row with y 0.
     columns : order of the columns of a table, "_" for one to ignore, or "x=NAME" for the array that holds x.
-    polarity : the numbers that mean OFF and ON.   stream : number of one of several streams of events.
+    polarity : the numbers that mean OFF and ON.   stream : name or number of one of several streams, topics or arrays.
     damaged : "refuse", or "keep" what is whole.   sort : put events in order of time.
     """
 
@@ -31,7 +45,7 @@ class EventReading:
     origin: str | None = None
     columns: tuple[str, ...] | None = None
     polarity: tuple[float, float] | None = None
-    stream: int | None = None
+    stream: str | None = None
     damaged: str = "refuse"
     sort: bool = False
 
@@ -53,7 +67,7 @@ class EventReading:
         origin: str | None = None,
         columns: str | Sequence[str] | None = None,
         polarity: str | Sequence[float] | None = None,
-        stream: int | None = None,
+        stream: int | str | None = None,
         damaged: str = "refuse",
         sort: bool = False,
     ) -> EventReading:
@@ -68,7 +82,7 @@ class EventReading:
             origin,
             _columns(columns),
             _polarity(polarity),
-            stream,
+            None if stream is None else str(stream),
             damaged,
             sort,
         )
@@ -114,3 +128,29 @@ def _polarity(polarity: str | Sequence[float] | None) -> tuple[float, float] | N
 
 def _refused(option: str, value: Any, accepted: str) -> ConfigError:
     return ConfigError(f"cannot read --{option}", where=f"--{option}", value=value, accepted=accepted)
+
+
+def chosen(
+    stream: str | None,
+    names: Sequence[str],
+    where: str,
+    what: str,
+    *,
+    numbered: bool = True,
+    labels: Sequence[str] = (),
+) -> int:
+    """Return which of ``names`` a user means by a name or, where they are ``numbered`` from 0, by a number; the only
+    one where nothing is declared.   labels : shown behind the names. Raises AssetError, which lists them: several and
+    none is declared, or none of these."""
+    if stream in names:
+        return names.index(stream)
+    if numbered and stream is not None and stream.isdigit() and int(stream) < len(names):
+        return int(stream)
+    if stream is None and len(names) == 1:
+        return 0
+    shown = [str(k) for k in range(len(names))] if numbered else names
+    behind = labels or (names if numbered else [""] * len(names))
+    listed = (f"--stream {key} ({label})" if label else f"--stream {key}" for key, label in zip(shown, behind))
+    problem = f"{len(names)} {what}, and none is chosen" if stream is None else f"no such one of the {what}"
+    value: dict[str, Any] = {} if stream is None else {"value": stream}
+    raise AssetError(problem, where=where, accepted=("one of " if len(names) > 1 else "") + ", ".join(listed), **value)

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, BlinkGLError
 
 MAX_RECORD_BYTES = 512 << 20
 MAX_NAME_BYTES = 1024
@@ -45,15 +45,16 @@ def input_errors(path: str | os.PathLike, problem: str = "cannot read") -> Itera
 
 
 @contextlib.contextmanager
-def decoding(path: str | os.PathLike, problem: str) -> Iterator[None]:
-    """Convert whatever a library raises on damaged bytes to an :class:`AssetError` of one line."""
+def decoding(path: str | os.PathLike, problem: str, kind: type[AssetError] = AssetError) -> Iterator[None]:
+    """Convert whatever a library raises on damaged bytes to an :class:`AssetError`, or another ``kind``, of one
+    line."""
     try:
         yield
-    except AssetError:
+    except BlinkGLError:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise AssetError(f"{problem}: {reason}", where=str(path)) from error
+        raise kind(f"{problem}: {reason}", where=str(path)) from error
 
 
 def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:

@@ -1,8 +1,8 @@
 """Events in ROS 1 and 2 bags and MCAP files, read by the package rosbags.
 
 ``dvs_msgs/EventArray`` and ``prophesee_event_msgs/EventArray`` hold rows x, y, time, polarity, which are read as arrays
-and not event by event; ``event_camera_msgs/EventPacket`` holds a camera's own bytes, of which EVT3 and ``mono`` are
-read. Times are the events' own: ROS time, or the camera's for EVT3.
+and not event by event; ``event_camera_msgs/EventPacket`` holds a camera's own bytes, of which EVT2.1, EVT3 and ``mono``
+are read. Times are the events' own: ROS time, or the camera's for EVT.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.columns import events_of, joined
-from blinkgl.io.evt import START, decode
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.evt import HIGH, START, UNTIMED, decode, state_lines
+from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen, listed
 from blinkgl.io.records import decoding
 from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
@@ -62,26 +62,24 @@ def typestore(ros2: bool) -> Any:
 
 
 class BagReader:
-    """The events of one topic; of several the first by name, or another by ``stream``. height, width : px, of its first
-    message.   notes : a line where there are several topics. Raises AssetError: damaged, no topic of events."""
+    """The events of the only topic, or of the one that ``stream`` names. height, width : px, of its first message.
+    notes : after reading, a line for each kind of words that were left out. Raises AssetError: no topic of events, or
+    several, which it lists; another encoding; Damage."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        self.path, self.notes = Path(path), []
+        self.path, self.notes, self._keep = Path(path), [], reading.keep
         self.height = self.width = None
+        self.triggers = np.empty((0, 3), np.int64)
         with self._opened() as bag:
             self._topics = sorted({c.topic for c in bag.connections if c.msgtype in _EVENTS})
-            number = reading.stream or 0
-            if not 0 <= number < len(self._topics):
+            if not self._topics:
                 raise AssetError(
-                    "no such topic of events" if self._topics else "no topic of events",
+                    "no topic of events",
                     where=str(path),
-                    value=number if self._topics else sorted({c.msgtype for c in bag.connections})[:8],
-                    accepted=", ".join(f"--stream {k} ({topic})" for k, topic in enumerate(self._topics))
-                    or "dvs_msgs/EventArray, prophesee_event_msgs/EventArray or event_camera_msgs/EventPacket",
+                    value=sorted({c.msgtype for c in bag.connections})[:8],
+                    accepted="dvs_msgs/EventArray, prophesee_event_msgs/EventArray or event_camera_msgs/EventPacket",
                 )
-            self._topic = self._topics[number]
-            if len(self._topics) > 1:
-                self.notes = [f"{len(self._topics)} topics of events: {self._topic} is read (--stream for another)"]
+            self._topic = self._topics[chosen(reading.stream, self._topics, str(path), "topics of events")]
             for _, _, (height, width) in self._messages(bag):
                 self.height, self.width = (height, width) if height and width else (None, None)
                 break
@@ -92,7 +90,7 @@ class BagReader:
         store = typestore(ros2)
         from rosbags.highlevel import AnyReader
 
-        with decoding(self.path, "damaged bag"), AnyReader([self.path], default_typestore=store) as bag:
+        with decoding(self.path, "damaged bag", Damage), AnyReader([self.path], default_typestore=store) as bag:
             yield bag
 
     def _messages(self, bag: Any) -> Iterator[tuple[Any, Any, tuple[int, int]]]:
@@ -110,13 +108,23 @@ class BagReader:
         yield from joined(self._events(), least)
 
     def _events(self) -> Iterator[Events]:
-        state, first = START["evt3"].copy(), 0
-        with self._opened() as bag:
-            for connection, content, _ in self._messages(bag):
-                packet = connection.msgtype == _PACKET
-                events = _unpacked(content, state, self.path) if packet else _timed(content, str(self.path), first)
-                first += len(events)
-                yield events
+        state, first, lost, triggers = START.copy(), 0, 0, []
+        try:
+            with self._opened() as bag:
+                for connection, content, _ in self._messages(bag):
+                    if connection.msgtype == _PACKET:
+                        events, bad = _unpacked(content, state, self.path, self._keep, triggers)
+                        lost += bad
+                    else:
+                        events = _timed(content, str(self.path), first)
+                    first += len(events)
+                    yield events
+        finally:
+            self.triggers = np.concatenate(triggers) if triggers else np.empty((0, 3), np.int64)
+            self.notes = [f"left out: words that the format does not have: {lost:,}"] if lost else []
+            self.notes += state_lines(state)
+        if state[HIGH] < 0 and state[UNTIMED]:
+            raise Damage(f"{state[UNTIMED]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
 
 def _rows(data: memoryview | bytes, ros2: bool) -> tuple[np.ndarray, tuple[int, int]]:
@@ -157,17 +165,39 @@ def _timed(rows: np.ndarray, where: str, first: int) -> Events:
     return events_of(rows["x"], rows["y"], t, rows["p"], where, first)
 
 
-def _unpacked(message: Any, state: np.ndarray, path: Path) -> Events:
-    """Return the events of an EventPacket. state : of the EVT3 decoder, which goes on from packet to packet."""
-    data = np.ascontiguousarray(message.events)
-    if message.encoding == "evt3":
-        events, bad = decode("evt3", data.view("<u2"), state)
-        if bad >= 0:
-            raise ValueError(f"no valid EVT3 word in packet {message.seq}")
-        return events
+_ENCODINGS = {"evt3": "u2", "evt21": "u8", "mono": "u8"}
+"""Encodings of a packet, and the type of their words; all but ``mono`` are read by :func:`~blinkgl.io.evt.decode`."""
+
+
+def _unpacked(
+    message: Any, state: np.ndarray, path: Path, keep: bool, triggers: list[np.ndarray]
+) -> tuple[Events, int]:
+    """Return the events of an EventPacket, and how many words were left out, which ``keep`` allows. state : of the
+    decoder, which goes on from packet to packet."""
+    data, order = np.ascontiguousarray(message.events), ">" if message.is_bigendian else "<"
+    words = np.dtype(order + listed(_ENCODINGS, message.encoding, "unknown encoding of events", path))
+    if len(data) % words.itemsize:
+        raise Damage(
+            f"packet {message.seq} is cut",
+            where=str(path),
+            value=f"{len(data)} bytes",
+            accepted=f"a multiple of {words.itemsize}",
+        )
     if message.encoding == "mono":  # p 1 bit, y 15, x 16, ns since time_base 32
-        words = data.view(">u8" if message.is_bigendian else "<u8")
-        t = (np.int64(message.time_base) + (words & 0xFFFFFFFF).astype(np.int64) + 500) // 1000
-        x, y = (words >> 32 & 0xFFFF).astype(np.uint16), (words >> 48 & 0x7FFF).astype(np.uint16)
-        return Events(x, y, t, (words >> 63).astype(np.uint8))
-    raise AssetError("unknown encoding of events", where=str(path), value=message.encoding, accepted="evt3 or mono")
+        values = data.view(words)
+        t = (np.int64(message.time_base) + (values & 0xFFFFFFFF).astype(np.int64) + 500) // 1000
+        x, y = (values >> 32 & 0xFFFF).astype(np.uint16), (values >> 48 & 0x7FFF).astype(np.uint16)
+        return Events(x, y, t, (values >> 63).astype(np.uint8)), 0
+    rest, parts, lost = data.view(words).astype(words.newbyteorder("<"), copy=False), [], 0
+    while True:
+        events, bad = decode(message.encoding, rest, state, triggers=triggers)
+        parts.append(events)
+        if bad < 0:
+            return Events.concatenate(parts), lost
+        if not keep:
+            raise Damage(
+                f"packet {message.seq}: no valid {message.encoding.upper()} word",
+                where=str(path),
+                value=hex(int(rest[bad])),
+            )
+        rest, lost = rest[bad + 1 :], lost + 1

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.clock import guessed_frame_unit, named_unit, nanoseconds, unit_of
+from blinkgl.io.clock import named_unit, nanoseconds
 from blinkgl.io.records import input_errors, read_text
 from blinkgl.io.rows import is_number, read_rows, titles_of
 
@@ -21,22 +21,34 @@ from blinkgl.io.rows import is_number, read_rows, titles_of
 @dataclass(frozen=True)
 class Stamps:
     """times_ns : int ns, in the file's order.   names : of the frames, None where the list has none.   note : the line
-    that says a guessed unit, or None."""
+    that says a layout that was recognised, or None."""
 
     times_ns: list[int]
     names: list[str] | None = None
     note: str | None = None
 
 
-def read_timestamps(path: Path, unit: str | None = None, fps: float | None = None) -> Stamps:
+class Undeclared(EventDataError):
+    """A list of times whose unit is neither stated nor declared."""
+
+
+_SECONDS = re.compile(r"[-+]?\d+\.(\d+)([eE][-+]?\d+)?")
+_PLACES = 6
+"""The Event Camera Dataset's and TUM's lists: seconds with a point, of which some have six places or more, or names."""
+
+
+def read_timestamps(
+    path: Path, unit: str | None = None, fps: float | None = None, *, usual: str | None = None
+) -> Stamps:
     """Return the times of a list.
 
     Columns are separated by blanks, tabs, commas or semicolons; ``#`` begins a comment, and the first line may be a
     heading. The time is the column that a heading calls so, else the first of numbers that is no plain count beside
     another; a start and an end of an exposure give their middle. The unit is ``unit`` ("s", "ms", "us", "ns"; "frames"
-    of ``fps`` Hz), else what the heading or the file's name states, else guessed from all values together.
+    of ``fps`` Hz), else what the heading or the file's name states, else ``usual``, that of a known writer; else
+    seconds, where every time has a point, and some have six places or all have names.
 
-    Raises AssetError: unreadable. EventDataError: not a time, with its line; two units in one list; no times.
+    Raises AssetError: unreadable. EventDataError: not a time, with its line; no times; Undeclared: no unit.
     ConfigError: "frames" without fps."""
     with input_errors(path):
         heading, numbered = read_rows(path.read_text(encoding="utf-8-sig", errors="replace"))
@@ -63,9 +75,15 @@ def read_timestamps(path: Path, unit: str | None = None, fps: float | None = Non
                 "times in frames need a frame rate", where="--time-unit", value=unit, accepted="--fps, too"
             )
         return Stamps([round(Fraction(text) * 10**9 / Fraction(fps)) for text in texts], names)
-    guessed = lambda: guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
-    found = unit_of(unit, _stated(titles, columns, heading, path), guessed)
-    return Stamps(nanoseconds(texts, found), names, None if found.line is None else f"{path.name}: {found.line}")
+    stated = unit or _stated(titles, columns, heading, path) or usual
+    if stated is not None:
+        return Stamps(nanoseconds(texts, stated), names)
+    points = [_SECONDS.fullmatch(text) for text in texts]
+    places = max(len(found[1]) for found in points if found) if None not in points else 0
+    if places and (names is not None or places >= _PLACES) and len(columns) == 1:
+        note = f"{path.name}: read as the Event Camera Dataset's and TUM's lists: seconds with a point"
+        return Stamps(nanoseconds(texts, "s"), names, note)
+    raise _undeclared(str(path), any("." in text for text in texts))
 
 
 _MICROSECONDS = re.compile(r"[-+]?\d{1,16}")
@@ -112,9 +130,16 @@ def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str)
             value=values[bad : bad + 1].tolist(),
             accepted="a finite number",
         )
-    guessed = lambda: guessed_frame_unit(values.astype(np.float64), f"{where}: '{name}'")
-    found = unit_of(unit, named_unit(name), guessed)
-    return Stamps(nanoseconds(values, found), None, found.line)
+    stated = unit or named_unit(name)
+    if stated is None:
+        raise _undeclared(f"{where}: '{name}'", values.dtype.kind == "f" and bool((values % 1).any()))
+    return Stamps(nanoseconds(values, stated))
+
+
+def _undeclared(where: str, points: bool) -> Undeclared:
+    proposed = "s" if points else "us"
+    accepted = f"try --time-unit {proposed} if that is right (--frames-time-unit in compare and calibrate), or --fps"
+    return Undeclared("no unit of the times is stated", where=where, accepted=accepted)
 
 
 def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[int]:

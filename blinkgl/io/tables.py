@@ -1,7 +1,8 @@
 """Events as four columns of numbers, whatever holds them: NumPy's and MATLAB's files, HDF5, text.
 
 People write the same table under many names (``t ts timestamps t_us``, ``x xs``, ``p pol polarity on``), with p as 0/1,
--1/1 or bool and t as any number of any unit. Names and units are known here, once.
+-1/1 or bool and t as any number of any unit. Names and units are known here, once; what has neither is proposed to the
+user as the options to declare, and not read.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.clock import TimeUnit, guessed_event_unit, named_unit, unit_of
+from blinkgl.io.clock import NANOSECONDS, named_unit
 from blinkgl.io.columns import events_of, microseconds
-from blinkgl.io.reading import EventReading
+from blinkgl.io.reading import EventReading, chosen
 from blinkgl.types.events import Events
 
 _NAMES = {
@@ -27,10 +28,10 @@ _NAMES = {
     "p": "p ps pol pols polarity polarities on",
 }
 _SLOT = {word: slot for slot, words in _NAMES.items() for word in words.split()}
-_FEW = 16
-"""Rows below which columns rise by accident."""
 _SAMPLE = 1 << 16
-"""Rows at each end of a table that a guess is made from."""
+"""Rows that a proposal is made from."""
+_NANOSECONDS_FROM = 1e17
+"""Whole numbers from which on times are proposed as ns: in µs these are later than the year 5000."""
 
 
 def slot_of(name: str) -> str:
@@ -42,43 +43,65 @@ def slot_of(name: str) -> str:
     )
 
 
-def named_columns(names: Iterable[str], reading: EventReading) -> dict[str, str]:
-    """Return column -> its name among ``names``: as declared, else the first that means it."""
-    found = dict(reading.named)
+def named_columns(names: Iterable[str], reading: EventReading, where: str) -> dict[str, str]:
+    """Return column -> its name among ``names``: as declared, else the one that means it; of several the bare letter.
+    Raises AssetError: several, and none is declared."""
+    found: dict[str, list[str]] = {}
+    names = list(names)
     for name in names:
-        slot = slot_of(name)
-        if slot != "_":
-            found.setdefault(slot, name)
-    return {slot: name for slot, name in found.items() if name in names}
+        if (slot := slot_of(name)) != "_":
+            found.setdefault(slot, []).append(name)
+    whole = set("txyp") <= {*found, *reading.named}
+    for slot, all_ in found.items():
+        if whole and slot not in reading.named and len(all_) > 1 and slot not in all_:
+            raise AssetError(
+                f"{len(all_)} columns that may be {slot}, and none is chosen",
+                where=where,
+                accepted="one of " + ", ".join(f"--columns {slot}={name}" for name in all_),
+            )
+    columns = {slot: slot if slot in all_ else all_[0] for slot, all_ in found.items() if slot not in reading.named}
+    return columns | {slot: name for slot, name in reading.named.items() if name in names}
 
 
-def guessed_order(rows: np.ndarray) -> tuple[str, ...]:
-    """Return the order of the columns of (N, 4) numbers without names: t x y p, unless p, the last column of -1, 0 and
-    1 alone, or the rising one say another."""
-    # From the last: of a still x or y, which may be 0 or 1 alone, p is the one behind it.
-    signs = [k for k in (3, 2, 1, 0) if np.isin(rows[:, k], (-1, 0, 1)).all()]
-    p = signs[0] if signs else 3
-    rising = [k for k in range(4) if k != p and (np.diff(rows[:, k]) >= 0).all()]
-    t = 0 if len(rows) < _FEW or not rising else rising[0]
-    p = 3 if len(rows) < _FEW else p
-    order = ["_"] * 4
-    order[p], order[t] = "p", "t"
-    for k, slot in zip([k for k in range(4) if order[k] == "_"], "xy", strict=True):
-        order[k] = slot
-    return tuple(order)
+def proposal(rows: np.ndarray | None, times: np.ndarray | None = None) -> str:
+    """Return the options to paste for (N, 4) rows without names, or for times without a unit, as far as a sample of the
+    file shows them. The user declares; nothing is read by this."""
+    options = []
+    if rows is not None:
+        if rows.ndim != 2 or rows.shape[1] != 4:
+            return "--columns with x, y, t, p in the file's order, _ for others, and --time-unit"
+        # t rises nearly everywhere and has the most values, p has the fewest; the others are x and y.
+        share = [round(float(np.mean(np.diff(column) >= 0)), 1) if len(column) > 1 else 0.0 for column in rows.T]
+        values = [len(np.unique(column)) for column in rows.T]
+        t = max(range(4), key=lambda k: (share[k], values[k]))
+        p = min((k for k in (3, 2, 1, 0) if k != t), key=lambda k: values[k])
+        order = ["_"] * 4
+        order[t], order[p] = "t", "p"
+        for k, slot in zip([k for k in range(4) if order[k] == "_"], "xy", strict=True):
+            order[k] = slot
+        options.append(f"--columns {','.join(order)}")
+        times = rows[:, t]
+    if times is not None:
+        size = float(np.abs(times).max()) if len(times) else 0.0
+        whole = not len(times) or not (times % 1).any()
+        options.append(f"--time-unit {('ns' if size > _NANOSECONDS_FROM else 'us') if whole else 's'}")
+    return " ".join(options)
 
 
-def order_line(order: Iterable[str]) -> str:
-    """Return the sentence that says a guessed order, and the option that overrules it."""
-    return f"columns taken as {' '.join(order)} (--columns x,y,t,p, or as they are, if that is wrong)"
+def undeclared(problem: str, where: str, rows: np.ndarray | None, times: np.ndarray | None = None) -> AssetError:
+    """Return the refusal of a file that does not say what its columns or times are, with the options to paste."""
+    text = proposal(rows, times)
+    return AssetError(
+        problem, where=where, accepted=f"try {text} if that is right (blinkgl convert --look shows the file)"
+    )
 
 
 @dataclass
 class Table:
     """Four columns in a file.   read : rows of a slice, "x", "y", "t", "p" and perhaps "cause" -> (N,) numbers.
     count : rows.   heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to
-    t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   notes :
-    lines for the user, of guesses."""
+    t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   layout :
+    the name of the layout by which its unit is known; "": the file states it, or nothing does."""
 
     read: Callable[[slice], dict[str, np.ndarray]]
     count: int
@@ -87,7 +110,7 @@ class Table:
     offset: int | float = 0
     size: tuple[int, int] | None = None
     place: str = ""
-    notes: tuple[str, ...] = ()
+    layout: str = ""
 
 
 def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Table:
@@ -125,59 +148,66 @@ def table_of_records(records: Any, named: Mapping[str, str], **known: Any) -> Ta
     return Table(read, len(records), named["t"], **known)
 
 
-def table_of_rows(rows: Any, where: str, reading: EventReading, **known: Any) -> Table:
-    """Return the table of an array (N, K) without names: K columns as declared, or four by :func:`guessed_order`."""
-    order, notes = reading.columns or (), ()
-    if not order or reading.named:
-        if rows.shape[1] != 4:
-            raise AssetError("columns without names", where=where, value=rows.shape, accepted="--columns x,y,t,p")
-        order = guessed_order(np.concatenate([rows[:_SAMPLE], rows[max(_SAMPLE, len(rows) - _SAMPLE) :]]))
-        notes = (order_line(order),)
-    if len(order) != rows.shape[1]:
+def table_of_rows(rows: Any, where: str, order: tuple[str, ...] | None, **known: Any) -> Table:
+    """Return the table of an array (N, K) without names: K columns of the declared order. Raises AssetError, which
+    proposes one: none is declared; of another length."""
+    if not order or any("=" in entry for entry in order):
+        sample = np.asarray(rows[:_SAMPLE])
+        raise undeclared(f"array '{known.get('place', '')}' has no names of columns", where, sample)
+    slots: tuple[str, ...] = order
+    if len(slots) != rows.shape[1]:
         raise AssetError(
             f"--columns names {len(order)} columns", where=where, value=rows.shape, accepted="one for each"
         )
 
     def read(part: slice) -> dict[str, np.ndarray]:
         columns = np.ascontiguousarray(rows[part].T)  # contiguous, because each is read several times
-        return {slot: column for slot, column in zip(order, columns, strict=True) if slot != "_"}
+        return {slot: column for slot, column in zip(slots, columns, strict=True) if slot != "_"}
 
-    return Table(read, len(rows), notes=notes, **known)
+    return Table(read, len(rows), **known)
+
+
+Candidate = tuple[str, Callable[[], Table]]
+"""The place of a table in a file, and what makes it, once it is chosen."""
+
+
+def choose(candidates: list[Candidate], reading: EventReading, where: str, held: Iterable[str]) -> Table:
+    """Return the table that the user means, or the only one.   held : what the file holds, for the message. Raises
+    AssetError, which lists them, or says that there is none."""
+    if not candidates:
+        raise AssetError(
+            "no columns of events",
+            where=where,
+            value=list(held)[:12],
+            accepted="x, y, t, p in one place, an array (N, 4), or --columns x=NAME,y=NAME,t=NAME,p=NAME",
+        )
+    names = [place for place, _ in candidates]
+    return candidates[chosen(reading.stream, names, where, "arrays of events")][1]()
 
 
 class TableReader:
-    """Events of a table. height, width : px, None where the file does not give them.   unit : of its times, read,
-    declared or guessed.   notes : lines for the user.   unread : rows left out so far, with ``damaged="keep"``."""
+    """Events of a table. height, width : px, None where the file does not give them.   unit : of its times, read or
+    declared.   notes : lines for the user.   unread : rows left out so far, with ``damaged="keep"``. Raises AssetError:
+    no unit is stated or declared."""
 
-    def __init__(self, path: Path, reading: EventReading, tables: list[Table]):
+    def __init__(self, path: Path, reading: EventReading, table: Table):
         self.path, self._keep, self._polarity, self.unread = path, reading.keep, reading.polarity, 0
-        number = reading.stream or 0
-        if not 0 <= number < len(tables):
-            raise AssetError(
-                "no such stream", where=str(path), value=number, accepted=f"--stream 0 to {len(tables) - 1}"
-            )
-        self._table = table = tables[number]
-        self.notes = [*table.notes]
-        if len(tables) > 1:
-            more = f"{len(tables)} streams of events: {number} ({table.place}) is read (--stream for another)"
-            self.notes.append(more)
+        self._table, self.notes = table, []
         self.height, self.width = table.size or (None, None)
         first = table.read(slice(0, 1))
         self.count, self.causes = table.count, "cause" in first
-        self._numbers = first["t"].dtype.kind in "iufb"
-        self.unit = unit_of(reading.time_unit, table.unit or named_unit(table.heading), self._guessed)
-
-    def _guessed(self) -> TimeUnit:
-        if not self._numbers:
-            return TimeUnit("us", "read")
-        ends = (slice(0, _SAMPLE), slice(max(self.count - _SAMPLE, _SAMPLE), self.count))
-        t = np.concatenate([self._table.read(part)["t"] for part in ends]).astype(np.float64) + self._table.offset
-        t = t[np.isfinite(t)]
-        return guessed_event_unit(t, self.count) if len(t) else TimeUnit("us", "read")
+        unit = reading.time_unit or table.unit or named_unit(table.heading)
+        if unit is None:
+            times = table.read(slice(0, _SAMPLE))["t"]
+            if len(times) and times.dtype.kind in "iuf":
+                raise undeclared(f"no unit of the times '{table.heading}' is stated", str(path), None, times)
+        elif table.layout and reading.time_unit is None:
+            self.notes.append(f"read as {table.layout}")
+        self.unit = unit or "us"  # of no times, or of no numbers, which reading refuses
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events in pieces of ``size``. Raises EventDataError, naming the event, for values that are none."""
-        where, self.unread, unit = str(self.path), 0, self.unit.nanoseconds
+        where, self.unread, unit = str(self.path), 0, NANOSECONDS[self.unit]
         offset = int(microseconds(np.array([self._table.offset]), where, 0, unit)[0])
         for first in range(0, self.count, size):
             columns = self._table.read(slice(first, min(self.count, first + size)))
@@ -187,13 +217,15 @@ class TableReader:
             x, y, p, cause = columns["x"], columns["y"], columns["p"], columns.get("cause")
             polarity = self._polarity
             yield events_of(x, y, t, p, where, first, cause=cause, offset=offset, signed=True, polarity=polarity)
+        if self.count and self.unread == self.count:
+            raise AssetError("no row is an event", where=where, accepted="x, y, t, p (--columns)")
 
     def _whole(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the rows that an event can be; count the others."""
         whole = np.ones(len(columns["t"]), bool)
         for slot, column in columns.items():
             if column.dtype.kind == "f":
-                whole &= np.isfinite(column) & ((column % 1 == 0) | (slot == "t"))
+                whole &= np.isfinite(column)
             if slot in "xy":
                 whole &= (column >= 0) & (column < 65536)
         self.unread += int(np.count_nonzero(~whole))

@@ -1,10 +1,11 @@
 """Events as text, the Event Camera Dataset's ``t[s] x y p`` and its relatives, parsed and printed by numba at disk
-speed; also packed by gzip.
+speed; also packed by gzip, or the one text in a zip.
 
 Read: separators space, tab, comma, semicolon; comment lines (``#``, ``%``) anywhere; before the first event a line
 ``width height`` (as E2VID's files have) and a line, perhaps a comment, that names the columns, also as faery writes it
-(``t,x@640,y@480,on``); p as 0/1, -1/1 or True/False; t in the unit of its name, else in one that is guessed for the
-whole file. Written: seconds with six decimals, or integer µs (exact both).
+(``t,x@640,y@480,on``); p as 0/1, -1/1 or True/False; t in the unit of its name. Two layouts are known without such a
+line: the Event Camera Dataset's, in which every row has to fit, and that of OpenEB, which ``%geometry:`` marks.
+Written: seconds with six decimals, or integer µs (exact both).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import contextlib
 import gzip
 import os
 import re
+import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,10 +25,10 @@ import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.clock import guessed_event_unit, named_unit, unit_of
-from blinkgl.io.columns import CheckedWriter
-from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.io.tables import guessed_order, order_line, slot_of
+from blinkgl.io.clock import named_unit
+from blinkgl.io.columns import CheckedWriter, proposed_polarity
+from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen
+from blinkgl.io.tables import slot_of, undeclared
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -37,17 +39,26 @@ _SHIFT = {"s": 6, "ms": 3, "us": 0, "ns": -3}
 """Decimal places from each unit of time to µs."""
 
 
+_ECD = ("t", "x", "y", "p")
+_ECD_ROW = re.compile(rb"\d+\.(\d+)[ \t,;]+\d+[ \t,;]+\d+[ \t,;]+[01]")
+_ECD_PLACES = 6
+"""The Event Camera Dataset's rows: seconds with a point, of which some have six places or more, x, y, 0 or 1."""
+_SAMPLE_BYTES = 1 << 15
+_NOT_A_ROW, _POLARITY, _LAYOUT, _BETWEEN = 1, 2, 3, 4
+"""What is wrong with a line: no numbers of an event; another polarity; not the layout of the others; between pixels."""
+
+
 class TextReader:
     """Reads events from text. height, width : px, None when the file does not give them.   unit : of the times.   notes
     : lines for the user.   unread : lines left out so far, with ``damaged="keep"``. Raises AssetError with the number
-    of a line that is not an event."""
+    of a line that is not an event, or which proposes the columns and the unit to declare."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path, self._reading, self.notes, self.unread = Path(path), reading, [], 0
         self.height = self.width = None
         self._start = self._lines = 0  # bytes and lines before the first event
         self._order: tuple[str, ...] = ()
-        unit = None
+        self._unit: str | None = None
         with self._open() as file:
             while line := file.readline(_LONGEST_LINE + 1):
                 if len(line) > _LONGEST_LINE:
@@ -56,48 +67,94 @@ class TextReader:
                         where=str(path),
                         value=line[:40],
                     )
-                text = line.decode("utf-8-sig", "replace").strip()
-                comment = text[:1] in ("#", "%")
-                # Two integers before the first event are the sensor's size.
-                size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
-                if size and self.width is None:
-                    self.width, self.height = int(size[1]), int(size[2])
-                elif text and (comment or re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I)):
-                    names = _names(text.lstrip("#% "))
-                    order = tuple(slot_of(name.partition("@")[0]) for name in names)
-                    named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
-                    if not self._order and named:
-                        self._order, unit = order, self._heading(dict(zip(order, names)))
-                    elif not comment and not reading.columns:
-                        raise AssetError(
-                            f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
-                            where=str(path),
-                            value=text,
-                            accepted="a heading such as t x y p, or --columns",
-                        )
-                elif text:
+                if self._begins_events(line):
                     self._start += 3 if line.startswith(codecs.BOM_UTF8) else 0
                     break
                 self._start, self._lines = file.tell(), self._lines + 1
-            sample, count = self._sample(file)
-        self._order = reading.columns or self._order
-        if not self._order:
-            self._order = guessed_order(sample) if sample.shape[1] == 4 else ("t", "x", "y", "p")
-            self.notes.append(order_line(self._order))
-        known = len(sample) and sample.shape[1] == len(self._order)
-        guessed = lambda: guessed_event_unit(sample[:, self._order.index("t")], count)
-        self.unit = unit_of(reading.time_unit, unit if unit or known else "us", guessed)
+            file.seek(self._start)
+            head = file.read(_SAMPLE_BYTES)
+        # A last line without its newline may be cut; a single line counts.
+        rows = head.split(b"\n")
+        rows = rows[:-1] if len(rows) > 1 else rows
+        rows = [row.strip() for row in rows if row.strip() and row.lstrip()[:1] not in (b"#", b"%")]
+        if reading.columns and not reading.named:
+            self._order = reading.columns
+        elif reading.named and not set("txyp") <= set(self._order):
+            raise AssetError(
+                "no heading with these names", where=str(path), value=reading.columns, accepted="a heading"
+            )
+        self._ecd = self._is_ecd(rows)
+        numbers = [row for row in map(_row, rows) if row]
+        wide = len(numbers[0]) if numbers else 4
+        self._sample = np.array([row for row in numbers if len(row) == wide], np.float64).reshape(-1, wide)
+        self.unit = reading.time_unit or self._unit or ("s" if self._ecd else "")
+        if numbers and not (self._order and self.unit):
+            if not self._order:
+                raise undeclared("no heading names the columns", str(path), self._sample)
+            t = self._sample[:, min(self._order.index("t"), wide - 1)]
+            raise undeclared("no unit of the times is stated", str(path), None, t)
+        self._order, self.unit = self._order or _ECD, self.unit or "us"  # of a text without events
+
+    def _begins_events(self, line: bytes) -> bool:
+        """Return whether a line is an event; take what one before the events states."""
+        text = line.decode("utf-8-sig", "replace").strip()
+        comment = text[:1] in ("#", "%")
+        # Two integers before the first event are the sensor's size.
+        size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
+        openeb = re.fullmatch(r"%\s*geometry:\s*(\d{1,9}),(\d{1,9})", text)
+        if (found := size or openeb) and self.width is None:
+            self.width, self.height = int(found[1]), int(found[2])
+            if openeb and not self._reading.columns:
+                self._order, self._unit = ("x", "y", "p", "t"), "us"
+                self.notes.append("read as OpenEB's CSV: x y p t, µs")
+            return False
+        if not text or not (comment or re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I)):
+            return bool(text)
+        names = _names(text.lstrip("#% "))
+        declared = {name.lower(): slot for slot, name in self._reading.named.items()}
+        bare = [name.partition("@")[0] for name in names]
+        slots = [declared.get(name) or slot_of(name) for name in bare]
+        order = tuple("_" if s in self._reading.named and n not in declared else s for s, n in zip(slots, bare))
+        named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
+        if not self._order and named:
+            self._order, self._unit = order, self._heading(dict(zip(order, names)))
+        elif not comment and not self._reading.columns:
+            raise AssetError(
+                f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
+                where=str(self.path),
+                value=text,
+                accepted="a heading such as t x y p, or --columns",
+            )
+        return False
+
+    def _is_ecd(self, rows: list[bytes]) -> bool:
+        """Return whether rows that nothing describes are of the Event Camera Dataset's layout: the first ones here, all
+        others when they are parsed."""
+        matches = [_ECD_ROW.fullmatch(row) for row in rows]
+        told = self._order not in ((), _ECD) or self._unit or self._reading.time_unit
+        if told or None in matches or max((len(m[1]) for m in matches if m), default=0) < _ECD_PLACES:
+            return False
+        self._order = _ECD
+        self.notes.append("read as the Event Camera Dataset's text: t x y p, seconds")
+        return True
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:
-        """Give the file, unpacked. Raises AssetError: unreadable, damaged."""
+        """Give the file, unpacked. Raises AssetError: unreadable, several texts in a zip; Damage."""
+        suffix = self.path.suffix.lower()
         try:
-            with gzip.open(self.path) if self.path.suffix.lower() == ".gz" else open(self.path, "rb") as file:
-                yield cast(BinaryIO, file)
-        except (OSError, EOFError, zlib.error) as error:
-            raise AssetError(
-                f"cannot read: {getattr(error, 'strerror', None) or error}", where=str(self.path)
-            ) from error
+            with contextlib.ExitStack() as stack:
+                if suffix == ".zip":
+                    archive = stack.enter_context(zipfile.ZipFile(self.path))
+                    names = [n for n in archive.namelist() if n.lower().endswith((".txt", ".csv"))]
+                    name = names[chosen(self._reading.stream, names, str(self.path), "texts in the zip")]
+                    yield cast(BinaryIO, stack.enter_context(archive.open(name)))
+                else:
+                    opened = gzip.open(self.path) if suffix == ".gz" else open(self.path, "rb")  # noqa: SIM115 - on the stack
+                    yield cast(BinaryIO, stack.enter_context(opened))
+        except (OSError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+            reason = getattr(error, "strerror", None)
+            raise (AssetError if reason else Damage)(f"cannot read: {reason or error}", where=str(self.path)) from error
 
     def _heading(self, names: dict[str, str]) -> str | None:
         """Return the unit that the name of t states; take the sizes that faery adds to the names of x and y."""
@@ -107,34 +164,13 @@ class TextReader:
             return "us"
         return named_unit(names["t"])
 
-    def _sample(self, file: BinaryIO, size: int = 1 << 15) -> tuple[np.ndarray, int]:
-        """Return events of both ends of the file as (N, K) numbers, and about how many events it holds."""
-        file.seek(self._start)
-        head, tail, total = file.read(size), b"", 0
-        # The end of a compressed file is reached only through all of it.
-        if self.path.suffix.lower() == ".gz":
-            for piece in iter(lambda: file.read(1 << 20), b""):
-                total, tail = total + len(piece), (tail + piece)[-size:]
-        else:
-            total = max(os.fstat(file.fileno()).st_size - self._start - len(head), 0)
-            file.seek(max(file.seek(0, os.SEEK_END) - min(size, total), 0))
-            tail = file.read()
-        # Cut lines are left out: the end of the head and the beginning of the tail, unless one continues the other.
-        whole = (head + tail).split(b"\n") if len(tail) == total else None
-        lines = whole or head.split(b"\n")[:-1] + tail.split(b"\n")[1:]
-        rows = [row for row in map(_row, lines) if row]
-        # Rows of another width than most are no events.
-        wide = max(map(len, rows), key=[len(row) for row in rows].count, default=4)
-        rows = [row for row in rows if len(row) == wide]
-        density = len(rows) / max(len(head) + len(tail), 1)
-        return np.array(rows, np.float64).reshape(len(rows), wide), max(round(density * (len(head) + total)), len(rows))
-
     def chunks(self, size: int = 1 << 22) -> Iterator[Events]:
         """Yield all events, from about ``size`` bytes of text at a time."""
         places = np.array([_PLACES[slot] for slot in self._order])
         off, on = (int(v) for v in self._reading.polarity or (0, 1))
-        pair = np.array([off, on, -1 if self._reading.polarity is None else off])  # undeclared, -1 is OFF, too
-        self.unread = 0
+        # Undeclared, -1 is OFF, too, but not in the layout that has 0 and 1 alone.
+        pair = np.array([off, on, off if self._reading.polarity or self._ecd else -1])
+        self.unread = kept = 0
         with self._open() as file:
             file.seek(self._start)
             line, rest = self._lines, b""
@@ -154,20 +190,37 @@ class TextReader:
                 x, y, p = np.empty(capacity, np.uint16), np.empty(capacity, np.uint16), np.empty(capacity, np.uint8)
                 t = np.empty(capacity, np.int64)
                 # The kernel indexes lines from 0 within this piece of text.
-                n, bad, lost = _parse(buffer, x, y, t, p, places, _SHIFT[self.unit.name], pair, self._reading.keep)
-                self.unread += lost
-                if bad >= 0 and not self._reading.keep:
-                    raise AssetError(
-                        f"line {line + bad + 1} is not an event",
-                        where=str(self.path),
-                        value=text.split(b"\n", bad + 1)[bad].decode("latin-1"),
-                        accepted=" ".join(self._order) + " (--columns), polarity 0/1 or -1/1 (--polarity)",
-                    )
+                n, bad, lost, why = _parse(
+                    buffer, x, y, t, p, places, _SHIFT[self.unit], pair, self._reading.keep, self._ecd
+                )
+                self.unread, kept = self.unread + lost, kept + n
+                if why:
+                    raise self._refused(line + bad + 1, text.split(b"\n", bad + 1)[bad].decode("latin-1"), why)
                 line += capacity
                 if n:
                     yield Events(x[:n], y[:n], t[:n], p[:n])
                 if not data:
-                    return
+                    break
+        if self.unread and not kept:
+            raise AssetError(
+                "no line is an event", where=str(self.path), accepted=" ".join(self._order) + " (--columns)"
+            )
+
+    def _refused(self, line: int, value: str, why: int) -> AssetError:
+        p = self._order.index("p")
+        codes = proposed_polarity(self._sample[:, p]) if p < self._sample.shape[1] else "--polarity OFF/ON"
+        order = " ".join(self._order)
+        problem, accepted = {
+            _NOT_A_ROW: ("is not an event", f"{order} (--columns)"),
+            _POLARITY: ("has a polarity that is not known", f"0/1, -1/1 or True/False as {order}; or {codes}"),
+            _LAYOUT: (
+                "is not as the lines before it, the Event Camera Dataset's: seconds with a point, x, y, 0 or 1",
+                "try --columns and --time-unit",
+            ),
+            _BETWEEN: ("is between pixels", "whole numbers: rectified events are no raw events"),
+        }[why]
+        kind = Damage if why == _NOT_A_ROW else AssetError
+        return kind(f"line {line} {problem}", where=str(self.path), value=value, accepted=accepted)
 
 
 def _names(heading: str) -> list[str]:
@@ -230,7 +283,7 @@ def _number(buffer, i):
     while 48 <= buffer[i] <= 57 or (buffer[i] == 46 and integer):
         if buffer[i] == 46:
             integer = False
-        elif mantissa < 10**16:  # digits beyond 17 are far below a µs once there is a point
+        elif mantissa < 8 * 10**17:  # 18 or 19 digits; more are far below a µs once there is a point
             mantissa = mantissa * 10 + (buffer[i] - 48)
             digits = True
             exponent -= 0 if integer else 1
@@ -264,7 +317,7 @@ def _scaled(mantissa, exponent):
     value = abs(mantissa)
     while exponent > 0 and value != 0:
         # value * 10 must stay below 2^63.
-        if value > 10**17:
+        if value > 9 * 10**17:
             return np.int64(0), False
         value *= 10
         exponent -= 1
@@ -296,14 +349,15 @@ def _word(buffer, i, place, pair):
 
 
 @kernel
-def _parse(buffer, x, y, t, p, places, shift, pair, keep):
-    """Parse the events in complete lines of text. Return (count, index of the first bad line or -1, bad lines).
+def _parse(buffer, x, y, t, p, places, shift, pair, keep, ecd):
+    """Parse the events in complete lines. Return (count, index of the line that stops the reading, lines left out, what
+    is wrong with that line; 0: nothing).
 
     places : what each field is, 0 t, 1 x, 2 y, 3 p, 4 ignored.   shift : decimal places from the unit of time to µs.
-    pair : numbers of OFF, of ON, and another of OFF.   keep : go on after a bad line."""
-    n, line, i, bad, lost, values = 0, 0, 0, -1, 0, np.zeros(5, np.int64)
+    pair : numbers of OFF, of ON, and another of OFF.   keep : go on after no row of numbers.   ecd : with points."""
+    n, line, i, lost, values = 0, 0, 0, 0, np.zeros(5, np.int64)
     while i < len(buffer):
-        field, good = 0, True
+        field, wrong = 0, 0
         while buffer[i] != 10:
             c = buffer[i]
             if _separates(c):
@@ -315,7 +369,7 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep):
                     i += 1
                 break
             if field == len(places):
-                good = False
+                wrong = 1
                 break
             place = places[field]
             field += 1
@@ -325,37 +379,38 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep):
             if i < 0 or not (_separates(c) or c == 10):
                 values[place], i = _word(buffer, begin, place, pair)
                 if i < 0:
-                    good, i = False, begin
+                    # A word in the place of the polarity is a code of it.
+                    wrong, i = 2 if place == 3 else 1, begin
                     break
                 continue
+            if ecd and place == 0 and exponent >= 0:
+                wrong = 3
             # Times are multiplied by 10^shift: that makes microseconds.
             values[place], ok = _scaled(mantissa, exponent + (shift if place == 0 else 0))
-            if not ok or (place > 0 and exponent < 0 and values[place] * 10.0**-exponent != mantissa):
-                # Coordinates between pixels are refused as well: rectified events are not raw events.
-                good = False
+            if not ok:
+                wrong = 1
                 break
-        if field != 0 or not good:
+            if place > 0 and place < 4 and exponent < 0 and values[place] * 10.0**-exponent != mantissa:
+                # Coordinates between pixels are refused as well: rectified events are not raw events.
+                wrong = 2 if place == 3 else 4
+                break
+        if field != 0 or wrong:
             on = values[3] == pair[1]
-            good = (
-                good
-                and field == len(places)
-                and 0 <= values[1] <= 65535
-                and 0 <= values[2] <= 65535
-                and (on or values[3] == pair[0] or values[3] == pair[2])
-            )
-            if good:
+            fits = field == len(places) and 0 <= values[1] <= 65535 and 0 <= values[2] <= 65535
+            if wrong == 0 and fits and (on or values[3] == pair[0] or values[3] == pair[2]):
                 t[n], x[n], y[n], p[n] = values[0], values[1], values[2], on
                 n += 1
-            else:
-                bad = line if bad < 0 else bad
-                lost += 1
-                if not keep:
-                    return n, bad, lost
-                while buffer[i] != 10:
-                    i += 1
+                i, line = i + 1, line + 1
+                continue
+            wrong = wrong if wrong and (fits or wrong != 3) else 1 if not fits else 3 if ecd else 2
+            if not keep or wrong != 1:
+                return n, line, lost, wrong
+            lost += 1
+            while buffer[i] != 10:
+                i += 1
         i += 1
         line += 1
-    return n, bad, lost
+    return n, -1, lost, 0
 
 
 @kernel

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import write_whole
-from blinkgl.io.clock import TimeUnit, checked_unit, guessed_frame_unit, named_unit, nanoseconds, unit_of
+from blinkgl.io.clock import NANOSECONDS, checked_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
 from blinkgl.io.rows import is_number, read_rows, titles_of
@@ -36,6 +36,12 @@ from blinkgl.io.stamps import read_timestamps
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")
 MAPS_FROM = ("camera", "world")
+_TYPICAL_HZ = 100.0
+"""Frame rate nearest to which, as a ratio, a guessed unit brings the frames."""
+_EPOCH_S = (9.4e8, 4.1e9)
+"""Seconds since 1970 of the years 2000 to 2099: times of a clock that counts from there betray their unit."""
+_LEAP = 500.0
+"""Ratio of neighbouring steps from which on a list of times is taken to be in two units."""
 _GAP = 20
 """A step this many times the usual one is a gap."""
 _COLUMNS = {
@@ -326,13 +332,15 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
                 raise _no_pose(path, number, [text], "a time first, a finite number")
         # Two equal times are refused in a moment, whatever the unit.
         stated = table.unit or ("s" if any(a == b for a, b in pairwise(texts)) else None)
-        unit = unit_of(declared.time_unit, stated, lambda: _guessed(texts, path))
-        if unit.line is not None:
-            notes.append(f"{path.name}: {unit.line.replace('--time-unit', 'time_unit:')}")
+        unit = declared.time_unit or stated
+        if unit is None:
+            unit = _likely_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+            others = ", ".join(other for other in NANOSECONDS if other != unit)
+            notes.append(f"{path.name}: times taken as {unit} (time_unit: {others} if that is wrong)")
         values = nanoseconds(texts, unit)
         # The difference of any two times below 2^62 fits into an int64.
         if max(map(abs, values)) >= 2**62:
-            value = f"{texts[-1]} {unit.name}"
+            value = f"{texts[-1]} {unit}"
             raise AssetError(
                 "times are too large: another unit?",
                 where=str(path),
@@ -344,16 +352,41 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
     return t_ns
 
 
-def _guessed(texts: Sequence[str], path: Path) -> TimeUnit:
-    try:
-        return guessed_frame_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
-    except EventDataError as error:
-        raise AssetError(
-            error.problem,
-            where=error.where,
-            value=error.value,
-            accepted="one unit for all, or time_unit: s, ms, us or ns",
-        ) from None
+def _likely_unit(values: np.ndarray, where: str) -> str:
+    """Return the unit in which times of poses, (N,) numbers of an unknown unit, make sense together.
+
+    Times within this century's seconds since 1970 in one unit are in that unit; else the unit is the one in which the
+    median step is nearest to that of 100 Hz. Raises AssetError: steps that only two units explain."""
+    values = np.asarray(values, np.float64)
+    steps = np.diff(values)
+    if not len(steps):
+        # A single time has no step: a fraction is of seconds, a whole number is in µs.
+        return "s" if (values % 1).any() else "us"
+    size = np.abs(values)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        leaps = np.flatnonzero(np.maximum(size[1:], size[:-1]) > _LEAP * np.minimum(size[1:], size[:-1]))
+    for k in leaps[leaps > 0]:
+        # A pause leaps, too, but the steps after it are as long as those before.
+        before, after = (
+            np.median(np.abs(steps[:k])),
+            np.median(np.abs(steps[k + 1 :])) if k + 1 < len(steps) else np.inf,
+        )
+        if max(before, after) > _LEAP * min(before, after):
+            raise AssetError(
+                "times in two units",
+                where=f"{where}: frames {k} and {k + 1}",
+                value=values[k : k + 2].tolist(),
+                accepted="one unit for all, or time_unit: s, ms, us or ns",
+            )
+    positive = steps[steps > 0]
+    usual = float(np.median(positive)) if len(positive) else 1.0
+    # Decades between the frame rate that a unit gives and the typical one; a time of this century counts for 2.5.
+    likely = {
+        unit: abs(np.log10(1e9 / (usual * ns * _TYPICAL_HZ)))
+        - (2.5 if _EPOCH_S[0] <= values[0] * ns / 1e9 <= _EPOCH_S[1] else 0)
+        for unit, ns in NANOSECONDS.items()
+    }
+    return min(likely, key=likely.__getitem__)
 
 
 def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:

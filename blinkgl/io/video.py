@@ -1,7 +1,8 @@
 """Video in and out through PyAV (FFmpeg's libraries); streaming, one frame in memory.
 
-What a file says is used: each frame's own time, the display matrix, pixel range, matrix and transfer curve, bits per
-component. PyAV is imported when a video is opened.
+What a file says is used: each frame's own time, the display matrix, the pixels' aspect, range, matrix and transfer
+curve, alpha, bits per component. A video is whole where everything decodes: packets without a picture (hidden frames,
+edit lists, null frames) are no damage. PyAV is imported when a video is opened.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.alpha import over
+from blinkgl.io.reading import Damage, chosen
 from blinkgl.io.ticks import frame_times
-from blinkgl.io.yuv import known, rgb_from_yuv
+from blinkgl.io.yuv import cut_riff, floats_of, known, orientation_of, rgb_from_yuv, samples_of
 from blinkgl.machine.closing import Finishing
 from blinkgl.machine.extras import install
 from blinkgl.machine.interrupts import uninterrupted
@@ -39,12 +42,25 @@ _FORMATS = frozenset(
 _ALONE = {"protocol_whitelist": "file", "format_whitelist": ",".join(sorted(_FORMATS))}
 """Only the file itself is read: play lists and manifests (DASH, HLS, concat), which make FFmpeg open other files and
 the network for any file name, are not accepted."""
-TRANSFERS = {16: "pq", 18: "hlg", 8: "linear", 4: 2.2, 5: 2.8}
-"""Curves of ITU-T H.273, by their number, that codes are decoded with; all others count as sRGB, which a display's
-curve for BT.709 and BT.601 is closer to than their camera's."""
-# FFmpeg's numbers of pixel ranges; below, that of a YUV matrix that is not specified.
-_RANGES = {1: "limited", 2: "full"}
+_AS_SRGB = (1, 2, 6, 7, 11, 12, 13, 14, 15)
+TRANSFERS: dict[int, str | float | None] = {
+    16: "pq", 18: "hlg", 8: "linear", 4: 2.2, 5: 2.8, 9: "log100", 10: "log316", 17: "smpte428",
+    **dict.fromkeys(_AS_SRGB),
+}  # fmt: skip
+"""Curves of ITU-T H.273, by their number, that codes are decoded with. None: as sRGB, which a display's curve for
+BT.709 and BT.601 is closer to than their camera's. A name that no decoder has is refused by it."""
+_RANGES = {0: None, 1: "limited", 2: "full"}
+"""FFmpeg's numbers of pixel ranges; 0 is not specified."""
 _UNSPECIFIED = 2
+_MATRICES = {
+    0: "RGB", 3: "reserved", 8: "YCgCo", 11: "SMPTE 2085", 12: "chroma-derived", 13: "chroma-derived, constant",
+    14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re", 17: "YCgCo-Ro",
+}  # fmt: skip
+"""YUV matrices of H.273 that are not read: FFmpeg's own conversion refuses them."""
+_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+"""Decoders that read the alpha which WebM keeps beside a picture (alpha_mode=1); FFmpeg's own drop it."""
+_RAW = {"h264", "hevc", "vvc", "mpegvideo", "m4v"}
+"""Streams without a container: FFmpeg makes up 25 Hz where the stream itself states no rate."""
 _PACKED = {
     "nv12": "yuv420p", "nv21": "yuv420p", "nv16": "yuv422p", "yuyv422": "yuv422p", "uyvy422": "yuv422p",
     "yvyu422": "yuv422p", "p010le": "yuv420p10le", "p210le": "yuv422p10le", "y210le": "yuv422p10le",
@@ -108,12 +124,10 @@ class VideoWriter(Finishing):
 @dataclass(frozen=True)
 class _Scan:
     """The packets of a file's video. times_ns : of the frames in the order of display, from the file's start; None
-    where packets have no stamps.   pts : their stamps, ticks.   note : what was made of them, or None.   damage : why
-    the file is not whole, or None."""
+    where packets have no stamps.   pts : their stamps, ticks.   damage : why the file is not whole, or None."""
 
     times_ns: list[int | None]
     pts: list[int]
-    note: str | None
     damage: str | None
 
 
@@ -127,12 +141,13 @@ class VideoReader:
     start, None where the file has none.
 
     range : "full" or "limited", overrules the file's.   zero_time : whether the start does not matter.   background :
-    (r, g, b), 0 to 255, below transparent pixels.
+    (r, g, b), 0 to 255, below transparent pixels.   keep : frames that are whole, of a damaged file, too.   stream :
+    number of one of several videos in the file.
 
     Raises
     ------
-    AssetError : unreadable, encrypted, no video stream; and, while iterating, truncated or corrupt (with the frame's
-        number).
+    AssetError : unreadable, encrypted, no video stream, several and none is chosen, a colour matrix that is not read.
+    Damage : while iterating, truncated or corrupt, with the frame's number.
     """
 
     def __init__(
@@ -142,8 +157,10 @@ class VideoReader:
         range: str | None = None,
         background: tuple[int, int, int] | None = None,
         zero_time: bool = False,
+        keep: bool = False,
+        stream: str | None = None,
     ):
-        self.path = Path(path)
+        self.path, self._keep, self._wanted = Path(path), keep, stream
         if not self.path.is_file():
             raise AssetError("no such file", where=str(path))
         self._av = _av(AssetError, path)
@@ -151,7 +168,7 @@ class VideoReader:
         self.notes: list[str] = []
         with self._opened() as (file, stream):
             self._scan = self._scanned(file, stream)
-            rate = stream.average_rate or stream.guessed_rate
+            rate = self._rate(file, stream)
         self.fps = float(rate) if rate else 0.0
         self.times_ns = self._scan.times_ns
         self.count = len(self.times_ns)
@@ -165,15 +182,18 @@ class VideoReader:
     def _look_at(self, frame: av.VideoFrame) -> None:
         """Take from the first frame what holds for all."""
         parts, notes = frame.format.components, self.notes
-        self._upright = _orientation(frame)
-        self.width, self.height = frame.width, frame.height
+        self._upright = orientation_of(frame)
+        self.width, self.height = self._square(frame.width, frame.height)
         if self._upright[0]:
             self.width, self.height = self.height, self.width
         self._bits = max(part.bits for part in parts)
         self._alpha = any(part.is_alpha for part in parts)
         self._grey = len(parts) == 1 + self._alpha and frame.format.name != "pal8"
-        self.transfer = TRANSFERS.get(int(frame.color_trc))
-        stated = _RANGES.get(int(frame.color_range))
+        curve = int(frame.color_trc)
+        self.transfer = TRANSFERS.get(curve, f"H.273 curve {curve}")
+        if int(frame.color_range) not in _RANGES:
+            raise AssetError("unknown range", where=str(self.path), value=int(frame.color_range), accepted="--range")
+        stated = _RANGES[int(frame.color_range)]
         # Codes of grey and RGB stay as they are; YUV is converted with its range.
         self._by_levels = self._grey or frame.format.is_rgb or frame.format.name == "pal8"
         self.levels = None
@@ -182,13 +202,23 @@ class VideoReader:
             self.levels = tuple(code << self._bits - 8 for code in (16, 235))
         elif self._by_levels and 8 < self._bits < 16 and not self._alpha:
             self.levels = 0, 2**self._bits - 1
+        matrix = int(frame.colorspace)
+        if not self._by_levels and matrix != _UNSPECIFIED and not known(matrix):
+            named = _MATRICES.get(matrix, "unknown")
+            raise AssetError(
+                f"the YUV matrix {named} is not read",
+                where=str(self.path),
+                value=matrix,
+                accepted="BT.601, 709 or 2020",
+            )
         unstated = [] if self._by_levels or stated or self._range else ["range (limited; --range full for another)"]
         if not self._by_levels and int(frame.colorspace) == _UNSPECIFIED:
             unstated.append("YUV matrix (BT.601)")
+        before = 0 if frame.pts is None else sum(pts < frame.pts for pts in self._scan.pts)
+        if before:
+            notes.append(f"left out: {before} pictures before the first that decodes: the file begins within a group")
         if unstated:
             notes.append(f"not stated by the video, so taken as usual: {' and '.join(unstated)}")
-        if self._scan.note:
-            notes.append(self._scan.note)
         if self.transfer is not None:
             notes.append(f"the video states the curve {self.transfer} (--gamma for another)")
         if frame.interlaced_frame:
@@ -198,12 +228,15 @@ class VideoReader:
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int | None]]:
         pts, at, count = self._scan.pts, 0, 0
-        damage = self._scan.damage
+        damage, self._lost = self._scan.damage, 0
         try:
             for frame in self._decoded():
                 if frame.is_corrupt:
-                    damage = damage or "a frame is corrupt"
-                    break
+                    if not self._keep:
+                        damage = damage or "a frame is corrupt"
+                        break
+                    self._lost += 1
+                    continue
                 time = None if pts or count >= self.count else self.times_ns[count]
                 if pts and frame.pts is not None:
                     # Packets that gave no frame are passed over, so that the others keep their times.
@@ -215,14 +248,33 @@ class VideoReader:
                         time = round((frame.pts * self._tick - self._start) * 10**9)
                 yield self._pixels(frame), time
                 count += 1
-        except AssetError as error:
+        except Damage as error:
             damage = error.problem
-        if damage or count < self.count:
-            raise AssetError(
+        if damage and not self._keep:
+            raise Damage(
                 f"video truncated or corrupt after frame {count}{_because(damage)}",
                 where=str(self.path),
-                accepted=f"a whole file of {self.count} frames",
+                accepted="a whole file; or --damaged keep",
             )
+        if damage or self._lost:
+            lost = f", {self._lost} damaged ones left out" if self._lost else ""
+            self.notes.append(f"kept: {count} frames that are whole{lost}{_because(damage)}")
+
+    def _square(self, width: int, height: int) -> tuple[int, int]:
+        """Return the (width, height) of a picture whose pixels are as wide as high. Raises AssetError: an aspect that
+        makes it too large."""
+        aspect = self._aspect
+        if not aspect or aspect == 1:
+            return width, height
+        shown = (round(width * aspect), height) if aspect > 1 else (width, round(height / aspect))
+        if not shown[0] * shown[1] <= _MAX_PIXELS:
+            raise AssetError(
+                "pixels of this aspect are not read", where=str(self.path), value=str(aspect), accepted="1:1"
+            )
+        note = f"its pixels are {aspect.numerator}:{aspect.denominator} wide: {width}x{height} is shown as "
+        note += f"{shown[0]}x{shown[1]}"
+        self.notes += [] if note in self.notes else [note]
+        return shown
 
     def _pixels(self, frame: av.VideoFrame) -> np.ndarray:
         """Return a frame's pixels, upright."""
@@ -231,6 +283,8 @@ class VideoReader:
             image, note = over(image, self._background)
             if note and note not in self.notes:
                 self.notes.append(note)
+        if self._aspect and self._aspect != 1:
+            image = cv2.resize(image, self._square(frame.width, frame.height), interpolation=cv2.INTER_LINEAR)
         transposed, left, up = self._upright
         if transposed:
             image = image.swapaxes(0, 1)
@@ -241,15 +295,15 @@ class VideoReader:
         name, bits = frame.format.name, self._bits
         planar = name.startswith(("yuv", "yuvj", "gbr", "gray")) and name.endswith(("p", "le", "gray")) and bits <= 16
         if bits == 32 or (bits == 16 and "f16" in name):
-            return _floats(frame)
+            return floats_of(frame)
         if planar and (self._by_levels or known(int(frame.colorspace))):
-            planes = [_plane(plane, bits) for plane in frame.planes]
+            planes = [samples_of(plane, bits) for plane in frame.planes]
             if self._grey:
                 return planes[0]
             if self._by_levels:  # the planes are G, B, R, A
                 rgb = np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
                 return np.rint(rgb * (65535.0 / (2**bits - 1))).astype(np.uint16) if self._alpha and bits > 8 else rgb
-            limited = (self._range or _RANGES.get(int(frame.color_range), "limited")) == "limited"
+            limited = (self._range or _RANGES.get(int(frame.color_range)) or "limited") == "limited"
             # The yuvj formats are of full range by definition.
             limited = limited and not (name.startswith("yuvj") and self._range is None)
             rgb = rgb_from_yuv((planes[0], planes[1], planes[2]), bits, int(frame.colorspace), limited)
@@ -266,18 +320,17 @@ class VideoReader:
 
     def _scanned(self, file: av.container.InputContainer, stream: av.VideoStream) -> _Scan:
         """Read the packets, without decoding them: the times of all frames, and whether the file is whole."""
-        if len(file.streams.video) > 1:
-            self.notes.append(f"{len(file.streams.video)} video streams: the first is read")
-        stamps, without, end = [], 0, 0.0
-        problem = None
+        stamps, without, seen = [], 0, 0
+        problem = cut_riff(self.path) if file.format.name == "avi" else None
         with _logged(self._av) as log:
             try:
                 for packet in file.demux():
                     if not packet.size:
                         continue
-                    if packet.pts is not None and packet.time_base:
-                        end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
-                    if packet.stream is not stream or packet.is_discard:
+                    if packet.stream is not stream:
+                        continue
+                    seen += 1
+                    if packet.is_discard:
                         continue
                     if packet.has_sidedata("encryption_info"):
                         raise AssetError("encrypted video", where=str(self.path), accepted="a file without protection")
@@ -287,34 +340,67 @@ class VideoReader:
                         stamps.append(packet.pts)
             except self._av.FFmpegError as error:
                 problem = _gist(error)
-        wanted, found = stream.frames, len(stamps) + without
-        seconds = (file.duration or 0) / 1e6
+        found = len(stamps) + without
+        # The index of a file holds the packets that are to be read, edit lists included; its other counts do not.
+        wanted = len(getattr(stream, "index_entries", ())) if "mp4" in file.format.name else 0
         cut = [line for line in log if re.search(r"ended prematurely|partial file|truncat", line, re.I)]
-        if problem is None and found < wanted:
-            problem = f"{found} of {wanted} frames"
+        if problem is None and seen < wanted:
+            problem = f"{seen} of {wanted} packets"
         elif problem is None and cut:
             problem = cut[0]
-        elif problem is None and file.format.name.startswith("matroska") and end < 0.95 * seconds - 0.1:
-            problem = f"{end:.3g} of {seconds:.3g} s"
         self._start, self._tick = Fraction(file.start_time or 0, 1_000_000), stream.time_base
+        # FFmpeg rounds the file's start to a µs; the streams have it exactly.
+        starts = [s.start_time * s.time_base for s in file.streams if s.start_time is not None and s.time_base]
+        if starts and abs(min(starts) - self._start) < Fraction(1, 500_000):
+            self._start = min(starts)
         if file.format.name == "avi" and stamps:  # its stamps count decoding, which begins earlier
             self._start = min(stamps) * self._tick
         if without:  # some AVI and raw streams: nothing says when, so the frame rate does
-            rate = stream.average_rate or stream.guessed_rate
+            rate = self._rate(file, stream)
             times = [round(k * 10**9 / rate) if rate else None for k in range(found)]
-            return _Scan(times, [], None, problem)
+            return _Scan(times, [], problem)
         ticks = sorted(stamps)
         rates = [rate for rate in (stream.average_rate, stream.base_rate, stream.guessed_rate) if rate]
-        times, note = frame_times(ticks, self._tick, self._start, rates)
-        return _Scan(times, ticks, note, problem)
+        return _Scan(list(frame_times(ticks, self._tick, self._start, rates)), ticks, problem)
+
+    def _rate(self, file: av.container.InputContainer, stream: av.VideoStream) -> Fraction | None:
+        """Return the frame rate that a file states, Hz."""
+        if file.format.name in _RAW:
+            return stream.codec_context.framerate or None
+        return stream.average_rate or stream.guessed_rate
 
     def _decoded(self) -> Iterator[av.VideoFrame]:
+        """Yield the frames. What does not decode is passed over up to the next key frame, if such files are kept.
+        Raises Damage."""
         with self._opened() as (file, stream):
             stream.thread_type = "AUTO"
-            try:
-                yield from file.decode(stream)
-            except self._av.FFmpegError as error:
-                raise AssetError(_gist(error), where=str(self.path)) from error
+            decoder, broken = self._decoder(stream), False
+            for packet in file.demux(stream):
+                try:
+                    frames = decoder.decode(packet) if decoder else packet.decode()
+                except self._av.FFmpegError as error:
+                    if not self._keep:
+                        raise Damage(_gist(error), where=str(self.path)) from error
+                    self._lost, broken = self._lost + 1, True
+                    continue
+                for frame in frames:
+                    broken = broken and not frame.key_frame
+                    if not broken:
+                        yield frame
+
+    _lost = 0
+
+    def _decoder(self, stream: av.VideoStream) -> Any:
+        """Return a decoder that reads a WebM's alpha; None: the stream's own does. Says where alpha is lost."""
+        mode, name = stream.metadata.get("alpha_mode", "0"), _ALPHA.get(stream.codec_context.name)
+        if mode == "0" or name is None:
+            return None
+        if mode == "1":
+            with contextlib.suppress(ValueError):
+                return self._av.CodecContext.create(name, "r")
+        note = f"left out: alpha (alpha_mode {mode}), which no decoder here reads"
+        self.notes += [] if note in self.notes else [note]
+        return None
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
@@ -332,7 +418,11 @@ class VideoReader:
             streams = [s for s in file.streams.video if not s.disposition & self._av.stream.Disposition.attached_pic]
             if not streams:
                 raise AssetError("no pictures in the file: it has no video stream", where=str(self.path))
-            stream = streams[0]
+            main = [s for s in streams if s.disposition & self._av.stream.Disposition.default]
+            sizes = [f"{s.codec_context.width}x{s.codec_context.height}" if s.codec_context else "" for s in streams]
+            chosen_ = self._wanted is not None or len(main) != 1
+            stream = streams[chosen(self._wanted, sizes, str(self.path), "videos in the file")] if chosen_ else main[0]
+            self._aspect = stream.sample_aspect_ratio
             if stream.codec_context is None:
                 raise AssetError("cannot read video: unknown codec", where=str(self.path))
             if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
@@ -345,38 +435,6 @@ class VideoReader:
             yield file, stream
 
 
-def _orientation(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
-    """Return (transposed, mirrored left to right, upside down), in the order of application, by which a frame becomes
-    upright: x' = a x + c y, y' = b x + d y of its display matrix (ISO 14496-12, 8.3.2)."""
-    # By its key: what iterating yields differs between versions of PyAV.
-    data = frame.side_data.get("DISPLAYMATRIX")
-    if data is not None:
-        # The matrix has nine 32-bit numbers, row by row: a b u, c d v, x y w.
-        a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-        if abs(b) > abs(a):
-            return True, c < 0, b < 0
-        return False, a < 0, d < 0
-    return False, False, False
-
-
-def _plane(plane: av.video.plane.VideoPlane, bits: int) -> np.ndarray:
-    """Return a plane's samples, (H, W) uint8 or uint16."""
-    dtype = np.dtype(np.uint8) if bits <= 8 else np.dtype("<u2")
-    # Rows are padded to line_size bytes.
-    rows = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)
-    return rows[: plane.height, : plane.width]
-
-
-def _floats(frame: av.VideoFrame) -> np.ndarray:
-    """Return (H, W), (H, W, 3) or (H, W, 4) float32 of a frame of 16- or 32-bit floats, planes G, B, R, A."""
-    dtype = np.dtype("<f2") if "f16" in frame.format.name else np.dtype("<f4")
-    planes = [
-        np.frombuffer(plane, dtype).reshape(frame.height, -1)[:, : frame.width].astype(np.float32)
-        for plane in frame.planes
-    ]
-    return planes[0] if len(planes) == 1 else np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)
-
-
 def decode_exr(data: bytes, where: str) -> np.ndarray:
     """Return (H, W, 3), (H, W, 4) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; FFmpeg
     has. Raises AssetError: undecodable."""
@@ -385,9 +443,11 @@ def decode_exr(data: bytes, where: str) -> np.ndarray:
         frames = av.CodecContext.create("exr", "r").decode(av.Packet(data))
     except (av.FFmpegError, OSError, ValueError) as error:
         raise AssetError(f"cannot decode OpenEXR image: {_gist(error)}", where=where) from error
+    except NotImplementedError as error:
+        raise AssetError("cannot decode OpenEXR image: a kind that is not read", where=where) from error
     if not frames or "f" not in frames[0].format.name:
         raise AssetError("cannot decode OpenEXR image: no picture of floats", where=where)
-    return _floats(frames[0])
+    return floats_of(frames[0])
 
 
 @functools.cache

@@ -1,7 +1,10 @@
-"""RGB of planar YUV, rounded once: FFmpeg's fast conversion is up to a code too dark, its exact one takes longer than
-everything else that a frame goes through."""
+"""Planes and orientation of FFmpeg's frames, and RGB of planar YUV, rounded once: FFmpeg's fast conversion is up to a
+code too dark, its exact one takes longer than everything else that a frame goes through."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,3 +68,46 @@ def _convert(y, u, v, halved_rows, halved_columns, factors, out):
             out[row, column, 0] = min(max(light + r_v * cr, np.float32(0)), top)
             out[row, column, 1] = min(max(light - g_u * cb - g_v * cr, np.float32(0)), top)
             out[row, column, 2] = min(max(light + b_u * cb, np.float32(0)), top)
+
+
+def cut_riff(path: Path) -> str | None:
+    """Return the damage of an AVI file whose chunks are longer than it; None: they are not."""
+    at, total = 0, path.stat().st_size
+    with open(path, "rb") as file:
+        while at + 8 <= total:
+            file.seek(at)
+            kind, size = file.read(4), int.from_bytes(file.read(4), "little")
+            if kind != b"RIFF" or size in (0, 0xFFFFFFFF):  # a file that was never finished states no size
+                return None
+            at += 8 + size + size % 2
+    return f"{total} of {at} bytes" if at > total + 1 else None
+
+
+def orientation_of(frame: Any) -> tuple[bool, bool, bool]:
+    """Return (transposed, mirrored left to right, upside down), in the order of application, by which a frame becomes
+    upright: x' = a x + c y, y' = b x + d y of its display matrix (ISO 14496-12, 8.3.2)."""
+    # By its key: what iterating yields differs between versions of PyAV.
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return False, False, False
+    # The matrix has nine 32-bit numbers, row by row: a b u, c d v, x y w.
+    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+    return (True, c < 0, b < 0) if abs(b) > abs(a) else (False, a < 0, d < 0)
+
+
+def samples_of(plane: Any, bits: int) -> np.ndarray:
+    """Return a plane's samples, (H, W) uint8 or uint16."""
+    dtype = np.dtype(np.uint8) if bits <= 8 else np.dtype("<u2")
+    # Rows are padded to line_size bytes.
+    rows = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    return rows[: plane.height, : plane.width]
+
+
+def floats_of(frame: Any) -> np.ndarray:
+    """Return (H, W), (H, W, 3) or (H, W, 4) float32 of a frame of 16- or 32-bit floats, planes G, B, R, A."""
+    dtype = np.dtype("<f2") if "f16" in frame.format.name else np.dtype("<f4")
+    planes = [
+        np.frombuffer(plane, dtype).reshape(frame.height, -1)[:, : frame.width].astype(np.float32)
+        for plane in frame.planes
+    ]
+    return planes[0] if len(planes) == 1 else np.stack([planes[k] for k in (2, 0, 1, 3)[: len(planes)]], axis=-1)

@@ -9,11 +9,15 @@ from typing import Annotated
 import typer
 
 TimeUnit = Annotated[
-    str | None, typer.Option("--time-unit", help="Unit of t: s, ms, us or ns (default: the file's, or guessed).")
+    str | None, typer.Option("--time-unit", help="Unit of t: s, ms, us or ns (default: as the file states).")
 ]
 Origin = Annotated[str | None, typer.Option("--origin", help="Row of y = 0: top or bottom.")]
-Columns = Annotated[str | None, typer.Option("--columns", help="Their order, e.g. x,y,t,p.")]
+Columns = Annotated[
+    str | None, typer.Option("--columns", help="Their order, e.g. x,y,t,p; _ ignores one, t=NAME names one.")
+]
 Polarity = Annotated[str | None, typer.Option("--polarity", metavar="OFF/ON", help="Their numbers, e.g. -1/1.")]
-Stream = Annotated[int | None, typer.Option("--stream", help="One of several, by number.")]
+Stream = Annotated[
+    str | None, typer.Option("--stream", "--array", help="One of several cameras, topics or arrays, by name or number.")
+]
 Damaged = Annotated[str, typer.Option("--damaged", help="refuse, or keep what is whole.")]
 Sort = Annotated[bool, typer.Option("--sort", help="Put events in order.")]

@@ -19,7 +19,7 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.frames import NOTHING, Declared
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.reading import AS_FILE, Damage, EventReading
 from blinkgl.recordings.clip import (
     PLAIN,
     Clip,
@@ -156,7 +156,9 @@ def calibrate(
     stream, size, said = read_recording(recording, events, least=LEAST_EVENTS)
     given = None
     if not still:
-        frames = _own_frames(recording) if frames is None else frames
+        if frames is None:
+            # The frames of the camera whose events are read.
+            frames, declared = _own_frames(recording, events), replace(declared, stream=events.stream)
         source, exposures = timed_frames(frames, declared)
         given, said = list(source), [*said, *source.notes]
         codes = replace(reading.codes, white_level=declared.white_level, range=declared.range).of(source)
@@ -331,16 +333,16 @@ def _keys(base: EmulatorConfig, fixed: Iterable[str]) -> list[str]:
     return keys
 
 
-def _own_frames(recording: str | os.PathLike) -> str | os.PathLike:
+def _own_frames(recording: str | os.PathLike, events: EventReading) -> str | os.PathLike:
     from blinkgl.io.formats import open_events
 
     try:
-        with open_events(recording) as file:
+        with open_events(recording, events) as file:
             if next(iter(file.frames()), None) is not None:
                 return recording
     except AssetError as error:
         # A format without frames is no error here: the message below says what to give.
-        if "needs the package aedat" in error.problem or "damaged" in error.problem:
+        if isinstance(error, Damage) or "none is chosen" in error.problem or "needs the package" in error.problem:
             raise
     raise EventDataError(
         "the recording has no frames, and the scene cannot be estimated without them",

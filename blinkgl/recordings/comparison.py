@@ -383,6 +383,9 @@ def _frame_intervals(
     from blinkgl.io.frames import open_frames
     from blinkgl.recordings.decoding import Codes, OwnFrames, meaning
 
+    for file in files:
+        if Path(path) == file.path:  # the frames of the camera whose events are read
+            declared = replace(declared, stream=file.reading.stream)
     source = open_frames(path, declared)
     if any((f.height, f.width) != (source.height, source.width) for f in files):
         sizes = "; ".join(

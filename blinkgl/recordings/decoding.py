@@ -17,6 +17,7 @@ from blinkgl.srgb import LUMA, linear_from_srgb
 _REFERENCE_WHITE = 203.0
 """cd/m² of white in PQ, which is 1 here (ITU-R BT.2408, 2.1)."""
 CURVES = ("srgb", "linear", "pq", "hlg")
+_ACCEPTED_CURVES = "srgb, linear, pq, hlg or an exponent up to 10"
 
 
 class OwnFrames(NamedTuple):
@@ -72,6 +73,10 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
     gamma, assumed = checked_gamma(codes.gamma), None
     if gamma is None:
         gamma = codes.transfer
+        if isinstance(gamma, str) and gamma not in CURVES:
+            raise ConfigError(
+                "the file states a curve that is not read", where="--gamma", value=gamma, accepted=_ACCEPTED_CURVES
+            )
     if gamma is None and codes.origin == "video":
         gamma = "srgb"  # made for viewing
     # Grey whole numbers of the sensor's size are its own; all others are meant for viewing.
@@ -204,6 +209,4 @@ def checked_gamma(gamma: str | float | None) -> str | float | None:
             return value
     except (TypeError, ValueError):
         pass
-    raise ConfigError(
-        "unknown transfer curve", where="gamma", value=gamma, accepted="srgb, linear, pq, hlg or an exponent up to 10"
-    )
+    raise ConfigError("unknown transfer curve", where="gamma", value=gamma, accepted=_ACCEPTED_CURVES)

@@ -37,10 +37,11 @@ where the picture's brightness or the share of pixels that change has changed by
 _BRIGHTER, _LIVELIER = 1.1, 2.0
 _SPARSE_PX = 64
 """Side of the grid of pixels that tells whether the picture has changed its nature."""
-_BLOCK_PX = 8
-_QUANTILE, _OF_CHI_SQUARED = 0.2, 0.85
+_BLOCKS_PX = (8, 4)
+"""Side of a block, and that of pictures of few rows or columns, which would show too few blocks at first."""
+_QUANTILE, _OF_CHI_SQUARED = 0.2, {8: 0.85, 4: 0.70}
 """Part of the blocks of one brightness that are taken to hold noise alone, and the 20 % quantile of the mean square of
-64 normal numbers: blocks in which something moves lie above."""
+64 or 16 normal numbers: blocks in which something moves lie above."""
 # The second difference along y of that along x, which is 0 for any f(x) + g(y). Its squares add up to 36.
 _MASK = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _WHITE, _LEAST_WHITE = 0.6, 0.1
@@ -56,6 +57,11 @@ samples show 2.8): dots that flip have 2 or less where all do, 10 where a tenth 
 _COARSE, _ROUNDED = 1.5, 12.0
 """Codes below which rounding raises the kurtosis, and up to what."""
 _BINS, _LEAST_BLOCKS = 12, 12
+_NEARLY = 0.6
+"""Part of the noise that was believed up to which a bound is news."""
+_ALIKE = 0.5
+"""Difference of pixels of one filter to that of neighbours, along both axes, up to which a picture is a mosaic of
+colour filters: of other pictures neighbours are the most alike."""
 _CLEAN = 0.35
 """Codes: rounding alone gives 0.29."""
 _BRIGHT = 0.85
@@ -81,7 +87,8 @@ class FrameNoise:
 
 
 class _Look(NamedTuple):
-    """What one pair of frames shows, per block, (N,).   light : mean luminance.   square : variance of a pixel's noise.
+    """What one pair of frames shows, per block, (N,).   light : mean luminance.   square : variance of a pixel's noise,
+    over its lower quantile in such a block.
     kurtosis : of its change; 3 where unknown.   bound : whether ``square`` only bounds the noise from above, because
     all moves."""
 
@@ -106,7 +113,7 @@ def estimated(looks: Sequence[_Look], code: Callable[[float], float]) -> tuple[F
     kind = np.clip(np.searchsorted(edges, light, side="right") - 1, 0, len(edges) - 2)
     kinds = np.unique(kind)
     level = np.array([light[kind == k].mean() for k in kinds])
-    variance = np.array([np.quantile(square[kind == k], _QUANTILE) for k in kinds]) / _OF_CHI_SQUARED
+    variance = np.array([np.quantile(square[kind == k], _QUANTILE) for k in kinds])
     constant, slope = _lower_line(level, variance)
     middle = float(np.median(light))
     sigma = float(np.sqrt(constant + slope * middle))
@@ -125,14 +132,41 @@ def estimated(looks: Sequence[_Look], code: Callable[[float], float]) -> tuple[F
     return FrameNoise(constant, slope, (middle, sigma)), None
 
 
+def is_mosaic(image: np.ndarray) -> bool:
+    """Return whether (H, W) light or codes are a mosaic of 2x2 colour filters."""
+    if image.ndim != 2 or min(image.shape) < 2 * _BLOCKS_PX[0]:
+        return False
+    light = image[:_SEEN_PX, :_SEEN_PX].astype(np.float32)
+    return all(
+        np.abs(one[2:] - one[:-2]).mean() < _ALIKE * np.abs(one[1:] - one[:-1]).mean() for one in (light, light.T)
+    )
+
+
+_SEEN_PX = 512
+
+
+def looked_at_phases(a: np.ndarray, b: np.ndarray) -> _Look | None:
+    """Return :func:`looked_at` of the four filters of a mosaic, each a picture of its own: what changes from filter to
+    filter is no noise."""
+    places = [(slice(row, None, 2), slice(column, None, 2)) for row in (0, 1) for column in (0, 1)]
+    looks = [look for at in places if (look := looked_at(*(np.ascontiguousarray(one[at]) for one in (a, b))))]
+    if not looks:
+        return None
+    light, square, kurtosis = (np.concatenate([look[k] for look in looks]) for k in range(3))
+    return _Look(light, square, kurtosis, any(look.bound for look in looks))
+
+
 def looked_at(a: np.ndarray, b: np.ndarray) -> _Look | None:
     """Return what a pair of frames, (H, W) float32 luminance of full scale 1, shows of their noise: the blocks in which
     no code is at an end and the change is white, which noise is and a moving texture is not. None: it shows nothing."""
-    height, width = (side // _BLOCK_PX * _BLOCK_PX for side in a.shape)
+    count = lambda side: (a.shape[0] // side) * (a.shape[1] // side)
+    block = next((side for side in _BLOCKS_PX if count(side) >= 4 * _LEAST_BLOCKS), _BLOCKS_PX[-1])
+    height, width = (side // block * block for side in a.shape)
     if not height or not width:
         return None
+    of_quantile = _OF_CHI_SQUARED[block]
     mean = lambda image: cv2.resize(
-        image[:height, :width], (width // _BLOCK_PX, height // _BLOCK_PX), interpolation=cv2.INTER_AREA
+        image[:height, :width], (width // block, height // block), interpolation=cv2.INTER_AREA
     ).ravel()
     light = mean((a + b) / 2)
     # A code at either end of its range is clipped, so its noise is too small.
@@ -145,16 +179,16 @@ def looked_at(a: np.ndarray, b: np.ndarray) -> _Look | None:
     white = inside & (finest > _WHITE * square)
     if not white.any():
         # Nothing moves, or what does is smooth: there is no more noise than what is left at the finest scale.
-        return _Look(light[inside], finest[inside], np.full(np.count_nonzero(inside), 3.0), bound=True)
+        return _Look(light[inside], finest[inside] / of_quantile, np.full(np.count_nonzero(inside), 3.0), bound=True)
     followed = _followed(a, b) - a
     still = white & ~(mean(followed**2) < _EXPLAINED * mean(change**2))
     if np.count_nonzero(still) < max(_LEAST_WHITE * np.count_nonzero(inside), _LEAST_STILL * np.count_nonzero(white)):
         # All moves. Noise is still in what the flow leaves, which may be more than noise but not much less.
         left = _variance(followed, mean)[1] / _EXPLAINED
-        return _Look(light[inside], left[inside], np.full(np.count_nonzero(inside), 3.0), bound=True)
+        return _Look(light[inside], left[inside] / of_quantile, np.full(np.count_nonzero(inside), 3.0), bound=True)
     rough = change - cv2.blur(change, (3, 3))  # flicker is light, too
     kurtosis = mean(rough**4) / np.maximum(mean(rough**2) ** 2, 1e-30)
-    return _Look(light[still], finest[still], kurtosis[still])
+    return _Look(light[still], finest[still] / of_quantile, kurtosis[still])
 
 
 def _variance(change: np.ndarray, mean: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -299,13 +333,13 @@ class DenoisedLight:
         return slice(top, top + _PART_PX[0]), slice(left, left + _PART_PX[1])
 
     def _look(self, a: np.ndarray, b: np.ndarray) -> None:
-        look = looked_at(a, b)
+        look = (looked_at_phases if is_mosaic(a) else looked_at)(a, b)
         if look is None:
             return
         self._known = True
         if look.bound:
             # It shows no noise of its own, but may show that there is less than was believed.
-            if self._now is None or np.median(look.square / self._now.sigma(look.light) ** 2) > 0.5:
+            if self._now is None or np.median(look.square / self._now.sigma(look.light) ** 2) > _NEARLY:
                 return
             self._looks.clear()
         self._looks.append(look)

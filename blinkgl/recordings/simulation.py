@@ -30,7 +30,7 @@ from blinkgl.io.frames import NOTHING, Declared, open_frames
 from blinkgl.recordings.decoding import UNKNOWN, Codes, Decoder, OwnFrames, checked_gamma, meaning
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.frame_checks import FrameChecks
-from blinkgl.recordings.frame_noise import DenoisedLight, FrameNoise
+from blinkgl.recordings.frame_noise import DenoisedLight, FrameNoise, is_mosaic
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
@@ -248,7 +248,7 @@ def stepped(
         report.displacement = between.Displacement()
         stream = between.motion(stream, use.max_px, displacement=report.displacement)
     else:
-        stream = between.watched(stream, report.moved_px)
+        stream = _watched(stream, report.moved_px)
     seen: list[np.ndarray] = []
 
     def shown() -> Iterator[EventFrame]:
@@ -261,6 +261,23 @@ def stepped(
         report.add(t_ns, events, camera)
         # An interpolated frame lies before the given frame that has been read last.
         yield Step(t_ns, events, seen[0], given.decode, t_ns == given.t_ns)
+
+
+def _watched(stream: Iterator[tuple[np.ndarray, int]], moved_px: list[float]) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield the frames of :func:`~blinkgl.timeline.interpolate.watched`. Of a mosaic of colour filters the pixels of
+    one filter are watched, which are two pixels apart: neighbours of other filters follow no motion."""
+    first = next(stream, None)
+    apart = 2 if first is not None and is_mosaic(first[0]) else 1
+    whole: list[np.ndarray] = []
+
+    def planes() -> Iterator[tuple[np.ndarray, int]]:
+        for frame, t in itertools.chain([] if first is None else [first], stream):
+            whole[:] = [frame]
+            yield np.ascontiguousarray(frame[::apart, apart - 1 :: apart]), t
+
+    for _, t in between.watched(planes(), moved_px):
+        yield whole[0], t
+    moved_px[:] = [apart * moved for moved in moved_px]
 
 
 class _Given:
@@ -363,7 +380,7 @@ def file_to_events(
     height, width = (frames.height, frames.width) if size is None else size
     report = SimulationReport(notes=frames.notes)
     codes = replace(use.codes, white_level=declared.white_level, range=declared.range)
-    use = replace(use, codes=codes.of(frames))
+    use = replace(use, codes=codes.of(frames), keep_noise=use.keep_noise or frames.exact)
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
     iterator = iter(frames)

@@ -3,6 +3,7 @@ label. The first comment describes the expected folders."""
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import os
 import re
@@ -17,11 +18,12 @@ from blinkgl.config.base import placed
 from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
+from blinkgl.io.clock import NANOSECONDS
 from blinkgl.io.flow import READ_ENDINGS, flow_form, read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
 from blinkgl.io.names import series
-from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.stamps import Undeclared, read_timestamps
 from blinkgl.io.stills import open_stills
 from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.decoding import Codes
@@ -121,7 +123,14 @@ def _check_stamps(folder: Path, files: list[Path], fps: float, used: slice) -> N
     path = next((p for p in (folder / "timestamps.txt", folder.parent / "timestamps.txt") if p.is_file()), None)
     if path is None:
         return
-    steps = np.diff(np.array(read_timestamps(path).times_ns[used], np.float64)) * 1e-9
+    # A list that does not say its unit is compared in the one that fits best.
+    known: list[np.ndarray] = []
+    for unit in (None, *NANOSECONDS):
+        with contextlib.suppress(Undeclared):
+            known.append(np.diff(np.array(read_timestamps(path, unit).times_ns[used], np.float64)) * 1e-9)
+            if unit is None:
+                break
+    steps = min(known, key=lambda one: abs(np.log(max(float(np.median(one)), 1e-12) * fps)) if len(one) else 0.0)
     if len(steps) + 1 != len(files) or not len(steps):
         return
     if np.abs(steps * fps - 1).max() > _UNEQUAL:

@@ -12,7 +12,7 @@ from rich.table import Table
 from blinkgl.io.atomic import write_whole
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.comparison import BLUR_PX, compare
-from blinkgl.recordings.comparison_plot import plot
+from blinkgl.show.comparison_plot import plot
 
 
 def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+from blinkgl.errors import ConfigError
 from blinkgl.io.formats import FORMATS, convert, output_format
 from blinkgl.io.reading import EventReading
 from blinkgl.machine.terminal import plain_console, say
+from blinkgl.show.look import looked_at
 
 
-def run(source: str, target: str, *, reading: EventReading, **options: Any) -> int:
-    """``options``: of :func:`~blinkgl.io.formats.convert`."""
+def run(source: str, target: str | None, *, reading: EventReading, look: bool = False, **options: Any) -> int:
+    """``options``: of :func:`~blinkgl.io.formats.convert`.   look : print what the source states instead."""
+    if look or target is None:
+        if not look:
+            raise ConfigError("no output", where="OUT", accepted="an event file, or --look to see what IN states")
+        for line in looked_at(source, reading):
+            say(plain_console(), line)
+        return 0
     file, count = convert(source, target, reading, **options)
     size = f"{file.width}x{file.height}" if file.height else "no size in it (--size WIDTHxHEIGHT)"
     say(plain_console(), f"{target}: {count:,} events, {size}, from {file.format}")

@@ -172,7 +172,7 @@ START = len(header())
         (b"\x89PNG", r"not an AEDAT file: wrong magic \(got b'\\x89PNG'\)"),
         (b"", r"not an AEDAT file: wrong magic"),
         (header(None) + records([0], [1]), r"no camera named in the header"),
-        (header("ch.unizh.ini.jaer.chip.retina.DVS128"), r"a camera with unknown addresses \(got 'DVS128'\)"),
+        (header("ch.unizh.ini.jaer.chip.retina.DVS132"), r"a camera with unknown addresses \(got 'DVS132'\)"),
     ],
 )
 def test_files_that_are_not_opened(tmp_path, data, message):

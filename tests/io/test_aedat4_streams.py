@@ -99,6 +99,7 @@ def recorded(monkeypatch, kind, packets):
 
     monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=Decoder))
     monkeypatch.setattr(aedat4, "_check_claims", lambda path: iter(()))
+    monkeypatch.setattr(aedat4, "_descriptions", lambda path: {})
     return Aedat4Reader("e.aedat4")
 
 

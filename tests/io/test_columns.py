@@ -22,6 +22,8 @@ def dsec(path, **columns):
     with h5py.File(path, "w") as file:
         for k, v in {**GOOD, **columns}.items():
             file[f"events/{k}"] = np.asarray(v)
+        file["ms_to_idx"] = [0]
+        file["events/t"].attrs["unit"] = "us"
     return path
 
 
@@ -35,7 +37,7 @@ def mvsec(path, **columns):
 
 
 def npz(path, **columns):
-    np.savez(path, **{k: np.asarray(v) for k, v in {**GOOD, **columns}.items()})
+    np.savez(path, **{k: np.asarray(v) for k, v in {**GOOD, **columns}.items()}, time_unit="us")
     return path
 
 
@@ -109,7 +111,7 @@ def test_events_outside_the_declared_sensor(tmp_path, kind, name):
         with h5py.File(path, "r+") as raw:
             raw.attrs["width"] = 8
     elif kind == "npz":
-        np.savez(path, **{**{k: getattr(events, k) for k in "xytp"}, "height": 8, "width": 8})
+        np.savez(path, **{k: getattr(events, k) for k in "xytp"}, height=8, width=8, time_unit="us")
     else:
         path.write_bytes(
             path.read_bytes().replace(b"20x20", b"08x20").replace(b"width=20", b"width=08").replace(b"x@20", b"x@08")
@@ -151,10 +153,15 @@ def test_slices_are_checked_too(tmp_path):
         ("x,y,p,time,time\n1,2,1,5\n", "line 1.*not a heading that names t, x, y and p"),
         ("t,x,y,p\nt,x,y,p\n1,2,3,1\n", "line 2 is not an event"),
         ("# " + "c" * 70_000 + "\n1 2 3 1\n", "line 1 is longer than 65536 bytes"),
-        ("0 480\n1 2 3 1\n", "impossible sensor size"),
-        ("1 2 3 1\n0.000002 2 3 1\n", "times decrease at event 1.*or --sort, or --damaged keep"),
-        ("t_us,x,y,p\n0.5,2,3,9\n", "line 2 is not an event.*polarity 0/1 or -1/1 \\(--polarity\\)"),
-        ("4 4\n1 2 3 1\n2 4 3 1\n", r"event 1 is outside the sensor \(got \(4, 3\)\)"),
+        ("0 480\nt_us x y p\n1 2 3 1\n", "impossible sensor size"),
+        ("1.000000 2 3 1\n0.000002 2 3 1\n", "times decrease at event 1.*or --sort$"),
+        ("1 2 3 1\n2 2 3 1\n", "no heading names the columns; try --columns t,x,y,p --time-unit us if that is right"),
+        ("t,x,y,p\n1,2,3,1\n", "no unit of the times is stated; try --time-unit us if that is right"),
+        (
+            "t_us,x,y,p\n0.5,2,3,9\n",
+            "line 2 has a polarity that is not known .*expected 0/1, -1/1 or True/False.*--polarity",
+        ),
+        ("4 4\nt_us x y p\n1 2 3 1\n2 4 3 1\n", r"event 1 is outside the sensor \(got \(4, 3\)\)"),
         ("t_min,x,y,p\n5,2,3,1\n", "line 1"),
     ],
 )

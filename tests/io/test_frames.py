@@ -29,7 +29,8 @@ def listed(source):
 @pytest.mark.parametrize(
     "name, text, expected",
     [
-        ("timestamps.txt", "0\n1000\n2500\n", [0, 10**6, 2_500_000]),
+        ("timestamps.txt", "# us\n0\n1000\n2500\n", [0, 10**6, 2_500_000]),
+        ("timestamp.txt", "0.000000\n0.001000\n0.0025\n", [0, 10**6, 2_500_000]),
         ("data.csv", "#timestamp [ns],filename\n5,f0.png\n6,f1.png\n8,f2.png\n", [5, 6, 8]),
         ("timestamps.txt", "# seconds\n0.0\n1e-3\n0.0025\n", [0, 10**6, 2_500_000]),
         ("images.txt", "0.5 f0.png\n0.6 f1.png\n0.75 f2.png\n0.9 f3.png\n", [500_000_000, 600_000_000, 750_000_000]),
@@ -51,8 +52,8 @@ def test_video(tmp_path):
     assert [t for _, t, _ in open_frames(tmp_path / "v.mp4", Declared(fps=1000))] == [i * 10**6 for i in range(5)]
     for count in (3, 6):
         (tmp_path / "t.txt").write_text("".join(f"{k}\n" for k in range(count)))
-        with pytest.raises(EventDataError, match=f"v.mp4: one time stamp per frame .got '{count} stamps, 5 frames'"):
-            open_frames(tmp_path / "v.mp4", Declared(timestamps=tmp_path / "t.txt"))
+        with pytest.raises(EventDataError, match=f"v.mp4: one time stamp per frame .got '{count} stamps, . frames'"):
+            list(open_frames(tmp_path / "v.mp4", Declared(timestamps=tmp_path / "t.txt", time_unit="us")))
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8"])
@@ -110,13 +111,17 @@ def image_of(shape):
         (lambda f: None, 0, "--fps: frame rate .got 0"),
         (lambda f: [(f / f"f{k}.png").unlink() for k in (1, 2)], 1, "at least two frames"),
         (
-            lambda f: (f / "timestamps.txt").write_text("0\n1\n"),
+            lambda f: (f / "timestamps.txt").write_text("# us\n0\n1\n"),
             None,
             "one time stamp per frame .got '2 stamps, 3 frames'",
         ),
-        (lambda f: (f / "timestamps.txt").write_text("0 f0.png\n1 f1.png\n"), None, "no time stamp for image f2.png"),
         (
-            lambda f: (f / "timestamps.txt").write_text("0\n20\n10\n"),
+            lambda f: (f / "timestamps.txt").write_text("t_us name\n0 f0.png\n1 f1.png\n"),
+            None,
+            "no time stamp for image f2.png",
+        ),
+        (
+            lambda f: (f / "timestamps.txt").write_text("# ms\n0\n20\n10\n"),
             None,
             r"frame 2 \(f2.png\): time stamps must increase \(got '0.01 s'\); expected more than 0.02 s, or --fps",
         ),
@@ -166,11 +171,11 @@ def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
     written = {"images.txt": (4, tmp_path), "timestamps.csv": (3, folder), "timestamps.txt": (1, folder)}
     written_in_folder = (folder / "images.txt", 2)
     for name, (step, where) in written.items():
-        (where / name).write_text("".join(f"{0.001 * step * k} f{k}.png\n" for k in range(3)))
+        (where / name).write_text("".join(f"{0.001 * step * k:.3f} f{k}.png\n" for k in range(3)))
         assert times(folder) == [0, step * 10**6, 2 * step * 10**6]
         if name == "timestamps.csv":
             path, step = written_in_folder
-            path.write_text(f"0,f0.png\n{1000 * step},f1.png\n{2000 * step},f2.png\n")
+            path.write_text(f"t_us,name\n0,f0.png\n{1000 * step},f1.png\n{2000 * step},f2.png\n")
             assert times(folder) == [0, step * 10**6, 2 * step * 10**6]
     (tmp_path / "mine.txt").write_text("5\n6\n8\n")
     mine = {"timestamps": tmp_path / "mine.txt"}
@@ -187,10 +192,10 @@ def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
 @pytest.mark.parametrize(
     ("text", "unit", "times", "names"),
     [
-        ("time name\n0 a\n33333,b\n66667 c\n", None, [0, 33_333_000, 66_667_000], ["a", "b", "c"]),
+        ("time_us name\n0 a\n33333,b\n66667 c\n", None, [0, 33_333_000, 66_667_000], ["a", "b", "c"]),
         ("-5 # before\n\n# nothing\n+7\n", "us", [-5000, 7000], None),
         ("1e-3\n.5\n2.\n", "s", [10**6, 5 * 10**8, 2 * 10**9], None),
-        ("1\n1.01\n1.02\n", None, [10**9, 1_010_000_000, 1_020_000_000], None),  # one unit for all
+        ("1.0\n1.010000\n1.02\n", None, [10**9, 1_010_000_000, 1_020_000_000], None),  # some with six places
         ("#timestamp [ns],filename\n1403636579763555584,a.png\n1403636579813555456,b.png\n", None,
          [1403636579763555584, 1403636579813555456], ["a.png", "b.png"]),
         ("# color images\n# timestamp filename\n1305031102.175304 rgb/1.png\n1305031102.211214 rgb/2.png\n", None,
@@ -198,7 +203,7 @@ def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
         ("# exposure_start_timestamp_us,exposure_end_timestamp_us\n10,30\n110,130\n", None, [20_000, 120_000], None),
         ("# timestamp format v2\n0\n16\n33\n", None, [0, 16_000_000, 33_000_000], None),
         ("index;t_ms;name\n0;5;a b\n1;15;c\n2;25;d\n", None, [5_000_000, 15_000_000, 25_000_000], None),
-        ("0 0.5\n1 0.533\n2 0.567\n", None, [500_000_000, 533_000_000, 567_000_000], None),
+        ("0 0.500000\n1 0.533\n2 0.567\n", None, [500_000_000, 533_000_000, 567_000_000], None),
         ("a.png 0.5\nb.png 0.533\n", None, [500_000_000, 533_000_000], ["a.png", "b.png"]),
         ("\ufefft_ns\n1\n2\n", None, [1, 2], None),
     ],
@@ -209,7 +214,7 @@ def test_lines_of_times(tmp_path, text, unit, times, names):
     stamps = read_timestamps(path, unit)
     assert stamps.times_ns == times and (names is None or stamps.names == names)
     stated = unit is not None or any(word in text for word in ("[ns]", "_us", "_ms", "_ns", "v2"))
-    assert (stamps.note is None) == stated and (stated or "--time-unit" in stamps.note)
+    assert (stamps.note is None) == stated and (stated or "read as the Event Camera Dataset's" in stamps.note)
 
 
 def test_lines_that_are_no_times(tmp_path):
@@ -222,7 +227,8 @@ def test_lines_that_are_no_times(tmp_path):
         ("1\n1e999999999\n", "line 2"),
         ("time\n0\nx\n", "line 3 is not a time stamp"),
         ("1 a.png\n2\n", "times with a name and times without one"),
-        ("0.01\n0.02\n0.03\n40000\n50000\n60000\n", "frames 2 and 3: times in two units"),
+        ("0.01\n0.02\n0.03\n40000\n50000\n60000\n", "no unit of the times is stated; try --time-unit s if"),
+        ("40000\n50000\n60000\n", "no unit of the times is stated; try --time-unit us if that is right"),
     ):
         path.write_text(text)
         with pytest.raises(EventDataError, match=said):

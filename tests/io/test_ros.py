@@ -74,12 +74,14 @@ def test_bags_of_every_kind(tmp_path, form, name, kind):
 def test_several_topics_and_none(tmp_path):
     pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = bag(tmp_path / "e.bag", "bag", {"/right": ("dvs_msgs", E.part(slice(9))), "/left": ("dvs_msgs", E)})
-    with open_events(path) as file:
-        assert same(file.read(), E) and file.notes == ["2 topics of events: /left is read (--stream for another)"]
-    with open_events(path, EventReading(stream=1)) as file:
-        assert len(file.read()) == 9
-    with pytest.raises(AssetError, match=r"no such topic of events .got 2.; expected --stream 0 ./left., --stream 1"):
-        open_events(path, EventReading(stream=2))
+    listed = r"expected one of --stream 0 ./left., --stream 1 ./right.$"
+    with pytest.raises(AssetError, match=f"2 topics of events, and none is chosen; {listed}"):
+        open_events(path)
+    for stream, count in (("0", len(E)), ("/left", len(E)), ("1", 9), ("/right", 9)):
+        with open_events(path, EventReading(stream=stream)) as file:
+            assert len(file.read()) == count and file.notes == []
+    with pytest.raises(AssetError, match=rf"no such one of the topics of events .got '2'.; {listed}"):
+        open_events(path, EventReading(stream="2"))
     data = path.read_bytes()
     for size in range(0, len(data), 997):
         (tmp_path / "cut.bag").write_bytes(data[:size])

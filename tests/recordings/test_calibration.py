@@ -50,7 +50,9 @@ def files(folder, frames=None, emulator=None, shift_us: int = 0, seed: int = 9):
     events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE, **(emulator or {})}), seed)
     write_events(folder / "camera.npz", Events(events.x, events.y, events.t + shift_us, events.p), H, W)
     np.savez(
-        folder / "frames.npz", frames=np.stack([f for f, _, _ in frames]), t=np.array([t // 1000 for _, t, _ in frames])
+        folder / "frames.npz",
+        frames=np.stack([f for f, _, _ in frames]),
+        t_us=np.array([t // 1000 for _, t, _ in frames]),
     )
     return folder / "camera.npz", folder / "frames.npz"
 
@@ -241,11 +243,11 @@ def test_one_line_and_nothing_written(tmp_path, capsys, what, said):
     if what == "other size":
         stored["frames"] = np.ascontiguousarray(stored["frames"].transpose(0, 2, 1))
     elif what == "no times":
-        del stored["t"]
+        del stored["t_us"]
     elif what == "other scene":
         stored["frames"] = np.stack([f for f, _, _ in moving(seed=5, px=-2.0)])
     elif what == "other clock":
-        stored["t"] = stored["t"] + 10_000_000
+        stored["t_us"] = stored["t_us"] + 10_000_000
     elif what == "saturated":
         stored["frames"] = np.where(stored["frames"] > 60, 255, stored["frames"]).astype(np.uint8)
     elif what == "no motion":

@@ -275,7 +275,7 @@ def test_pages_are_frames(tmp_path, capsys, compression):
     times = [k / 100 for k in range(COUNT)]
     check(capsys, folder, srgb(film() / 255), times, ("--fps", "100"))
     (tmp_path / "t.txt").write_text("".join(f"{t:.3f}\n" for t in times))
-    check(capsys, folder, srgb(film() / 255), times, ("--timestamps", str(tmp_path / "t.txt")))
+    check(capsys, folder, srgb(film() / 255), times, ("--timestamps", str(tmp_path / "t.txt"), "--time-unit", "s"))
 
 
 def test_white_is_dark_in_some_tiffs(tmp_path, capsys):
@@ -367,7 +367,14 @@ def test_lists_of_times(tmp_path, capsys):
     (tmp_path / "data.csv").unlink()
     (tmp_path / "data.txt").write_text("# color images\n# timestamp filename\n" + "".join(
         f"{t / 1e9:.6f} data/{t}.png\n" for t in stamps))  # fmt: skip
-    check(capsys, folder, srgb(film() / 255), times, ("--zero-time",), ["data.txt: times taken as s"])
+    check(
+        capsys,
+        folder,
+        srgb(film() / 255),
+        times,
+        ("--zero-time",),
+        ["data.txt: read as the Event Camera Dataset's and TUM's lists: seconds with a point"],
+    )
 
 
 @pytest.mark.parametrize(

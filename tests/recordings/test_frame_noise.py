@@ -10,6 +10,7 @@ import skimage.data
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events
+from blinkgl.io.frames import open_frames
 from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
 from blinkgl.recordings.frame_noise import BAND, MOST_CODES, DenoisedLight, estimated, looked_at
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
@@ -249,3 +250,69 @@ def test_still_pixels_of_a_recording():
     rate = lambda stream: np.count_nonzero(clip.still[stream.y, stream.x])
     recorded, made = rate(clip.events), rate(clip.simulate(EsimConfig(contrast_threshold=0.25, log_eps=5 / 255)))
     assert 0 < made < recorded
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Few rows, mosaics of colour filters, and frames that say what they are.
+
+
+def counted(frames, **use):
+    report = SimulationReport()
+    events = frames_to_events(frames, fps=1000, report=report, gamma="linear", **use)
+    return sum(map(len, events)), report
+
+
+@pytest.mark.parametrize("shape", [(8, 96), (96, 8), (9, 96), (16, 96), (4, 200)])
+def test_grain_of_few_rows_makes_few_events(shape):
+    """As of a large picture: each pixel of grain of 4 codes has 4 to 5 events in 60 frames if nothing is done."""
+    rng = np.random.default_rng(0)
+    light = np.linspace(60, 160, shape[1])[None] * np.ones((shape[0], 1))
+    film = [np.clip(np.rint(light + rng.normal(0, 4, shape)), 0, 255).astype(np.uint8) for _ in range(60)]
+    few = sum(map(len, frames_to_events(film, fps=100, gamma="srgb")))
+    many = sum(map(len, frames_to_events(film, fps=100, gamma="srgb", keep_noise=True)))
+    assert many > 3 * film[0].size and few < 0.05 * film[0].size
+
+
+def mosaic_of(k: int, speed: float, height: int = 96, width: int = 128) -> np.ndarray:
+    """A smooth scene behind RGGB filters, 16 bits, without noise."""
+    y, x = np.mgrid[0:height, 0:width].astype(float)
+    x = x - k * speed
+    red = 0.5 + 0.35 * np.sin(x / 9) * np.cos(y / 13)
+    green = 0.7 * (0.4 + 0.3 * np.cos(x / 7 + 1) * np.sin(y / 11))
+    blue = 0.4 * (0.3 + 0.25 * np.sin(x / 12 + y / 8))
+    out = green.copy()
+    out[::2, ::2], out[1::2, 1::2] = red[::2, ::2], blue[1::2, 1::2]
+    return (out * 60000).astype(np.uint16)
+
+
+@pytest.mark.parametrize("speed", [0.09, 1.5])
+def test_a_mosaic_without_noise_is_exact(speed):
+    film = [mosaic_of(k, speed) for k in range(60)]
+    count, report = counted(film)
+    assert report.noise is None and count == counted(film, keep_noise=True)[0]
+    assert report.guessed_over_px == pytest.approx(speed, rel=0.3)
+
+
+def test_the_noise_of_a_mosaic_is_found():
+    rng = np.random.default_rng(0)
+    film = [np.clip(mosaic_of(0, 0) + rng.normal(0, 900, (96, 128)), 0, 65535).astype(np.uint16) for _ in range(30)]
+    count, report = counted(film)
+    assert report.noise is not None and count < 0.02 * counted(film, keep_noise=True)[0]
+    assert report.noise.typical[1] == pytest.approx(900 / 65535, rel=0.25)
+
+
+@pytest.mark.parametrize("noise", ["photon_noise: false", "photon_noise: true"])
+def test_the_frame_camera_of_a_sequence_says_what_it_is(tmp_path, noise):
+    folder = tmp_path / "frame_camera" / "images"
+    folder.mkdir(parents=True)
+    (tmp_path / "config.yaml").write_text(
+        f"images: {{bits: 12, response: linear, black: 0.0625, bayer: rggb, {noise}}}\n"
+    )
+    (tmp_path / "frame_camera" / "exposures.csv").write_text("start_us\n")
+    (folder / "timestamps.txt").write_text("".join(f"{1000 * k}\n" for k in range(4)))
+    for k in range(4):
+        cv2.imwrite(str(folder / f"{k:06d}.png"), np.full((16, 24), 256 + 100 * k, np.uint16))
+    source = open_frames(folder)
+    assert source.levels == (0.0625 * 4095, 4095.0) and source.transfer == "linear"
+    assert source.exact == ("false" in noise) and [t for _, t, _ in source] == [0, 10**6, 2 * 10**6, 3 * 10**6]
+    assert any("linear, 12 bits, rggb filters" in note for note in source.notes)

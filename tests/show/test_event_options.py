@@ -67,7 +67,8 @@ def test_convert(ns, tmp_path, capsys):
 
 def test_refusals_name_the_option_and_write_nothing(ns, tmp_path, capsys):
     for arguments, line in (
-        ([], "polarity"),
+        ([], "try --time-unit us if that is right"),
+        (["--time-unit", "ns"], "or --polarity 1/2"),
         (OPTIONS[:-1], "keep"),
         (
             ["--time-unit", "minutes"],
@@ -99,9 +100,24 @@ def test_compare_says_what_it_took(ns, tmp_path, capsys):
     assert "left out: events outside 80x60" in capsys.readouterr().out
     assert json.loads((tmp_path / "c/compare.json").read_text())["a"]["count"] == 3000
     np.savez(tmp_path / "g.npz", x=E.x, y=E.y, t=E.t, p=E.p)
-    assert run(["compare", str(tmp_path / "g.npz")]) == 0
+    assert run(["compare", str(tmp_path / "g.npz")]) == 2
+    assert "no unit of the times 't' is stated; try --time-unit us if that is right" in capsys.readouterr().err
+    assert run(["compare", str(tmp_path / "g.npz"), "--time-unit", "us"]) == 0
+    assert "size taken as 240x180" in capsys.readouterr().out
+
+
+def test_a_look_prints_what_is_stated_and_the_options_to_paste(ns, tmp_path, capsys):
+    """The proposal reads the very file."""
+    (tmp_path / "e.txt").write_text("".join(f"{k * 1000} {k % 9} {k % 7} {k % 2}\n" for k in range(60)))
+    assert run(["convert", str(tmp_path / "e.txt"), "--look"]) == 0
     said = capsys.readouterr().out
-    assert "g.npz: times taken as us" in said and "size taken as 240x180" in said
+    assert "no heading names the columns; try --columns t,x,y,p --time-unit us" in said and "  2000 2 2 0" in said
+    options = ["--columns", "t,x,y,p", "--time-unit", "us"]
+    assert run(["convert", str(tmp_path / "e.txt"), "--look", *options]) == 0
+    assert "t[us] x y p\n0 0 0 0\n1000 1 1 1\n" in capsys.readouterr().out
+    assert run(["convert", str(tmp_path / "e.txt"), str(tmp_path / "o.h5"), *options]) == 0
+    assert "60 events" in capsys.readouterr().out
+    assert run(["convert", ns]) == 2 and "OUT: no output; expected an event file, or --look" in capsys.readouterr().err
 
 
 def test_calibrate_notes_what_it_took(ns, tmp_path, capsys):

@@ -61,7 +61,7 @@ anything else ends no run."""
 SHIPPED_TABLES = "emulators", "quality", "rigs", "sensors"
 """Folders of ``configs/`` whose files a recipe uses by name, so that its hash does not cover them."""
 NUMERICS = (
-    *("numpy", "scipy", "numba", "llvmlite", "h5py", "hdf5plugin", "av", "pillow", "tifffile", "trimesh"),
+    *("numpy", "scipy", "numba", "llvmlite", "h5py", "hdf5plugin", "av", "pillow", "imageio", "tifffile", "trimesh"),
     *("mapbox_earcut", "python-fcl", "scikit-image", "matplotlib", "PyYAML"),
 )
 """Distributions whose versions can change bytes, besides OpenCV, whose distribution has several names."""

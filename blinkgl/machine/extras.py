@@ -31,7 +31,7 @@ TESTED = {
         word.partition("==")
         for word in (
             "moderngl==5.13.0 glcontext==3.1.0 numpy==2.4.6 numba==0.68.1 scipy==1.17.1 trimesh==5.2.0 lxml==6.1.3 "
-            "mapbox_earcut==2.1.0 python-fcl==0.7.0.11 pillow==13.0.0 tifffile==2026.3.3 av==18.1.0 "
+            "mapbox_earcut==2.1.0 python-fcl==0.7.0.11 pillow==13.0.0 tifffile==2026.3.3 imageio==2.38.1 av==18.1.0 "
             "opencv-python-headless==5.0.0.93 scikit-image==0.26.0 h5py==3.16.0 hdf5plugin==7.1.0 aedat==2.3.0 "
             "pydantic==2.14.3 PyYAML==6.0.3 typer==0.29.2 rich==14.3.4 matplotlib==3.11.2 jinja2==3.1.6 torch==2.13.0 "
             "safetensors==0.8.0 tensorboard==2.21.0 ray==2.60.0 mujoco==3.17.0 rosbags==0.11.9 dv-processing==2.0.4 "

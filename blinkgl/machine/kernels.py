@@ -9,7 +9,6 @@ other is compiled again.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import sys
 import zlib
@@ -56,8 +55,10 @@ class _Turn:
         if self._file is not None or TURN_HELD in os.environ:
             return False
         try:
+            import fcntl
+
             self._file = os.open(_turn_file(), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except (OSError, RuntimeError):  # nothing can be kept there, so nobody would find it
+        except (ImportError, OSError, RuntimeError):  # no locks, or nothing can be kept there
             return False
         with contextlib.suppress(OSError):  # a file system without locks
             try:

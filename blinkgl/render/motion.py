@@ -171,7 +171,7 @@ class Motion:
                     return True
         return bool(
             speeds.hides(
-                limits, camera, self._body, self._radius, self._arm, self._timescale, a.items, b.items,
+                limits, camera, self._body, self._arm, self._timescale, a.items, b.items,
                 (tb - ta) * 1e-9, self.camera.near, self.camera.px_per_slope, tolerance,
             )
         )  # fmt: skip

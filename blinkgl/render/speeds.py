@@ -183,7 +183,24 @@ def _twice_area(p, q):
 
 
 @kernel(error_model="numpy")
-def look(T, D, body, ranges, sides, points, rates, faces, planes, near, lens, light, areas, sums, rows, velocities):
+def look(
+    T: np.ndarray,
+    D: np.ndarray,
+    body: np.ndarray,
+    ranges: np.ndarray,
+    sides: np.ndarray,
+    points: np.ndarray,
+    rates: np.ndarray,
+    faces: np.ndarray,
+    planes: np.ndarray,
+    near: float,
+    lens: tuple[np.ndarray, ...],
+    light: tuple[np.ndarray, ...],
+    areas: np.ndarray,
+    sums: np.ndarray,
+    rows: np.ndarray,
+    velocities: np.ndarray,
+) -> float:
     """Fill the arrays of a :class:`~blinkgl.render.motion.Look` and return the largest speed. light : of
     :func:`_patterns`."""
     room, largest, lit = 0, 0.0, len(light[0]) > 0
@@ -262,7 +279,19 @@ def _represent(moved, outside, count, total, out):
 
 
 @kernel(error_model="numpy")
-def hides(limits, camera, body, radius, arm, timescale, a, b, seconds, near, focal, tolerance):
+def hides(
+    limits: np.ndarray,
+    camera: np.ndarray,
+    body: np.ndarray,
+    arm: np.ndarray,
+    timescale: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    seconds: float,
+    near: float,
+    focal: float,
+    tolerance: float,
+) -> bool:
     """Return the value of :meth:`~blinkgl.render.motion.Motion.hides`. limits : (n, 4) of the bodies and (4,) of the
     camera: largest speed and angular rate, and the parts of them that the ends do not show."""
     v_cam, w_cam, off_cam, woff_cam = camera[0], camera[1], camera[2], camera[3]

@@ -18,6 +18,7 @@ from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
+from blinkgl.io.reading import EventReading
 from blinkgl.io.tracks import read_tracks
 from blinkgl.layouts import LAYOUTS, dsec, event_kubric, export as exporting, export_layout
 from blinkgl.layouts.planned import Planned
@@ -229,7 +230,8 @@ def test_eventkubric(data, sequence, tmp_path, monkeypatch):
     for k, frame in enumerate(rgb):
         np.testing.assert_array_equal(frame[..., ::-1], cv2.imread(str(sequence / f"images/{k:06d}.png")))
     with open_events(folder / "train/sequence_000000/events/0000000000.npz") as file:  # says its own unit, ns
-        assert file.read().t.tolist() == (part.t - tracks["t_us"][0]).tolist() and file.notes == []
+        assert file.read().t.tolist() == (part.t - tracks["t_us"][0]).tolist()
+        assert file.notes == ["read as vid2e's arrays: ns"]
 
 
 def test_generate_writes_a_layout_too_when_all_are_whole(tmp_path, capsys):
@@ -475,8 +477,10 @@ def test_rosbag_on_the_topics_of_esim(data, sequence, tmp_path):
 def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
     pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
     path = exported(stereo.parents[1], tmp_path, "rosbag") / "train/sequence_000000.bag"
-    with open_events(path) as file:
-        assert file.notes == ["2 topics of events: /cam0/events is read (--stream for another)"]
+    with pytest.raises(AssetError, match=r"2 topics of events, and none is chosen; expected one of --stream 0"):
+        open_events(path)
+    with open_events(path, EventReading(stream="/cam0/events")) as file:
+        assert file.notes == []
         same([getattr(file.read(), k) for k in "xytp"], read_events(stereo / "left/events.h5"))
     assert export_layout(bare, tmp_path / "bare", "rosbag").said == ()
 

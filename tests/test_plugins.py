@@ -24,7 +24,10 @@ def command(folder: Path, *words: str) -> tuple[int, str]:
 
 
 def test_four_parts_of_ones_own_reach_everything(tmp_path):
-    """The file of docs/extending.md: emulator, label, primitive and event format, in commands, workers and verify."""
+    """The file of docs/extending.md: emulator, label, primitive and event format, in commands, workers and verify; its
+    folder has a character that separates paths elsewhere."""
+    tmp_path = tmp_path / "of a:b"
+    tmp_path.mkdir()
     shutil.copy(MINE / "mine.py", tmp_path)
     small = ["--set", "camera.width=48", "--set", "camera.height=36", "--set", "output.sequences=2"]
     run = ["generate", str(MINE / "mine.yaml"), "--out", "set", *small]

@@ -200,3 +200,27 @@ def test_a_sensor_of_labels_alone_is_a_camera():
     assert [one.sees for one in config.sensors] == [True, True, False, True]
     assert [one.name for one in config.cameras()] == ["left", "truth", "points"]
     assert config.sensors[1].camera.width == 64 and config.sensors[1].events is None
+
+
+def test_a_camera_beside_an_inertial_unit_stays():
+    """`imu:` alone makes an inertial unit; with a camera of its own the sensor has both."""
+    config = read("sensors: [{name: left, camera: {fov: 70}, imu: {rate: 200}}, {name: right, camera: {fov: 70}}]")
+    left, right = config.sensors
+    assert left.sees and left.events == right.events and left.labels == right.labels
+    assert left.imu is not None and left.imu.rate == 200 and right.imu is None
+    assert [one.name for one in config.cameras()] == ["left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ("events: null, camera: {fov: 70}", "camera: is not used: the sensor has no camera"),
+        ("events: null, imu: {}, camera: {fov: 70}", "camera: is not used: the sensor has no camera"),
+        ("imu: {}, readout: {events_per_second: 1e6}", "readout: is not used: the sensor has no camera"),
+        ("images: {rate: 10}, readout: {events_per_second: 1e6}", "readout: is not used: the sensor has no events"),
+        ("events: null, labels: {depth: true}, readout: {}", "readout: is not used: the sensor has no events"),
+    ],
+)
+def test_a_key_that_would_not_be_used_is_refused(keys, said):
+    line = refusal(f"sensors: [{{name: right}}, {{name: left, {keys}}}]")
+    assert f"sensors.1.{said}; expected events: {{}} beside it, or without this key" in line

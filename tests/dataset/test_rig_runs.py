@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from tiny_recipe import TINY
 
+from blinkgl import open_events
 from blinkgl.config.run import load_run
 from blinkgl.dataset.deep import differences
 from blinkgl.dataset.executor import Inline, Local
@@ -190,3 +192,20 @@ def _inside(ids: np.ndarray) -> np.ndarray:
     same[[0, -1]] = False
     same[:, [0, -1]] = False
     return same
+
+
+def test_a_sensor_with_a_camera_and_an_inertial_unit_writes_both(tmp_path):
+    """What it sees is what the same camera sees without the unit."""
+    sensors = [{"name": "left", "camera": {"fov": 70}}, {"name": "right", "place": {"position": [0.1, 0, 0]}}]
+    made = {}
+    for name, own in (("without", {}), ("with", {"imu": {"rate": 200}})):
+        (tmp_path / name).mkdir()
+        left, right = sensors
+        recipe = recipe_file(tmp_path / name, **TINY, sensors=[{**left, **own}, right])
+        run_dataset(load_run(recipe), tmp_path / name / "out")
+        made[name] = tmp_path / name / "out/train/sequence_000000/left"
+    assert "imu" in {path.name for path in made["with"].iterdir()}
+    files = sorted(path.name for path in made["without"].iterdir())
+    assert "events.h5" in files and set(files) < {path.name for path in made["with"].iterdir()}
+    assert len(open_events(made["with"] / "events.h5").read()) > 0
+    assert (made["with"] / "events.h5").read_bytes() == (made["without"] / "events.h5").read_bytes()

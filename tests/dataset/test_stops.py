@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ import pytest
 from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_run
-from runs import NAMES, assert_same, recipe_file, temporaries, wait_for
+from blinkgl.dataset.run import run_dataset
+from runs import NAMES, Listener, assert_same, recipe_file, temporaries, wait_for
 
 BLINKGL = [sys.executable, "-P", "-m", "blinkgl"]
 
@@ -144,14 +146,120 @@ def test_simulate(tmp_path, number):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.npy"] and not mine(str(tmp_path))
 
 
+def compiles(line: list[str], folder: Path) -> tuple[subprocess.Popen, str]:
+    """The command with an empty folder for kernels, when it says that it compiles; and what it said before."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder)}
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(
+        line,
+        stdout=pipe,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+        preexec_fn=foreground,  # noqa: PLW1509
+    )
+    said = ""
+    while "compiling the kernels that this needs" not in said:
+        said += (text := process.stdout.readline())
+        assert text, said
+    return process, said
+
+
+@pytest.mark.parametrize("kernels_again", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "act, workers, status",
+    [
+        (lambda p: os.kill(p.pid, signal.SIGTERM), 0, 143),
+        pytest.param(lambda p: os.kill(p.pid, signal.SIGTERM), 2, 143, marks=pytest.mark.slow),
+        pytest.param(lambda p: os.killpg(p.pid, signal.SIGTERM), 2, 143, marks=pytest.mark.slow),
+        pytest.param(lambda p: os.kill(p.pid, signal.SIGINT), 0, 130, marks=pytest.mark.slow),
+    ],
+    ids=["TERM", "TERM with workers", "TERM of the group", "INT"],
+)
+def test_generate_while_it_compiles(reference, tmp_path, act, workers, status, kernels_again):
+    """The same line goes on: with the kernels that were begun (minutes), or with those of this machine."""
+    recipe, out = recipe_file(tmp_path), tmp_path / "out"
+    line = [*BLINKGL, "generate", str(recipe), "--out", str(out), "--resume"]
+    line += ["--workers", str(workers)] if workers else []
+    process, _ = compiles(line, tmp_path / "kernels")
+    act(process)
+    rest = process.communicate()[0]
+    wait_for(lambda: not mine(str(tmp_path)))
+    said = [text for text in rest.splitlines() if "compil" not in text]
+    assert (process.returncode, said) == (status, ["interrupted; --resume continues"]), rest
+    assert not any((out / name).is_dir() for name in NAMES) and not temporaries(out)
+    if kernels_again:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+        done = subprocess.run([*line, "--quiet"], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0 and not done.stderr, done.stderr
+    else:
+        assert run(line[len(BLINKGL) :] + ["--quiet"]) == 0
+    assert_same(out, reference)
+
+
+def test_simulate_while_it_compiles(tmp_path):
+    frames = tmp_path / "f.npy"
+    np.save(frames, (np.random.default_rng(0).random((20, 48, 64)) * 255).astype(np.uint8))
+    line = ["simulate", str(frames), "--fps", "100", "--out"]
+    process, _ = compiles([*BLINKGL, *line, str(tmp_path / "e.h5")], tmp_path / "kernels")
+    os.kill(process.pid, signal.SIGTERM)
+    rest = process.communicate()[0]
+    wait_for(lambda: not mine(str(tmp_path)))
+    said = [text for text in rest.splitlines() if "compil" not in text]
+    assert (process.returncode, said) == (143, ["interrupted"]), rest
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["f.npy", "kernels"]
+    assert run([*line, str(tmp_path / "e.h5")]) == 0 == run([*line, str(tmp_path / "again.h5")])
+    assert (tmp_path / "e.h5").read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
+@pytest.mark.parametrize("lock", ["", "process 1 of a dead machine"])
+def test_a_clock_that_jumps_back_and_the_lock_of_a_dead_machine(reference, tmp_path, monkeypatch, lock):
+    """Each look at the clock is a day before the last one, what was written is of the future, and the lock file of the
+    machine that died is still there: the run goes on with what it has, to the same bytes."""
+    recipe, out = recipe_file(tmp_path), tmp_path / "out"
+    now = [2_000_000_000.0]
+
+    def back() -> float:
+        now[0] -= 86400
+        return now[0]
+
+    monkeypatch.setattr(time, "time", back)
+    monkeypatch.setattr(time, "time_ns", lambda: int(back() * 1e9))
+    if lock:
+        (out / ".run").mkdir(parents=True)
+        (out / ".run/lock").write_text(lock)
+
+    def stop(name: str, message: dict) -> bool:
+        if sum((out / one).is_dir() for one in NAMES) < 2:
+            return False
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_dataset(load_run(recipe), out, listener=Listener(stop, "done"), resume=True)
+    whole = [name for name in NAMES if (out / name).is_dir()]
+    assert 2 <= len(whole) < len(NAMES)
+    for path in out.rglob("*"):
+        os.utime(path, (4e9, 4e9))
+    before = {name: (out / name / "manifest.json").stat().st_ino for name in whole}
+    if lock:
+        (out / ".run/lock").write_text(lock)
+    assert run(["generate", str(recipe), "--out", str(out), "--resume", "--quiet"]) == 0
+    assert {name: (out / name / "manifest.json").stat().st_ino for name in whole} == before
+    assert not (out / ".run/lock").exists()
+    assert_same(out, reference)
+    assert run(["verify", str(out)]) == 0
+
+
 # ---- what is imported ------------------------------------------------------------------------------------------------
 
 SPY = "import os\nopen(os.environ['SPY'], 'a').write(__name__ + '\\n')\n"
 """A module of the user's folder under the name of one of the standard library's."""
 
 
-@pytest.mark.parametrize("how", ["workers", "online loader"])
+@pytest.mark.parametrize("how", ["workers", "online loader", pytest.param("ray", marks=pytest.mark.slow)])
 def test_workers_import_nothing_of_the_users_folder(tmp_path, how):
+    if how == "ray":
+        pytest.importorskip("ray", reason="Ray is not installed (extra [cluster])")
     here = tmp_path / "unpacked"
     here.mkdir()
     for name in ("queue", "statistics", "secrets", "colorsys"):
@@ -162,8 +270,10 @@ def test_workers_import_nothing_of_the_users_folder(tmp_path, how):
         "import blinkgl, sys\nif __name__ == '__main__':\n"
         f"    with blinkgl.OnlineSequences({str(recipe)!r}, workers=1) as samples:\n        next(iter(samples))\n"
     )
+    generate = [*BLINKGL, "generate", "recipe.yaml", "--out", "out", "--num", "1", "--workers", "1", "--quiet"]
     words = {
-        "workers": [*BLINKGL, "generate", "recipe.yaml", "--out", "out", "--num", "1", "--workers", "1", "--quiet"],
+        "workers": generate,
+        "ray": [*generate, "--executor", "ray"],
         "online loader": [sys.executable, "-P", str(script)],
     }
     environment = {**os.environ, "SPY": str(tmp_path / "spy")}

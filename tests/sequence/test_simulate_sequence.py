@@ -174,3 +174,38 @@ def test_two_at_once_are_as_one_after_the_other(tmp_path):
         truths = [(x, y) for x, y in zip(together, alone, strict=True) if isinstance(x, GroundTruth)]
         assert_same(events_of(together), events_of(alone))
         assert truths and all(np.array_equal(x.frame.images, y.frame.images) for x, y in truths)
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("look_at", "seen"), [([0, 0, 0], True), ([0, -1.3, 0], True), ([-6, 0, 0], False), ([-3, 0, 3], False)]
+)
+def test_a_camera_that_never_sees_a_body_is_said(tmp_path, gl, look_at, seen):
+    """Towards the body, past its middle with an edge in the picture, away from it, and above it."""
+    scene = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box", "keyframes": [{"time": 0}, {"time": 1, "euler": [0, 0, 40]}]}],
+        "camera": {"position": [-3, 0, 0], "look_at": look_at},
+    }
+    config = config_of(tmp_path, camera={"width": 48, "height": 36, "fov": 60}, scene=scene)
+    with simulate_sequence(SequenceRequest(config, 0), gl) as sequence:
+        list(sequence)
+        said = [line for line in sequence.notes if "in the camera's view" in line]
+    assert said == ([] if seen else ["no body is ever in the camera's view: its pose may be meant otherwise"])
+
+
+def test_a_camera_that_turns_to_a_body_sees_it(tmp_path, gl):
+    """Any instant counts, the last, too."""
+    way = [{"time": t, "position": [-3, 0, 0], "look_at": at} for t, at in ((0.25, [-6, 0.5, 0]), (0.35, [0, 0, 0]))]
+    scene = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box"}],
+        "camera": {"keyframes": way},
+    }
+    with simulate_sequence(SequenceRequest(config_of(tmp_path, scene=scene), 0), gl) as sequence:
+        list(sequence)
+        assert not [line for line in sequence.notes if "view" in line]

@@ -18,7 +18,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter
-from blinkgl.io.images import NpzReader, numpy_errors, read_npy
+from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import (
     Candidate,
@@ -161,6 +161,33 @@ class ArrayReader(TableReader):
                     table = choose(candidates, reading, str(path), archive.names)
             super().__init__(path, reading, table)
         self.notes += [f"left out: {', '.join(skipped)}, which would have to be unpickled"] if skipped else []
+
+
+EVIMO2 = tuple(f"dataset_events_{part}.npy" for part in ("t", "xy", "p"))
+"""Arrays of the events of an EVIMO2v2 sequence, files of one folder: seconds, (N, 2) px, 0 or 1."""
+
+
+class Evimo2Reader(TableReader):
+    """Reads the three arrays of a folder, or those beside one of them; they stay on disk until a piece is read. Raises
+    AssetError: one is missing, or not of its form."""
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        t, xy, p = (_mapped(folder / name) for name in EVIMO2)
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise AssetError("no rows of x and y", where=str(folder / EVIMO2[1]), value=xy.shape, accepted="(N, 2)")
+        unit = "s" if t.dtype.kind == "f" else None
+        columns = {"t": t, "x": xy[:, 0], "y": xy[:, 1], "p": p}
+        table = table_of_columns(columns, str(folder), unit=unit, layout="EVIMO2's three arrays: seconds")
+        super().__init__(folder, reading, table)
+
+
+def _mapped(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise AssetError("no such file", where=str(path), accepted=f"{', '.join(EVIMO2)} in one folder")
+    with numpy_errors(path):
+        check_npy(path)
+        return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
 def _table_of_npy(array: np.ndarray, where: str, reading: EventReading) -> Table:

@@ -176,10 +176,9 @@ class Evimo2Reader(TableReader):
         t, xy, p = (_mapped(folder / name) for name in EVIMO2)
         if xy.ndim != 2 or xy.shape[1] != 2:
             raise AssetError("no rows of x and y", where=str(folder / EVIMO2[1]), value=xy.shape, accepted="(N, 2)")
-        unit = "s" if t.dtype.kind == "f" else None
+        known = {"unit": "s", "layout": "EVIMO2's three arrays: seconds"} if t.dtype.kind == "f" else {}
         columns = {"t": t, "x": xy[:, 0], "y": xy[:, 1], "p": p}
-        table = table_of_columns(columns, str(folder), unit=unit, layout="EVIMO2's three arrays: seconds")
-        super().__init__(folder, reading, table)
+        super().__init__(folder, reading, table_of_columns(columns, str(folder), **known))
 
 
 def _mapped(path: Path) -> np.ndarray:
@@ -243,12 +242,12 @@ def _candidates(
         or (len(shape) == 1 and set("txyp") <= named_columns(dtype.names or (), reading, where).keys())
     ]
     # A name may mean any of them; a number counts those that the refusal lists.
-    called = [name for name in rows if _called_events(name)] if reading.stream not in rows else rows
+    called = (
+        [name for name in rows if name.rpartition("/")[2].lower() in ("events", "event")]
+        if reading.stream not in rows
+        else rows
+    )
     return [(name, lambda name=name: table(name)) for name in called or rows]
-
-
-def _called_events(place: str) -> bool:
-    return place.rpartition("/")[2].lower() in ("events", "event")
 
 
 def _of_columns(columns: Mapping[str, str], arrays: Mapping[str, np.ndarray], where: str, **known: Any) -> Table:

@@ -78,8 +78,7 @@ class Aedat4Reader:
             )
             for a, s in zip(about, (self._streams[n] for n in numbers))
         ]
-        names = [str(n) for n in numbers]
-        return numbers[chosen(stream, names, str(self.path), what, numbered=False, labels=labels)]
+        return numbers[chosen(stream, [str(n) for n in numbers], str(self.path), what, numbered=False, labels=labels)]
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events, packet by packet, joined to about ``size``."""

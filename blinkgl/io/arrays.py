@@ -18,7 +18,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter
-from blinkgl.io.images import NpzReader, numpy_errors, read_npy
+from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import (
     Candidate,
@@ -163,6 +163,32 @@ class ArrayReader(TableReader):
         self.notes += [f"left out: {', '.join(skipped)}, which would have to be unpickled"] if skipped else []
 
 
+EVIMO2 = tuple(f"dataset_events_{part}.npy" for part in ("t", "xy", "p"))
+"""Arrays of the events of an EVIMO2v2 sequence, files of one folder: seconds, (N, 2) px, 0 or 1."""
+
+
+class Evimo2Reader(TableReader):
+    """Reads the three arrays of a folder, or those beside one of them; they stay on disk until a piece is read. Raises
+    AssetError: one is missing, or not of its form."""
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        t, xy, p = (_mapped(folder / name) for name in EVIMO2)
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise AssetError("no rows of x and y", where=str(folder / EVIMO2[1]), value=xy.shape, accepted="(N, 2)")
+        known = {"unit": "s", "layout": "EVIMO2's three arrays: seconds"} if t.dtype.kind == "f" else {}
+        columns = {"t": t, "x": xy[:, 0], "y": xy[:, 1], "p": p}
+        super().__init__(folder, reading, table_of_columns(columns, str(folder), **known))
+
+
+def _mapped(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise AssetError("no such file", where=str(path), accepted=f"{', '.join(EVIMO2)} in one folder")
+    with numpy_errors(path):
+        check_npy(path)
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+
+
 def _table_of_npy(array: np.ndarray, where: str, reading: EventReading) -> Table:
     if not array.dtype.names:
         plain: list[Candidate] = [("", lambda: table_of_rows(array, where, reading.columns))]
@@ -216,12 +242,12 @@ def _candidates(
         or (len(shape) == 1 and set("txyp") <= named_columns(dtype.names or (), reading, where).keys())
     ]
     # A name may mean any of them; a number counts those that the refusal lists.
-    called = [name for name in rows if _called_events(name)] if reading.stream not in rows else rows
+    called = (
+        [name for name in rows if name.rpartition("/")[2].lower() in ("events", "event")]
+        if reading.stream not in rows
+        else rows
+    )
     return [(name, lambda name=name: table(name)) for name in called or rows]
-
-
-def _called_events(place: str) -> bool:
-    return place.rpartition("/")[2].lower() in ("events", "event")
 
 
 def _of_columns(columns: Mapping[str, str], arrays: Mapping[str, np.ndarray], where: str, **known: Any) -> Table:

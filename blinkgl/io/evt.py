@@ -139,8 +139,12 @@ class EvtReader:
             if not re.fullmatch(r"\d{1,9}x\d{1,9}", size):
                 raise AssetError(f"unknown {what}", where=str(self.path), value=size, accepted="WIDTHxHEIGHT")
         if len(sizes := set(said.values())) > 1:
-            problem = "geometry and format state different sizes"
-            raise AssetError(problem, where=str(self.path), value=sorted(sizes), accepted="one size")
+            raise AssetError(
+                "geometry and format state different sizes",
+                where=str(self.path),
+                value=sorted(sizes),
+                accepted="one size",
+            )
         width, _, height = sizes.pop().partition("x") if sizes else ("", "", "")
         return (int(height), int(width)) if height else None
 

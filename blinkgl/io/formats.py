@@ -103,8 +103,10 @@ for _one in (
     EventFormat("rosbag", (".bag", ".mcap", ".db3"), "ros", "BagReader"),
     EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
+    EventFormat("evimo2", (), "arrays", "Evimo2Reader"),
 ):
     register(_one)
+_EVIMO2 = "dataset_events_*.npy"
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files without a size."""
 _FOUND = ("moved", "late", "cut", "outside")
@@ -340,6 +342,8 @@ def _kind(path: Path, reading: EventReading) -> str:
     found = [one for one in FORMATS.values() if ending in one.endings]
     if path.is_dir() and (path / "metadata.yaml").is_file():
         return "rosbag"
+    if any(path.glob(_EVIMO2)) or (path.match(_EVIMO2) and path.parent.is_dir()):
+        return "evimo2"
     if not found:
         raise AssetError("unknown event file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
     if not path.is_file():

@@ -107,8 +107,9 @@ def _of_rows(file: h5py.File, group: Any, data: h5py.Dataset, reading: EventRead
     check_storage(data, place, path)
     if place in EVENTS:
         # MVSEC's columns, in seconds, of its sensor of 346x260 px.
-        order = reading.columns or ("x", "y", "t", "p")
-        return table_of_rows(data, str(path), order, place=place, unit="s", size=(260, 346))
+        return table_of_rows(
+            data, str(path), reading.columns or ("x", "y", "t", "p"), place=place, unit="s", size=(260, 346)
+        )
     return table_of_rows(data, str(path), reading.columns, place=place, size=_size(file, group, path))
 
 

@@ -239,8 +239,7 @@ def read_pfm(path: str | os.PathLike) -> np.ndarray:
             "truncated or malformed PFM file", where=str(path), value=f"{len(data)} bytes", accepted=f"{expected}"
         )
     pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end()).astype(np.float32)
-    shape = (height, width, 3) if channels == 3 else (height, width)
-    return np.ascontiguousarray(pixels.reshape(shape)[::-1])
+    return np.ascontiguousarray(pixels.reshape((height, width, 3) if channels == 3 else (height, width))[::-1])
 
 
 def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) -> bytes:

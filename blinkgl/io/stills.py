@@ -299,8 +299,9 @@ def _tiff(path: Path) -> Stills:
         white = 2**bits - 1 if white is None and 8 < bits < 16 else white
         pages = len(series.pages)
         delays = [stated] * pages if stated and pages > 1 else None
-        linear = page.dtype is not None and page.dtype.kind == "f"
-        return Stills(path, pages, delays, "linear" if linear else None, white, notes)
+        return Stills(
+            path, pages, delays, "linear" if page.dtype is not None and page.dtype.kind == "f" else None, white, notes
+        )
 
 
 def _check_tags(page: Any, path: Path) -> None:

@@ -90,9 +90,10 @@ def proposal(rows: np.ndarray | None, times: np.ndarray | None = None) -> str:
 
 def undeclared(problem: str, where: str, rows: np.ndarray | None, times: np.ndarray | None = None) -> AssetError:
     """Return the refusal of a file that does not say what its columns or times are, with the options to paste."""
-    text = proposal(rows, times)
     return AssetError(
-        problem, where=where, accepted=f"try {text} if that is right (blinkgl convert --look shows the file)"
+        problem,
+        where=where,
+        accepted=f"try {proposal(rows, times)} if that is right (blinkgl convert --look shows the file)",
     )
 
 
@@ -181,8 +182,7 @@ def choose(candidates: list[Candidate], reading: EventReading, where: str, held:
             value=list(held)[:12],
             accepted="x, y, t, p in one place, an array (N, 4), or --columns x=NAME,y=NAME,t=NAME,p=NAME",
         )
-    names = [place for place, _ in candidates]
-    return candidates[chosen(reading.stream, names, where, "arrays of events")][1]()
+    return candidates[chosen(reading.stream, [place for place, _ in candidates], where, "arrays of events")][1]()
 
 
 class TableReader:

@@ -30,5 +30,4 @@ def read_tracks(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
     Raises AssetError: missing, damaged, another shape or number type."""
     path = Path(path)
-    path = path / TRACKS if path.is_dir() else path
-    return checked_arrays(path, _SHAPES)
+    return checked_arrays(path / TRACKS if path.is_dir() else path, _SHAPES)

@@ -99,8 +99,7 @@ def samples_of(plane: Any, bits: int) -> np.ndarray:
     """Return a plane's samples, (H, W) uint8 or uint16."""
     dtype = np.dtype(np.uint8) if bits <= 8 else np.dtype("<u2")
     # Rows are padded to line_size bytes.
-    rows = np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)
-    return rows[: plane.height, : plane.width]
+    return np.frombuffer(plane, dtype).reshape(-1, plane.line_size // dtype.itemsize)[: plane.height, : plane.width]
 
 
 def floats_of(frame: Any) -> np.ndarray:

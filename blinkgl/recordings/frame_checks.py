@@ -27,13 +27,14 @@ class FrameChecks:
         """Look at a frame as stored."""
         step = tuple(slice(None, None, max(1, side // _SPARSE_PX)) for side in frame.shape[:2])
         sparse = frame[step].copy()
-        self._brightness.append(float(sparse.mean()))
+        # As a part of white: files of 8 and of 16 bits may show one light.
+        white = np.iinfo(sparse.dtype).max if sparse.dtype.kind == "u" else 1
+        self._brightness.append(float(sparse.mean()) / white)
         self._top = max(self._top, float(sparse.max()))
         if sparse.dtype.kind == "u":
-            most = np.iinfo(sparse.dtype).max
-            self._codes = np.zeros(most + 1, bool) if self._codes is None or len(self._codes) <= most else self._codes
+            self._codes = np.zeros(white + 1, bool) if self._codes is None or len(self._codes) <= white else self._codes
             self._codes[sparse] = True
-            self._clipped += float(np.mean((sparse == 0) | (sparse == most)))
+            self._clipped += float(np.mean((sparse == 0) | (sparse == white)))
         self._repeated += self._last is not None and np.array_equal(sparse, self._last)
         self._last = sparse
 
@@ -61,6 +62,7 @@ class FrameChecks:
         jumps = np.diff(np.log(np.maximum(self._brightness, 1e-6)), 2)
         if len(jumps) >= 3 and np.median(np.abs(jumps)) > _FLICKER:
             yield (
-                f"the whole picture flickers, by {100 * np.median(np.abs(jumps)) / 2:.0f} % from frame to frame, and "
-                "that makes events as motion does"
+                "the whole picture flickers, by a factor of "
+                f"{min(np.exp(np.median(np.abs(jumps)) / 2), 1e6):.3g} from frame to frame, and that makes events as "
+                "motion does"
             )

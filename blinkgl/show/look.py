@@ -18,7 +18,8 @@ _ROWS, _WIDTH = 5, 100
 def looked_at(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Iterator[str]:
     """Yield lines about a file. What cannot be read without a declaration is one of them, and no error."""
     path = Path(path)
-    yield f"{path}: {path.stat().st_size:,} bytes" if path.is_file() else f"{path}: no file"
+    kind = "a folder" if path.is_dir() else "no file"
+    yield f"{path}: {path.stat().st_size:,} bytes" if path.is_file() else f"{path}: {kind}"
     try:
         with open_events(path, reading) as file:
             size = f"{file.width}x{file.height}" if file.height else "not stated (--size WIDTHxHEIGHT)"

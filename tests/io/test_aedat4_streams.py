@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blinkgl.cli import run
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io import aedat4
 from blinkgl.io.aedat4 import Aedat4Reader
@@ -144,3 +145,27 @@ def test_a_packet_longer_than_the_file_is_refused_before_memory_is_set_aside(tmp
     (tmp_path / "e.aedat4").write_bytes(data)
     with pytest.raises(AssetError, match="a header of 2147483632 bytes"):
         open_events(tmp_path / "e.aedat4")
+
+
+def test_a_recording_of_frames_alone(tmp_path, capsys):
+    """Written by iniVation's own library: its frames are simulated, and a reader of events says that there are none."""
+    dv = pytest.importorskip("dv_processing", reason="optional extra [formats]")
+    path = tmp_path / "frames.aedat4"
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (48, 64)).astype(np.uint8) for _ in range(5)]
+    writer = dv.io.MonoCameraWriter(str(path), dv.io.MonoCameraWriter.FrameOnlyConfig("DAVIS346_1", (64, 48)))
+    for k, image in enumerate(images):
+        writer.writeFrame(dv.Frame(1_000_000 + 10_000 * k, image))
+    del writer  # which closes the file
+    source = list(open_frames(path))
+    assert [t for _, t, *_ in source] == [1_000_000_000 + 10_000_000 * k for k in range(5)]
+    assert all(np.array_equal(frame, image) for (frame, *_), image in zip(source, images, strict=True))
+    with open_events(path) as file:
+        assert (file.height, file.width) == (None, None) and len(list(file.frames())) == 5
+        with pytest.raises(AssetError, match=r"^\S+frames.aedat4: no events in the recording$"):
+            file.read()
+    assert run(["simulate", str(path), "--out", str(tmp_path / "e.h5")]) == 0
+    assert "from 5 frames" in capsys.readouterr().out
+    assert run(["convert", str(path), str(tmp_path / "none.h5")]) == 2
+    assert capsys.readouterr().err.endswith("frames.aedat4: no events in the recording\n")
+    assert not (tmp_path / "none.h5").exists()

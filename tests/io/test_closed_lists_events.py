@@ -14,6 +14,7 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.io import aedat2, evt, fixed_records, hdf5, hdf5_tables, ros, tables
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.reading import EventReading
+from blinkgl.show.look import looked_at
 from tests.io.aedat2_files import event_addresses, header, records
 from tests.io.some_events import same, some_events
 
@@ -555,3 +556,70 @@ def test_aedat4_of_any_length(tmp_path, count):
         whole = np.concatenate(parts)
         for ours, theirs in (("t", "timestamp"), ("x", "x"), ("y", "y"), ("p", "polarity")):
             assert np.array_equal(whole[theirs], getattr(events, ours))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# EVIMO2v2: three arrays in one folder.
+
+
+def evimo2(folder, rows=ROWS, **instead):
+    """Write them; ``instead`` : another array, or None to leave it out."""
+    t, x, y, p = np.array(rows, np.int64).reshape(-1, 4).T
+    arrays = {"t": t / 1e6, "xy": np.stack([x, y], 1).astype(np.uint16), "p": p.astype(np.uint8)} | instead
+    folder.mkdir()
+    for name, array in arrays.items():
+        if array is not None:
+            np.save(folder / f"dataset_events_{name}.npy", array)
+    return folder
+
+
+@pytest.mark.parametrize("named", ["", "dataset_events_t.npy", "dataset_events_xy.npy", "dataset_events_p.npy"])
+def test_the_three_arrays_of_evimo2_are_one_recording(tmp_path, named):
+    events, notes = read(evimo2(tmp_path / "seq") / named)
+    assert list(zip(events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist())) == ROWS
+    assert notes == ["read as EVIMO2's three arrays: seconds"]
+
+
+def test_evimo2_is_read_from_disk_piece_by_piece(tmp_path):
+    """Thirteen gigabytes that are holes on the disk."""
+    folder, n = evimo2(tmp_path / "seq"), 1_000_000_000
+    for name, shape, kind in (("t", (n,), "f8"), ("xy", (n, 2), "u2"), ("p", (n,), "u1")):
+        np.lib.format.open_memmap(folder / f"dataset_events_{name}.npy", "w+", kind, shape)
+    with open_events(folder) as file:
+        first = next(file.chunks())
+    assert 0 < len(first) < 10_000_000 and not first.t.any()
+
+
+@pytest.mark.parametrize("missing", ["t", "xy", "p"])
+def test_evimo2_without_one_of_the_three(tmp_path, missing):
+    folder = evimo2(tmp_path / "seq", **{missing: None})
+    for path in (folder, folder / "dataset_events_xy.npy", folder / "dataset_events_p.npy"):
+        one_line(path, f"dataset_events_{missing}.npy: no such file", "in one folder")
+
+
+@pytest.mark.parametrize(
+    ("array", "value", "words"),
+    [
+        ("xy", np.zeros((60, 3), np.uint16), ("dataset_events_xy.npy", "no rows of x and y", "(60, 3)")),
+        ("xy", np.zeros(60, np.uint16), ("dataset_events_xy.npy", "no rows of x and y")),
+        ("p", np.zeros(59, np.uint8), ("event columns differ in length", "59")),
+        ("p", np.full(60, 7, np.uint8), ("polarity", "7")),
+        ("t", np.arange(60), ("no unit of the times", "--time-unit")),
+        ("p", np.array([{}] * 60), ("dataset_events_p.npy", "Python objects")),
+    ],
+)
+def test_evimo2_in_another_form(tmp_path, array, value, words):
+    one_line(evimo2(tmp_path / "seq", **{array: value}), *words)
+
+
+def test_evimo2_with_a_unit_with_one_event_and_with_none(tmp_path):
+    t = np.array([row[0] for row in ROWS])
+    assert read(evimo2(tmp_path / "us", t=t), time_unit="us")[0].t.tolist() == t.tolist()
+    assert len(read(evimo2(tmp_path / "one", ROWS[:1]))[0]) == 1
+    assert len(read(evimo2(tmp_path / "none", []))[0]) == 0
+
+
+def test_a_look_at_evimo2(tmp_path):
+    lines = list(looked_at(evimo2(tmp_path / "seq")))
+    assert lines[0].endswith("seq: a folder") and lines[1].startswith("format evimo2; size not stated")
+    assert list(looked_at(tmp_path / "none"))[0].endswith("none: no file")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -217,14 +219,15 @@ def test_what_a_clip_shows_makes_its_events(frames, after):
     assert share(frames, after) > 0.97
 
 
-def flickering(count: int) -> np.ndarray:
-    return np.round(scene(count) * (0.8 + 0.1 * (np.arange(count) % 2))[:, None, None] * 255).astype(np.uint8)
+def flickering(count: int, more: float = 0.1, dark: float = 0.8) -> np.ndarray:
+    """Frames whose light is ``dark`` and ``dark + more`` of the scene's in turn."""
+    return np.round(scene(count) * (dark + more * (np.arange(count) % 2))[:, None, None] * 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize(
     ("frames", "said"),
     [
-        (flickering(9), "warning: the whole picture flickers, by 12 %"),
+        (flickering(9), "warning: the whole picture flickers, by a factor of 1.13 from frame to frame"),
         (np.clip(np.round(scene(6, 2.0) * 500), 0, 255).astype(np.uint8), "% of the codes are at an end"),
         (np.round(scene(6, 2.0) * 15).astype(np.uint8) * 17, "warning: frames of 11 different codes"),
         (noisy(scene(2), 4 * CODE**2, 0.0), "own noise is"),
@@ -238,6 +241,26 @@ def test_frames_with_a_caveat(tmp_path, capsys, frames, said):
     out = capsys.readouterr().out
     assert said in out
     assert ("warning:" in out) == ("warning:" in said or "at an end" in said)
+
+
+@pytest.mark.parametrize(("more", "dark"), [(0.1, 0.8), (0.5, 0.5), (0.84, 0.15), (0.9, 0.02)])
+def test_how_much_the_picture_flickers(tmp_path, capsys, more, dark):
+    """The brighter frames over the darker ones, for small factors and for large ones."""
+    np.save(tmp_path / "v.npy", flickering(9, more, dark))
+    assert run(["simulate", str(tmp_path / "v.npy"), "--fps", "100", "--out", str(tmp_path / "e.h5")]) == 0
+    said = re.search(
+        r"the whole picture flickers, by a factor of (\S+) from frame to frame, and", capsys.readouterr().out
+    )
+    assert said and float(said[1]) == pytest.approx((dark + more) / dark, rel=0.03)
+
+
+def test_one_light_in_files_of_8_and_16_bits_does_not_flicker(tmp_path, capsys):
+    codes = np.random.default_rng(1).integers(40, 200, (48, 64)).astype(np.uint8)
+    for k in range(9):
+        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), codes if k % 2 else codes.astype(np.uint16) * 257)
+    assert run(["simulate", str(tmp_path), "--fps", "100", "--out", str(tmp_path / "e.h5")]) == 0
+    out = capsys.readouterr().out
+    assert "0 events" in out and "flicker" not in out
 
 
 def test_still_pixels_of_a_recording():

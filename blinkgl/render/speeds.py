@@ -24,7 +24,7 @@ POINTS = 8
 SEEN, NEAREST, AWAY, ASIDE = range(4)
 
 
-@kernel
+@kernel(error_model="numpy")
 def _velocity(x, y, z, dx, dy, dz, lens):
     """Return (px/s of a point in x and in y, px² per unit² around it); nan where the lens shows nothing. lens : corner,
     size and Jacobians of :class:`~blinkgl.render.motion.View`."""
@@ -38,7 +38,7 @@ def _velocity(x, y, z, dx, dy, dz, lens):
     return a, b, abs(J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0])
 
 
-@kernel
+@kernel(error_model="numpy")
 def _pattern(x, y, z, light, lens):
     """Return the largest px/s of the light's patterns at a point."""
     (twists, cones), most = light, 0.0
@@ -56,7 +56,7 @@ def _pattern(x, y, z, light, lens):
     return most
 
 
-@kernel
+@kernel(error_model="numpy")
 def _patterns(polygon, count, area, light, lens):
     """Return the largest px/s of the light's patterns on a polygon of this area, px²: on a grid of about 4 px. light :
     maps and cones of :meth:`~blinkgl.render.motion.Motion.light`."""
@@ -71,7 +71,7 @@ def _patterns(polygon, count, area, light, lens):
     return most
 
 
-@kernel
+@kernel(error_model="numpy")
 def _cut(polygon, count, out, nx, ny, nz, d):
     """Write the part of a polygon of ``count`` corners (position, velocity) in which n . x >= d to ``out``; return its
     number of corners."""
@@ -91,7 +91,7 @@ def _cut(polygon, count, out, nx, ny, nz, d):
     return m
 
 
-@kernel
+@kernel(error_model="numpy")
 def _gap(corners, count, n, d):
     """Return (how far a polygon is outside the plane n . x = d, the same as the sine of an angle), at most."""
     gap, farthest = np.inf, 0.0
@@ -102,7 +102,7 @@ def _gap(corners, count, n, d):
     return max(gap, 0.0), max(gap, 0.0) / math.sqrt(farthest)
 
 
-@kernel
+@kernel(error_model="numpy")
 def _in_view(polygon, other, planes, near, common, row):
     """Cut the triangle in ``polygon`` at the edges of the view; return (the array that holds the rest, its number of
     corners). Where nothing is left, its distance from the view goes to ``row``, of a look's items. common : bits of the
@@ -136,7 +136,7 @@ def _in_view(polygon, other, planes, near, common, row):
 _AHEAD = np.array([0.0, 0.0, 1.0])
 
 
-@kernel
+@kernel(error_model="numpy")
 def _move(R, dR, points, rates, planes, near, lens, moved, outside):
     """Write positions, velocities, image velocities and densities of points in camera axes to ``moved``, (n, 9), and
     the bits of the planes they are outside of; what is not in view gets no image velocity."""
@@ -162,7 +162,7 @@ _FASTEST, _DENSITY, _SUM_X, _SUM_Y = range(4)
 _WHOLE, _MEAN_X, _MEAN_Y, _SPREAD, _OUTWARDS, _AROUND = range(6)
 
 
-@kernel
+@kernel(error_model="numpy")
 def _add(q, corners, total, row):
     """Add a corner to the sums over its polygon and its item."""
     x, y = q[6], q[7]
@@ -176,7 +176,7 @@ def _add(q, corners, total, row):
         total[_OUTWARDS], total[_AROUND] = total[_OUTWARDS] + x * u + y * v, total[_AROUND] + y * u - x * v
 
 
-@kernel
+@kernel(error_model="numpy")
 def _twice_area(p, q):
     """Return the cross product of two corners on the plane at distance 1."""
     return (p[0] * q[1] - q[0] * p[1]) / (p[2] * q[2])
@@ -257,7 +257,7 @@ def look(
     return largest
 
 
-@kernel
+@kernel(error_model="numpy")
 def _behind(a, b, c):
     """Return a number above 0 where a triangle is seen from behind: the camera, the origin, is there."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -265,7 +265,7 @@ def _behind(a, b, c):
     return (uy * vz - uz * vy) * a[0] + (uz * vx - ux * vz) * a[1] + (ux * vy - uy * vx) * a[2]
 
 
-@kernel
+@kernel(error_model="numpy")
 def _represent(moved, outside, count, total, out):
     """Write the velocities of an item's row of a look."""
     for k in range(POINTS):
@@ -331,7 +331,7 @@ def hides(
     return False
 
 
-@kernel
+@kernel(error_model="numpy")
 def _bow(angle):
     """Return the height of an arc over its chord, by its radius."""
     return min(2.0, angle * angle / 8.0)

@@ -163,12 +163,10 @@ class Motion:
         limits = bodies.bounds(ta, tb)
         camera = np.array([*self._path.speed_bound(ta, tb), *self._path.unseen(ta, tb)])
         for lamp in self._lamps:
-            v, w = lamp.path.unseen(ta, tb)
-            # Of light only its own time scale is known: what it moves over may be anywhere.
-            if v or w:
-                moved = (lamp.path.speed_bound(ta, tb)[0], lamp.path.speed_bound(ta, tb)[1])
-                if v > 0.1 * moved[0] or w > 0.1 * moved[1]:
-                    return True
+            # Relative to its own speed: what it moves over may be anywhere.
+            (v, w), (speed, rate) = lamp.path.unseen(ta, tb), lamp.path.speed_bound(ta, tb)
+            if v > 0.1 * speed or w > 0.1 * rate:
+                return True
         return bool(
             speeds.hides(
                 limits, camera, self._body, self._arm, self._timescale, a.items, b.items,

@@ -172,6 +172,11 @@ class _TwoThresholds:
 _NO_CORRELATION = {"threshold_correlation": Removed("the key left out", lambda value: value == 0)}
 
 
+_SPREAD = 0.105
+"""Standard deviation of ESIM's thresholds by the threshold itself: 0.021 of 0.2. An absolute one would make a pixel
+that is set to a small threshold fire at many others."""
+
+
 class EsimConfig(_TwoThresholds, EmulatorConfig):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
@@ -198,7 +203,8 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
         ge=0,
         le=5,
         description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021), drawn once per "
-        "pixel; each threshold stays >= 0.01 (or >= half of a smaller nominal one).",
+        "pixel; each threshold stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of "
+        "contrast_threshold.",
     )
     threshold_jitter: float = Field(
         0.0,
@@ -223,6 +229,14 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
     device: Device = _DEVICE
+
+    @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        data = super().completed(data)
+        threshold = data.get("contrast_threshold", 0)
+        if "threshold_sigma" in data or not isinstance(threshold, int | float) or not threshold:
+            return data
+        return {**data, "threshold_sigma": _SPREAD * threshold}
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> dict[str, Any]:

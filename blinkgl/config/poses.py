@@ -58,7 +58,8 @@ def some_rotation(quaternion: tuple[float, ...] | None) -> None:
 
 
 class PoseConfig(Config):
-    """A position, and at most one kind of orientation."""
+    """A position, and at most one kind of orientation: of a body's own axes, or of a camera's as OpenCV has them (x
+    right, y down, z forward). Without one a body is not turned, and a camera looks along +x with z up."""
 
     position: Position = Field((0.0, 0.0, 0.0), description="m")
     quaternion: tuple[float, float, float, float] | None = Field(

@@ -3,11 +3,14 @@ clock, in this order. Parts that are not given are absent."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+import itertools
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, Removed, rule
+
+_Rate = Annotated[float, Field(ge=0, le=1e4)]
 
 
 class PixelsConfig(Config):
@@ -52,6 +55,34 @@ class PixelsConfig(Config):
         description="Dead time of a pixel's noise after its own noise event, microseconds; the rates are those "
         "without dead time.",
     )
+
+
+class LightNoiseConfig(Config):
+    """Noise events whose rate depends on the light, as those of photons do: published curves of a camera. Emulators
+    with noise of their own (``v2e``, ``voltmeter``) have it; ESIM, which has none, leaves it out and says so. A
+    Poisson process per pixel; between the given lights logarithms of rates are linear in that of the light."""
+
+    lux: tuple[Annotated[float, Field(gt=0, le=1e7)], ...] = Field(
+        min_length=1, max_length=256, description="Light on the scene, lux, increasing."
+    )
+    on_hz: tuple[_Rate, ...] = Field(description="ON noise events per second and pixel at each light.")
+    off_hz: tuple[_Rate, ...] = Field(description="OFF noise events per second and pixel at each light.")
+    white_lux: float = Field(1000.0, gt=0, le=1e9, description="Light on the scene where luminance is 1, lux.")
+    shape: float | None = Field(
+        None,
+        ge=0.01,
+        le=1e6,
+        description="Shape r of the gamma law of the pixels' rates, whose counts are then negative binomial; null: all "
+        "pixels are alike.",
+    )
+
+    @rule("lux", "on_hz", "off_hz")
+    def _a_curve(lux: tuple[float, ...], on: tuple[float, ...], off: tuple[float, ...]):
+        if any(b <= a for a, b in itertools.pairwise(lux)):
+            raise Refused("must increase", where="lux", value=list(lux))
+        for key, rates in (("on_hz", on), ("off_hz", off)):
+            if len(rates) != len(lux):
+                raise Refused("a rate for each light", where=key, value=len(rates), accepted=f"{len(lux)}, as of lux")
 
 
 class FrameResetsConfig(Config):
@@ -106,6 +137,9 @@ class ReadoutConfig(Config):
         description="Resolution of time stamps, microseconds: they are rounded down to multiples of this.",
     )
     pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels; null: none.")
+    light_noise: LightNoiseConfig | None = Field(
+        None, description="Noise events by the light, of emulators with noise of their own; null: none."
+    )
     frame_resets: FrameResetsConfig | None = Field(
         None, description="Bursts of events caused by the camera's frames; null: none."
     )

@@ -105,11 +105,10 @@ class SensorConfig(Config):
                     raise Refused("the file has no such value", where=table, value=name)
 
     @property
-    def pixels_known(self) -> bool:
-        """Return whether anything is known about its pixels; otherwise the emulators' defaults apply."""
-        keys = ("contrast_threshold", "contrast_threshold_off", "threshold_sigma", "cutoff_hz", "refractory_us",
-                "leak_rate_hz", "shot_noise_rate_hz", "emulators")  # fmt: skip
-        return any(getattr(self, key) not in (None, {}) for key in keys)
+    def threshold_known(self) -> bool:
+        """Return whether a threshold of its pixels is known; otherwise the emulators' defaults apply."""
+        tables = (*self.emulators.values(), {"contrast_threshold": self.contrast_threshold})
+        return any(table.get(key) is not None for table in tables for key in ("contrast_threshold", "k1"))
 
     def values(self, emulator: Any) -> dict[str, Any]:
         """Return the sensor's values for the keys of the emulator of this name; none for an unknown one."""

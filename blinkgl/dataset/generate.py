@@ -47,8 +47,8 @@ LOSSES = "events_cut_by_max_events_per_step", "events_lost_in_readout", "events_
 
 
 class PreviewRecorder:
-    """Context manager; does nothing where no sequence has pictures. The flow panel shows the instantaneous velocity
-    times the label interval, which equals the flow labels for small motions; recorded frames have none.
+    """Context manager; does nothing where no sequence has pictures. The flow panel shows the flow over a label
+    interval, as the label does; recorded frames have none.
 
     sequences : of one camera, or of those of a rig, shown one below the other by their names."""
 
@@ -59,8 +59,7 @@ class PreviewRecorder:
         if not shown:
             return
         self._clock = shown[0].clock
-        rate, time = config.rate if shown[0].pictures_hz is None else shown[0].pictures_hz, shown[0].config.time
-        self._interval_s = np.float32(time.interval_ns * 1e-9)
+        rate = config.rate if shown[0].pictures_hz is None else shown[0].pictures_hz
         panels = [
             Panels(
                 one.height,
@@ -84,8 +83,8 @@ class PreviewRecorder:
                 self._video.panels[number].add_events(item.events)
         elif isinstance(item, Picture):
             with sequence.clock("preview"):
-                if item.velocity is not None:
-                    self._video.panels[number].set_flow(item.velocity * self._interval_s)
+                if item.flow is not None:
+                    self._video.panels[number].set_flow(item.flow)
                 self._video.frame(item.t_ns // 1000, item.image, number)
 
     def __enter__(self) -> PreviewRecorder:

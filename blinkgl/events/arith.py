@@ -11,10 +11,12 @@ Coefficients are Chebyshev fits made with mpmath on the reduced intervals; the t
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numba.extending import overload, register_jitable
+
+Number = TypeVar("Number", float, np.ndarray)
 
 _F, _I, _D, _L = np.float32, np.int32, np.float64, np.int64
 
@@ -169,7 +171,7 @@ LOG_64 = tuple(
 
 
 @register_jitable
-def log_f64(v: float) -> float:
+def log_f64(v: Number) -> Number:
     """Return ln(v), float64, v normal and positive; error < 4e-16 (1 + |ln v|)."""
     bits = bits_f64(v)
     # The exponent for which m lies in [sqrt(1/2), sqrt(2)).

@@ -19,6 +19,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import Emulator
+from blinkgl.events.light_noise import LightNoise
 from blinkgl.events.pixels import PixelNoise
 from blinkgl.events.resets import FrameResets
 from blinkgl.events.table import EMULATORS, make_emulator
@@ -173,7 +174,7 @@ class EventCamera:
     sensor.
 
     The light, changed by the jumps of a frame camera's resets, goes into the emulator; its events go through the
-    pixels' defects, the bus and its clock, as far as the configuration has them.
+    pixels' defects and noise, the bus and its clock, as far as the configuration has them.
     readout : None: none of these.   seed : of the draws.
     emulator : the :class:`Emulator` itself.
     truth : finds the surface of each event, for frames with ``surfaces``; None: not requested.
@@ -194,14 +195,28 @@ class EventCamera:
         self.emulator = make(config, height, width, seed)
         self.frames = 0
         """Frames taken so far."""
-        self._pixels, self._readout, self._resets = None, None, None
+        self._unheard: str | None = None
+        self._pixels, self._noise, self._readout, self._resets = None, None, None, None
         if readout is not None:
             if readout.frame_resets is not None:
                 response = EMULATORS[config.emulator].response(config)
                 self._resets = FrameResets(readout.frame_resets, self.emulator, response.threshold / response.gain)
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
+            if readout.light_noise is not None and not self.emulator.noisy:
+                self._unheard = config.emulator
+            elif readout.light_noise is not None:
+                self._noise = LightNoise(readout.light_noise, height, width, seed, self.emulator.causes)
             self._readout = Readout(readout)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what of the read-out its emulator leaves out, a line each."""
+        if self._unheard is None:
+            return ()
+        return (
+            f"events: {self._unheard} models no noise and leaves out readout.light_noise; v2e and voltmeter have it",
+        )
 
     @property
     def records_truth(self) -> bool:
@@ -212,7 +227,8 @@ class EventCamera:
     def tensor_device(self) -> Any:
         """Return the torch device of which it takes frames as tensors; None: only arrays, because the emulator or
         another part of the camera needs them."""
-        return self.emulator.tensor_device if self._truth is None and self._resets is None else None
+        arrays = (self._truth, self._resets, self._noise)
+        return self.emulator.tensor_device if all(part is None for part in arrays) else None
 
     @property
     def saturated(self) -> int:
@@ -244,6 +260,8 @@ class EventCamera:
         until_us = frame.t_ns // 1000
         if self._pixels is not None:
             events = self._pixels.step(events, until_us)
+        if self._noise is not None:
+            events = self._noise.step(events, until_us, self.emulator.decoded(frame.luminance))
         if self._truth is not None:  # the later stages keep the truth with its event
             events = replace(events, truth=self._truth.of(events, frame.t_ns))
         return events if self._readout is None else self._readout.step(events, until_us)

@@ -66,6 +66,8 @@ class Emulator(ABC):
     """Where events are computed: "cpu" or "cuda"."""
     tensor_device: Any = None
     """The torch device of which ``step`` takes frames as tensors, too; None: only arrays."""
+    noisy: ClassVar[bool] = False
+    """Whether it models noise, and so has that of a camera's curves (:mod:`~blinkgl.events.light_noise`), too."""
     _still_pixels_sleep = False
     """Whether a pixel whose luminance does not change has no events and no changing state. A subclass whose
     :meth:`_advance` is its own, and may change the frames, says it anew."""
@@ -169,11 +171,12 @@ class Emulator(ABC):
     def _checked_frame(self, luminance: np.ndarray) -> np.ndarray:
         frame = np.asarray(luminance)
         if frame.shape != (self.height, self.width):
+            colours = ": luminance, for linear colours frame @ [0.2126, 0.7152, 0.0722]" if frame.ndim == 3 else ""
             raise EventDataError(
-                "frame size changed",
+                "a frame of another shape than the emulator's",
                 where=f"frame {self.frames}",
                 value=frame.shape,
-                accepted=f"({self.height}, {self.width})",
+                accepted=f"({self.height}, {self.width}){colours}",
             )
         if frame.dtype != np.uint8 and frame.dtype != np.float32:
             raise EventDataError(

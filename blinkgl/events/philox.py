@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
+from typing import TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
@@ -28,6 +29,10 @@ _W0, _W1 = _U(0x9E3779B9), _U(0xBB67AE85)
 _HALF, _ULP53, _MINUS2 = _D(0.5), _D(2.0**-53), _D(-2.0)
 
 
+Word: TypeAlias = int | np.integer | np.ndarray
+"""A number below 2^64, or one for each draw."""
+
+
 class Stream(IntEnum):
     """The purposes of draws. Append only: the numbers are part of every published data set."""
 
@@ -42,6 +47,7 @@ class Stream(IntEnum):
     START = 8  # initial state
     DEFECT = 9  # dead and hot pixels and their rates, frozen per pixel
     OWN_NOISE = 10  # noise events of pixels, "pixel" is the event's number
+    LIGHT_NOISE = 11  # 0: a pixel's share, frozen; 1, 2: noise by light, "pixel" is the candidate's number
 
 
 # "always": loops over draws become vector instructions only if nothing is called in them.
@@ -54,7 +60,7 @@ def _round(c0, c1, c2, c3, k0, k1):
 
 
 @register_jitable(inline="always")
-def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
+def philox4x32(c0: Word, c1: Word, c2: Word, c3: Word, k0: Word, k1: Word) -> tuple[Word, Word, Word, Word]:
     """Return four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
     # Ten rounds, the key bumped between them by the golden ratio and sqrt(3) - 1.
     for _ in range(9):
@@ -64,7 +70,7 @@ def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[in
 
 
 @register_jitable(inline="always")
-def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
+def uniform2(seed: Word, pixel: Word, stream: Word, index: Word) -> tuple[np.ndarray, np.ndarray]:
     """Return two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of
     it)."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
@@ -73,7 +79,7 @@ def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, flo
 
 
 @register_jitable
-def normal2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
+def normal2(seed: Word, pixel: Word, stream: Word, index: Word) -> tuple[np.ndarray, np.ndarray]:
     """Return two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(seed, pixel, stream, index)
     # Box and Muller: radius sqrt(-2 ln u), angle 2 pi v. u is never 0.

@@ -212,6 +212,7 @@ class V2e(Emulator):
     shot noise), 8 with the dead time, 12 with causes. Constants: 16 bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
+    noisy = True
     _state: ClassVar[tuple[str, ...]] = (
         "_intensity",
         "_x",

@@ -363,6 +363,7 @@ class DvsVoltmeter(Emulator):
     the events that were not drawn."""
 
     Config = VoltmeterConfig
+    noisy = True
     _state = ("_intensity", "_v", "_unspent", "_release", "_by_light", "_by_leak")
 
     @classmethod

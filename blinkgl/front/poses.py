@@ -74,8 +74,8 @@ class Pose(Piece):
     """Position and orientation of a body or a camera; give at most one form of the orientation.
 
     position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
-    look_at : (3,) m, the point towards which a camera's z axis, or a body's x axis, is turned. Without orientation a
-    camera looks along +x with z up.
+    look_at : (3,) m, the point towards which a camera's z axis, or a body's x axis, is turned. A camera's axes are x
+    right, y down, z forward; without orientation it looks along +x with z up.
     Raises ConfigError."""
 
     def __init__(

@@ -242,6 +242,7 @@ def stepped(
     """Yield steps of frames (array, t_ns, name), interpolated ones included, through an event camera. Raises
     EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
+    report.notes.extend(camera.notes)
     given = _Given(frames, use, report, fitting, camera)
     stream = iter(given)
     if use.interpolate == "motion":

@@ -96,7 +96,8 @@ class RenderedSequence(SensorSimulation):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        return self._notes if self.timeline is None else self._notes + self.timeline.notes
+        notes = self._notes if self.camera is None else self._notes + self.camera.notes
+        return notes if self.timeline is None else notes + self.timeline.notes
 
     def _resume(self) -> None:
         self.renderer.gl.resume()
@@ -158,7 +159,12 @@ class RenderedSequence(SensorSimulation):
 
     def _picture(self, t_ns: int) -> Picture:
         image = self.renderer.colour(t_ns, antialiasing="none").read()
-        return Picture(t_ns, image, self.renderer.velocity(t_ns).read())
+        interval = self.config.time.interval_ns
+        span = min(interval, self.scene.t1_ns - t_ns)
+        if 4 * span < interval:
+            return Picture(t_ns, image)  # of so short a motion the rest of an interval does not follow
+        flow = self.renderer.labels(t_ns, LabelRequest("flow_forward"), t_ns + span).forward.flow
+        return Picture(t_ns, image, np.nan_to_num(flow) * np.float32(interval / span))
 
     @property
     def seconds(self) -> dict[str, float]:

@@ -102,12 +102,12 @@ class GroundTruth:
 class Picture:
     """A picture at t_ns for display: comes after the events up to then.
 
-    image : (H, W, 3) or (H, W) float32 linear light.   velocity : (H, W, 2) float32 px/s, or None where it is unknown
-    (recorded frames)."""
+    image : (H, W, 3) or (H, W) float32 linear light.   flow : (H, W, 2) float32, px from t_ns to a label interval
+    later, 0 where nothing is seen; None where it is unknown: in recorded frames, and at the sequence's end."""
 
     t_ns: int
     image: np.ndarray
-    velocity: np.ndarray | None = None
+    flow: np.ndarray | None = None
     sensor: str = ""
 
 

@@ -82,8 +82,8 @@ def run(
     if size is not None:
         options["size"] = parsed_size(size)
     console = plain_console(quiet=quiet)
-    if sensor is not None and not load_sensor(sensor).pixels_known:
-        say(console, f"of {sensor} only the size is known: thresholds and noise are the emulator's defaults")
+    if sensor is not None and not load_sensor(sensor).threshold_known:
+        say(console, f"the thresholds of {sensor} are not known: they are the emulator's defaults")
     bar = Progress(
         plain_column("{task.description}"),
         BarColumn(),

@@ -100,6 +100,19 @@ def test_threshold_spread_is_frozen_and_normal():
     assert (Esim(100, 100, EsimConfig(contrast_threshold=0.3, threshold_sigma=0.03), seed=1)._on != esim._on).any()
 
 
+@pytest.mark.parametrize("threshold", [0.001, 0.01, 0.2, 1.0, 5.0])
+def test_the_default_spread_is_a_share_of_the_threshold(threshold):
+    """A rise by 40 thresholds makes 40 events a pixel at every threshold, but for the rest below one threshold."""
+    esim = Esim(64, 64, EsimConfig(contrast_threshold=threshold, log_eps=1e-9), seed=3)
+    on = esim._on / 2**25
+    assert on.std() == pytest.approx(0.105 * threshold, rel=0.05)
+    if threshold <= 0.2:
+        frames = [np.full((64, 64), light, np.float32) for light in (1e-3, 1e-3 * np.exp(40 * threshold))]
+        assert len(run(esim, frames, [0, 10**9])) / 64**2 == pytest.approx(
+            (40 * threshold / on).astype(int).mean(), abs=0.5
+        )
+
+
 def test_burst_saturates_honestly():
     """10^4 events per pixel wanted in one interval: bounded memory, every pixel cut alike, the rest counted."""
     config = EsimConfig(contrast_threshold=0.001, threshold_sigma=0, log_eps=1e-9, max_events_per_step=20_000)

@@ -115,8 +115,12 @@ def test_frames_and_times_that_an_emulator_takes():
     assert esim.t_ns == -(2**61) + 1
     with pytest.raises(EventDataError, match="frame 1: time stamps must increase"):
         esim.step(frame, esim.t_ns)
-    with pytest.raises(EventDataError, match="frame 1: frame size changed"):
+    with pytest.raises(EventDataError, match="frame 1: a frame of another shape"):
         esim.step(frame[:1], 0)
+    with pytest.raises(
+        EventDataError, match=r"frame 0: a frame of another shape .* frame @ \[0.2126, 0.7152, 0.0722\]"
+    ):
+        Esim(2, 2, EsimConfig(), 0).step(np.ones((2, 2, 3), np.float32), 0)
     longest = (2**30 - 1) * 1000
     esim.step(frame, esim.t_ns + longest)
     with pytest.raises(

@@ -115,5 +115,18 @@ def test_pictures_come_after_the_events_until_then(run):
     )
     times = [items[k].t_ns / 1e9 for k in pictures]
     assert times[0] == 0 and np.diff(times).max() < 0.05 + 1 / 50 + 1e-9
-    drawn = items[pictures[0]].velocity is not None
-    assert all(items[k].image.dtype == np.float32 and (items[k].velocity is not None) == drawn for k in pictures)
+    drawn = items[pictures[0]].flow is not None
+    assert all(items[k].image.dtype == np.float32 and (items[k].flow is not None) == drawn for k in pictures[:-2])
+
+
+def test_the_flow_of_a_picture_is_the_label_of_its_time():
+    # Above all before a camera that turns: its velocity times the interval is another motion.
+    turn = blinkgl.Keyframes({0: blinkgl.Pose((-3, 0, 1)), 0.2: blinkgl.Pose((-3, 0, 1), look_at=(-2, 0.6, 1.2))})
+    scene = blinkgl.Scene(blinkgl.Camera(48, 32, pose=turn), [blinkgl.Primitive("cuboid")], duration=0.2)
+    pictures = (one for one in blinkgl.simulate_sequence(scene, pictures_hz=10, labels=[]) if isinstance(one, Picture))
+    drawn = {one.t_ns: one.flow for one in pictures}
+    with blinkgl.Renderer(scene) as renderer:
+        for t_ns in sorted(drawn)[:-1]:
+            label = renderer.frame(t_ns * 1e-9, ["forward"])
+            assert np.abs(label.forward.flow).max() > 4 or t_ns > 150_000_000
+            np.testing.assert_array_equal(drawn[t_ns], np.nan_to_num(label.forward.flow))

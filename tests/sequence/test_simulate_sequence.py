@@ -112,7 +112,7 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
         drawn.clear()
         made[name] = list(simulate_sequence(SequenceRequest(config, 0, **wanted), gl))
         expected = {
-            "everything": {"luminance", "colour", "labels", "velocity"},
+            "everything": {"luminance", "colour", "labels"},
             "events": {"luminance"},
             "labels": {"colour", "labels"},
         }

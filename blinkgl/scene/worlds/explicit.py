@@ -207,6 +207,14 @@ def motion_path(
     sequence's clock) or a file's poses. Raises ConfigError and AssetError."""
     if config.trajectory is not None:
         return trajectory_path(config.trajectory, t0_ns, t1_ns, f"{where}.trajectory", base, log)
+    turned = next((k for k in (config, *config.keyframes) if k.euler is not None), None)
+    if camera and turned and log is not None:
+        x, y, z, w = (Rotation.from_euler("xyz", turned.euler, degrees=True) * _LEVEL_CAMERA).as_quat().round(7) + 0.0
+        log.append(
+            f"{where}: euler turns OpenCV's axes (x right, y down, z forward), as quaternion does; "
+            f"up to version 0.2 it turned a camera that looks along +x, whose euler {list(turned.euler)} is "
+            f"quaternion [{w}, {x}, {y}, {z}]"
+        )
     if not config.keyframes:
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
@@ -283,9 +291,9 @@ size."""
 def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
     """Return T_world_body, (4, 4).
 
-    quaternion : the rotation itself; for a camera that of its OpenCV axes.
-    euler, or nothing : rotation about the world's x, then y, then z, from rest; a camera at rest looks along +x with z
-    up.
+    quaternion, or euler about the world's x, then y, then z : the rotation itself, for a camera that of its OpenCV
+    axes.
+    nothing : no rotation; a camera looks along +x with z up.
     look_at : a camera's z axis (x level), an object's x axis (y level) points there.
     """
     if config.look_at is not None:
@@ -294,9 +302,10 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
     elif config.quaternion is not None:
         w, x, y, z = config.quaternion
         axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+    elif config.euler is not None:
+        axes = Rotation.from_euler("xyz", config.euler, degrees=True).as_matrix()
     else:
-        turn = Rotation.from_euler("xyz", config.euler or (0, 0, 0), degrees=True)
-        axes = (turn * _LEVEL_CAMERA if camera else turn).as_matrix()
+        axes = _LEVEL_CAMERA.as_matrix() if camera else np.eye(3)
     return pose_of(config.position, axes)
 
 

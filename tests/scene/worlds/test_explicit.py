@@ -1,5 +1,7 @@
 """Custom scenes: poses, key frames, materials, scales, and bad input by message."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -33,11 +35,34 @@ def test_camera_orientations():
     rest = pose_matrix(PoseConfig(), camera=True)[:3, :3]
     np.testing.assert_allclose(rest, np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # z forward = +x, y down = -z
     np.testing.assert_allclose(pose_matrix(PoseConfig(look_at=(5, 0, 0)), camera=True)[:3, :3], rest, atol=1e-12)
-    turned = pose_matrix(PoseConfig(euler=(0, 0, 90)), camera=True)[:3, :3]
-    np.testing.assert_allclose(turned[:, 2], [0, 1, 0], atol=1e-12)
+    level = pose_matrix(PoseConfig(euler=(-90, 0, -90)), camera=True)[:3, :3]
+    np.testing.assert_allclose(level, rest, atol=1e-12)
     np.testing.assert_allclose(
         pose_matrix(PoseConfig(quaternion=(2, 0, 0, 0)), camera=True)[:3, :3], np.eye(3), atol=1e-12
     )
+
+
+@pytest.mark.parametrize("euler", [(0, 0, 0), (-90, 0, -90), (10, 20, 30), (0, 90, 0), (-45, 10, 170)])
+def test_euler_is_the_quaternion_of_the_same_rotation_for_cameras_and_bodies(euler):
+    x, y, z, w = Rotation.from_euler("xyz", euler, degrees=True).as_quat()
+    for camera in (False, True):
+        np.testing.assert_allclose(
+            pose_matrix(PoseConfig(euler=euler), camera),
+            pose_matrix(PoseConfig(quaternion=(w, x, y, z)), camera),
+            atol=1e-12,
+        )
+
+
+def test_a_recipe_that_turns_a_camera_by_euler_is_told_its_former_pose(tmp_path):
+    # With the quaternion that the note names the camera looks where version 0.2 turned it: by euler from +x.
+    frames = [{"time": 0, "euler": [0, 0, 20]}, {"time": 1, "euler": [0, 9, 20]}]
+    scene = build(tmp_path, camera={"keyframes": frames})
+    (note,) = [line for line in scene.log if "euler" in line]
+    assert note.startswith("scene.camera: euler turns OpenCV's axes (x right, y down, z forward)")
+    quaternion = json.loads(note.partition("is quaternion ")[2])
+    axes = pose_matrix(PoseConfig(quaternion=quaternion), camera=True)[:3, :3]
+    np.testing.assert_allclose(axes[:, 2], [np.cos(np.radians(20)), np.sin(np.radians(20)), 0], atol=1e-6)
+    assert build(tmp_path, camera={"look_at": [1, 0, 0]}).log == ()
 
 
 def test_object_orientations():

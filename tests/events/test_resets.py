@@ -8,8 +8,9 @@ import pytest
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.problems import validate
 from blinkgl.config.readout import FrameResetsConfig, ReadoutConfig
+from blinkgl.config.sensor import load_sensor
 from blinkgl.errors import ConfigError
-from blinkgl.events import Events
+from blinkgl.events import Events, resets as resets_module
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.resets import BEFORE, RISE_NS
 
@@ -69,7 +70,8 @@ def test_of_moving_pixels_the_share_fires_that_stands_within_the_jump_of_its_thr
     assert sum(after[4:]) < 0.2 * sum(after[:4])  # those that would have come next have come
 
 
-def test_codes_and_rows_are_as_light_and_whole_frames():
+def test_codes_and_rows_are_as_light_and_whole_frames(monkeypatch):
+    monkeypatch.setattr(resets_module, "BEFORE", 3)  # of a kick so high that pixels end between two levels
     light = np.linspace(0.1, 0.9, H * W).reshape(H, W).astype(np.float32)
     resets = FrameResetsConfig(interval_ms=10, kick=0.3 / 0.17, first_ms=2.9)
     whole = events_of([(t * MS, light) for t in range(12)], resets)
@@ -98,9 +100,10 @@ SHARP = dict(preset="clean", threshold_sigma=0.0, contrast_threshold=0.2, contra
         (VoltmeterConfig(k1=5.0, k2=1.0), 2.5, 1.5),
     ],
 )
-def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(config, kick, expected, luminance):
-    """A low-pass that light has to go through takes nothing of it. The fourth jump counts, after those before the first
+def test_the_signal_of_any_emulator_jumps_by_so_many_thresholds(monkeypatch, config, kick, expected, luminance):
+    """A low-pass that light has to go through takes nothing of it. The fourth jump counts, after three before the first
     frame."""
+    monkeypatch.setattr(resets_module, "BEFORE", 3)
     light = [(t * MS, np.full((H, W), luminance, np.float32)) for t in range(40)]
     events = events_of(light, FrameResetsConfig(interval_ms=100, kick=kick, length_ms=2, first_ms=10), config)
     quiet = events_of(light, None, config)
@@ -121,6 +124,14 @@ def test_the_highest_jump_stays_within_the_emulators_range():
 def test_a_jump_that_lasts_into_the_next_is_refused():
     with pytest.raises(ConfigError, match="length_ms: the jump does not end before the next one .*at most 9,"):
         validate(ReadoutConfig, {"frame_resets": {"interval_ms": 10, "kick": 0.1, "length_ms": 10}})
+
+
+def test_a_still_davis240c_of_the_voltmeter_is_quiet_from_its_first_frame_on():
+    """Recorded: .005 Hz a pixel. Diffusion brings pixels near their thresholds again and again, and resets take them."""
+    known = load_sensor("davis240c")
+    camera = EventCamera(known.emulator("voltmeter"), known.readout, 120, 160, 1)
+    frames = (EventFrame(t * 10 * MS, np.full((120, 160), 0.5, np.float32)) for t in range(51))
+    assert sum(len(events) for _, events in emulate(frames, camera)) / (120 * 160 * 0.5) <= 0.02
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from importlib import resources
 from typing import Any, Literal
 
 from blinkgl.config.reader import shipped
@@ -21,6 +23,12 @@ def load_quality(name: str) -> dict[str, Any]:
     """Return ``timeline:`` and ``render:`` of a preset as plain data; comments in its file give the figures it is based
     on."""
     return shipped("quality", name)
+
+
+def measured_presets() -> dict[str, Any]:
+    """Return what the suite of ``trade`` measured: ``settings`` by name, and ``scenes`` with a row of costs and errors
+    for each of them; a share, not a percentage. Made by ``tools/quality_presets.py``."""
+    return json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text(encoding="utf-8"))
 
 
 def fill_quality(quality: Any, kind: Any) -> dict[str, Any]:

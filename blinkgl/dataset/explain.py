@@ -10,11 +10,12 @@ import platform
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.over_time import imu_count, track_times
-from blinkgl.config.quality import DEFAULT, load_quality
+from blinkgl.config.quality import DEFAULT, load_quality, measured_presets
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import DisplacementTimeline
@@ -65,6 +66,23 @@ def quality_in_words(config: SequenceConfig) -> str:
     return f"{named}not {DEFAULT}: {', '.join(apart)}"
 
 
+def error_in_words(config: SequenceConfig) -> str:
+    """Return the error that the suite of ``trade`` measured for these settings, for ``explain``."""
+    measured = measured_presets()
+    mine = {"timeline": config.timeline.model_dump(), "render": config.render.model_dump()}
+    for name, setting in measured["settings"].items():
+        same = [mine[table].get(key) == setting[table].get(key) for table, keys in COMPARED.items() for key in keys]
+        if all(same) and mine["timeline"]["kind"] == setting["timeline"]["kind"]:
+            rows = [row for scene in measured["scenes"].values() for row in scene["settings"] if row["name"] == name]
+            error, missed, extra = ([100 * row[key] for row in rows] for key in (measured["error"], "missed", "extra"))
+            return (
+                f"{median(missed):.0f} % missed, {median(extra):.0f} % extra, voxel grids {median(error):.0f} % apart "
+                f"({min(error):.0f} to {max(error):.0f} %): medians of {len(rows)} scenes, docs/trade.md; "
+                "blinkgl trade measures it for your scene"
+            )
+    return "not measured for these settings; blinkgl trade measures it for your scene"
+
+
 def _apart(table: str, mine: dict[str, Any], usual: dict[str, Any]) -> list[str]:
     return [
         f"{table}.{key} {_plain(mine[key])} (not {_plain(usual[key])})"
@@ -96,8 +114,11 @@ class Explanation:
     frames: int = 0
     seconds: float = 0.0
     """Wall time of a sequence in a process that has made one before."""
+    processor_s: float = 0.0
+    """Its processor time, which hardly depends on what else the machine does."""
     bytes: int = 0
     seconds_per_simulated_second: float = 0.0
+    """Processor time."""
     sequences: int = 1
     """Sequences of the run or group, which take ``run_seconds`` in one process."""
     run_seconds: float = 0.0
@@ -151,8 +172,8 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
 
 def _priced(result: Explanation, costs: list[Cost], config: SequenceConfig, duration: float) -> Explanation:
     """Return ``result`` with the cost of its sequence of ``duration`` s, and of its run."""
-    result.seconds, result.bytes = mean_cost(costs)
-    result.seconds_per_simulated_second, result.stages = result.seconds / duration, costs[0].stages
+    result.seconds, result.processor_s, result.bytes = mean_cost(costs)
+    result.seconds_per_simulated_second, result.stages = result.processor_s / duration, costs[0].stages
     result.sequences = config.output.sequences
     result.run_seconds = costs[0].seconds + (result.sequences - 1) * result.seconds
     return result
@@ -241,6 +262,7 @@ def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[
         else "none: every surface is unlit",
         **_fog(scene),
         "quality": quality_in_words(config),
+        "error of the events": error_in_words(config),
         "notes": "; ".join(scene.log + nothing_in_view(scene)) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
@@ -386,7 +408,7 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         ("anisotropic filtering", render.anisotropy != 1, "render.anisotropy: 1"),
         ("light", lit, "every material is unlit: no normals in the vertex stream, no light in the shader"),
         ("fog", scene.fog is not None, "scene.fog: null"),
-        ("velocity pass", timeline != "uniform", "timeline: uniform does not look at motion"),
+        ("velocity pass", timeline == "brightness", f"timeline: {timeline} needs none"),
         *(
             (f"{config.events.emulator}: {name}", False, f"events.{name}: {getattr(config.events, name)}".lower())
             for name in zero

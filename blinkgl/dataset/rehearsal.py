@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.gl import GLContext
-from blinkgl.machine.compiling import working_clock
+from blinkgl.machine.compiling import compiled_s
 
 _MOST, _LONG_S, _PART = 12, 8.0, 0.4
 """As many sequences are made to learn the cost, or as take this time; a long one at least for this time and part."""
@@ -20,10 +21,11 @@ _MOST, _LONG_S, _PART = 12, 8.0, 0.4
 
 @dataclass(frozen=True)
 class Cost:
-    """Of a sequence: wall time without compiling, s, bytes, event frames of all cameras, events, seconds by stage, and
-    what was noted of it."""
+    """Of a sequence: wall and processor time without compiling, s, bytes, event frames of all cameras, events, wall
+    seconds by stage, and what was noted of it."""
 
     seconds: float
+    processor_s: float
     bytes: int
     frames: int
     events: int
@@ -31,13 +33,20 @@ class Cost:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, report: SequenceReport, spent: float, folder: str, fraction: float) -> Cost:
-        """Return the cost of a sequence of which a fraction was made; its scene is built once."""
+    def of(cls, report: SequenceReport, began: np.ndarray, folder: str, fraction: float) -> Cost:
+        """Return the cost of a sequence of which a fraction was made; its scene is built once. began : of :func:`_now`
+        at its beginning."""
         once = report.seconds.get("scene", 0.0)
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
         whole = lambda count: round(count / fraction)
-        seconds, frames, events = once + (spent - once) / fraction, whole(report.frames), whole(report.events)
-        return cls(seconds, whole(size), frames, events, dict(report.seconds), report.notes)
+        seconds, processor_s = (float(once + (spent - once) / fraction) for spent in _now() - began)
+        counts = whole(size), whole(report.frames), whole(report.events)
+        return cls(seconds, processor_s, *counts, dict(report.seconds), report.notes)
+
+
+def _now() -> np.ndarray:
+    """Return the wall and the processor clock of this process, s, without compiling, which one thread does."""
+    return np.array([time.perf_counter(), time.process_time()]) - compiled_s()
 
 
 def rehearsals(template: RunTemplate, index: int, count: int, gl: GLContext | None) -> list[Cost]:
@@ -49,9 +58,10 @@ def rehearsals(template: RunTemplate, index: int, count: int, gl: GLContext | No
     return costs
 
 
-def mean_cost(costs: list[Cost]) -> tuple[float, int]:
-    """Return mean seconds, without the first sequence if there are more, and mean bytes."""
-    return float(np.mean([c.seconds for c in costs[1:] or costs])), int(np.mean([c.bytes for c in costs]))
+def mean_cost(costs: list[Cost]) -> tuple[float, float, int]:
+    """Return mean wall and processor seconds, without the first sequence if there are more, and mean bytes."""
+    seconds, processor_s = np.mean([(c.seconds, c.processor_s) for c in costs[1:] or costs], axis=0)
+    return float(seconds), float(processor_s), int(np.mean([c.bytes for c in costs]))
 
 
 class _Enough(Exception):
@@ -59,16 +69,16 @@ class _Enough(Exception):
 
 
 def _rehearsal(template: RunTemplate, index: int, gl: GLContext | None) -> Cost:
-    began = working_clock()
+    began = _now()
 
     def progress(report: SequenceReport, fraction: float) -> None:
-        if (spent := working_clock() - began) > _LONG_S and fraction > _PART:
-            raise _Enough(Cost.of(report, spent, scratch, fraction))
+        if (_now() - began)[0] > _LONG_S and fraction > _PART:
+            raise _Enough(Cost.of(report, began, scratch, fraction))
 
     with tempfile.TemporaryDirectory(prefix="blinkgl-explain-") as scratch:
         try:
             config = template.sequence(index)
             made = generate_sequence(config, index, scratch, gl, base=template.base, progress=progress)
-            return Cost.of(made, working_clock() - began, scratch, 1.0)
+            return Cost.of(made, began, scratch, 1.0)
         except _Enough as enough:
             return enough.args[0]

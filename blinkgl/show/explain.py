@@ -37,8 +37,9 @@ def show(result: Explanation, console: Console) -> None:
     console.print(left)
     say(
         console,
-        f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s and {size(result.bytes)} a sequence "
-        f"({result.seconds_per_simulated_second:.1f} s per simulated second; {shares(result.stages)}; on "
+        f"expected: about {result.frames:,} event frames, {result.processor_s:.1f} s of processor, "
+        f"{result.seconds:.1f} s by the clock as this machine is now and {size(result.bytes)} a sequence "
+        f"({result.seconds_per_simulated_second:.1f} s of processor per simulated second; {shares(result.stages)}; on "
         f"{result.machine}); {result.sequences:,} in one process: "
         f"{clock(result.run_seconds)} and {size(result.sequences * result.bytes)}",
     )

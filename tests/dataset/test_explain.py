@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib import resources
 
 import cv2
 import numpy as np
@@ -11,9 +12,9 @@ import pytest
 import yaml
 from rich.console import Console
 
-from blinkgl.config.run import load_run
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.dataset.executor import Local
-from blinkgl.dataset.explain import explain
+from blinkgl.dataset.explain import error_in_words, explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.show.generate import MAX_NOTES, Display, run
 from tests.scene.gltf_files import GltfBuilder, triangle
@@ -236,3 +237,16 @@ def test_many_files_are_not_a_screenful(tmp_path, capsys):
     said = capsys.readouterr().out.splitlines()
     assert len(said) == MAX_NOTES + 1 and len(set(said)) == len(said)
     assert said[-1] == "note: there are more; the manifests have them under not_drawn and scene_log"
+
+
+@pytest.mark.parametrize("quality", ["fast", "reference"])
+def test_the_error_of_the_setting_is_that_of_the_measured_suite(tmp_path, quality):
+    rows = json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text())
+    name = rows["presets"][quality]
+    errors = [100 * r["voxel"] for scene in rows["scenes"].values() for r in scene["settings"] if r["name"] == name]
+    usual = {key: value for key, value in SMALL.items() if key != "timeline"}
+    words = lambda **changes: error_in_words(RunTemplate({**usual, **changes}, tmp_path).sequence(0))
+    assert f"voxel grids {np.median(errors):.0f} % apart ({min(errors):.0f} to {max(errors):.0f} %)" in words(
+        quality=quality
+    )
+    assert "not measured" in words(timeline={"kind": "uniform", "fps": 77})

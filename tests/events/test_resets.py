@@ -127,7 +127,7 @@ def test_a_jump_that_lasts_into_the_next_is_refused():
 
 
 def test_a_still_davis240c_of_the_voltmeter_is_quiet_from_its_first_frame_on():
-    """Recorded: .005 Hz a pixel. Diffusion brings pixels near their thresholds again and again, and resets take them."""
+    """Recorded: .005 Hz a pixel. Diffusion brings pixels near their thresholds again, and resets carry them over."""
     known = load_sensor("davis240c")
     camera = EventCamera(known.emulator("voltmeter"), known.readout, 120, 160, 1)
     frames = (EventFrame(t * 10 * MS, np.full((120, 160), 0.5, np.float32)) for t in range(51))

@@ -46,6 +46,7 @@ PICTURES = {
 ORDER = (
     "scene_in_python",
     "living_scene",
+    "star_field",
     "frame_with_labels",
     "own_label",
     "own_trajectory",

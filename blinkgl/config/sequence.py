@@ -145,7 +145,8 @@ class RenderConfig(Config):
         "none",
         description="event frames. taps4: filters textures (4 lookups per pixel); edges: filters silhouettes, "
         "too, by surface area, and its lookups follow the foreshortening; edges2: edges at 2 x 2 "
-        "resolution; ssaa2 and ssaa4: averages 2 x 2 and 4 x 4 samples. Labels are never filtered. "
+        "resolution; both are ssaa4 in a scene whose outlines crowd; ssaa2 and ssaa4: averages 2 x 2 and 4 x 4 "
+        "samples. Labels are never filtered. "
         "Costs: docs/trade.md",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")

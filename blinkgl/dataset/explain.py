@@ -262,6 +262,7 @@ def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[
         else "none: every surface is unlit",
         **_fog(scene),
         "quality": quality_in_words(config),
+        **({"anti-aliasing": f"{renderer.antialiasing}: {renderer.crowded}"} if renderer.crowded else {}),
         "error of the events": error_in_words(config),
         "notes": "; ".join(scene.log + nothing_in_view(scene)) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),

@@ -154,6 +154,23 @@ class Lines:
         pixels = _by_pixel(self._crossings[:count], self._places, width, self._counts, self._pixels, self._sorted)
         return self._pixels[:pixels], self._sorted[:count]
 
+    def tangled(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> float:
+        """Return the share of the picture's pixels in which three silhouettes cross, or two at depths that differ by
+        more than :data:`_APART`, hidden ones included: which surfaces they divide is a guess (edges.glsl)."""
+        pixels, crossings = self.in_pixels(moment, items, width, height)
+        first = np.sort(pixels[:, 2])
+        if not len(first):
+            return 0.0
+        outline, depth = crossings[:, 6] < 0.5, crossings[:, 3].astype(np.float64)
+        count = np.add.reduceat(outline.astype(np.int64), first)
+        nearest = np.maximum.reduceat(np.where(outline, depth, 0.0), first)
+        farthest = np.minimum.reduceat(np.where(outline, depth, np.inf), first)
+        return float(np.count_nonzero((count > 2) | ((count == 2) & (nearest > _APART * farthest)))) / (width * height)
+
+
+_APART = 1.05
+"""Ratio of depths, near / Z, of two surfaces that are not one."""
+
 
 @kernel
 def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):

@@ -209,11 +209,31 @@ class Moment:
         order = np.lexsort((nearest, stage.item_layer))
         return [stage.items[i] for i in order[inside[order]]]
 
+    def specks(self, grid: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest ``most`` bodies whose bounding sphere is under :data:`SPECK` samples of a picture of
+        ``grid`` samples per pixel in x and y, front to back: (k,) int64 and (k, 4) float64, the sphere's middle, from
+        the picture's corner, and its diameter, in samples, and its depth (near / Z), the nearest point's."""
+        stage, camera, P = self._stage, self.view.camera, self.view.projection
+        T, radius = self.T_cam_obj, stage.body_radius
+        X, Y, Z = ((T[:, :3, :3] @ stage.body_centre[..., None])[..., 0] + T[:, :3, 3]).T
+        near = np.maximum(Z - radius, camera.near)
+        per_px = grid * camera.width * abs(P[0, 0])  # samples of a unit at distance 1, twice
+        small = np.flatnonzero((camera.near < Z) & (radius * per_px < SPECK * near))
+        small = small[np.argsort(near[small])]
+        X, Y, Z, near, radius = X[small], Y[small], Z[small], near[small], radius[small]
+        x, y = (P[k, k] * v / Z + P[k, 2] for k, v in enumerate((X, Y)))
+        seen = np.flatnonzero((np.abs(x) <= 1) & (np.abs(y) <= 1))
+        width, height = grid * camera.width, grid * camera.height
+        places = np.column_stack([(x + 1) / 2 * width, (y + 1) / 2 * height, radius * per_px / Z, camera.near / near])
+        return small[seen][:most], places[seen][:most]
+
     def parts_of(self, object_index: int) -> list[DrawItem]:
         """Return all items of one object, visible or not."""
         return self._stage.parts[object_index]
 
 
+SPECK = 1.5
+"""Samples; a larger body's own outline is right, its lines and the centres that it meets."""
 _OF_THE_PLACE = ("T_cam_obj", "dT_world_cam", "centres")
 
 
@@ -230,6 +250,12 @@ class Stage:
         self.parts: dict[int, list[DrawItem]] = {}
         for item in items:
             self.parts.setdefault(item.object_index, []).append(item)
+        # Bounding spheres of whole bodies; those of sky, ground and walls have no end.
+        self.body_centre, self.body_radius = np.zeros((len(scene.objects), 3)), np.full(len(scene.objects), np.inf)
+        for body, parts in self.parts.items():
+            if all(part.layer == 0 for part in parts):
+                self.body_centre[body] = middle = np.mean([part.centre for part in parts], axis=0)
+                self.body_radius[body] = max(np.linalg.norm(part.centre - middle) + part.radius for part in parts)
 
 
 class Bodies:

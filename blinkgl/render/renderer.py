@@ -27,6 +27,7 @@ from blinkgl.machine.closing import Releasing
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, StillCanvas
+from blinkgl.render.crowding import CROWDED_AS, crowding
 from blinkgl.render.draw_items import DrawItem
 from blinkgl.render.frames import Frame
 from blinkgl.render.labels import DrawnLabel, Seen
@@ -85,7 +86,7 @@ class Renderer(Releasing):
             scene = without_collapsed_faces(scene)
         self.gl, self.scene, self.config, self.stats = gl, scene, config, RenderStats()
         self.width, self.height = scene.camera.width, scene.camera.height
-        self._samples = samples_of(config.antialiasing)
+        samples = samples_of(config.antialiasing)
         self._image_samples = samples_of(config.image_antialiasing, "render.image_antialiasing")
         self._beside = beside
         resources = (
@@ -112,7 +113,30 @@ class Renderer(Releasing):
             self._shadows = shadow_maps(scene, self.items) if beside is None else beside._shadows  # noqa: SLF001
         # The shadow of a moving object also changes surfaces at rest.
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
-        self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand)
+        # A body under a pixel moves without a rectangle of its own.
+        self._specks = self._most_specks(samples.grid) if samples.shared else 0
+        stands = scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand and not self._specks
+        self.whole = whole or not stands
+
+    @property
+    def antialiasing(self) -> str:
+        """Return the anti-aliasing of event frames: the configured one, but :data:`CROWDED_AS` for ``edges`` and
+        ``edges2`` where outlines crowd."""
+        return CROWDED_AS if self.crowded else self.config.antialiasing
+
+    @cached_property
+    def crowded(self) -> str:
+        """Return why event frames are drawn with samples although ``edges`` was asked for, in words; "": they are
+        not (:func:`crowding`)."""
+        edges = samples_of(self.config.antialiasing).edges
+        return crowding(self, self._painter.line_drawer.lines) if edges else ""
+
+    def _most_specks(self, grid: int) -> int:
+        """Return how many bodies under a pixel get their light by their area: half more than at the
+        busiest time."""
+        times = np.linspace(self.scene.t0_ns, self.scene.t1_ns, _LOOKS).astype(np.int64)
+        most = max(len(self.moment(int(t)).specks(grid, _MOST_SPECKS)[0]) for t in times)
+        return min(most + most // 2 + (most > 0), _MOST_SPECKS)
 
     def release(self) -> None:
         if self.gl.released:  # everything was released with the context
@@ -227,7 +251,8 @@ class Renderer(Releasing):
 
     def luminance(self, t_ns: int) -> Frame:
         """Return linear luminance at t_ns, (H, W) float32."""
-        return self.draw(self.seen(Luminance(self._samples, self._shadows), smooth=True), t_ns)
+        samples = samples_of(self.antialiasing)
+        return self.draw(self.seen(Luminance(samples, self._shadows, self._specks), smooth=True), t_ns)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
         """Return luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures
@@ -278,6 +303,11 @@ class Renderer(Releasing):
         return self._labels_in(None).shown_at(x, y, t_ns)
 
 
+_LOOKS = 64
+"""Times at which a scene is searched for bodies under a pixel."""
+_MOST_SPECKS = 32_000
+"""Bodies under a pixel that get their light by their area; of more, the farthest are drawn as larger ones are. Their
+portraits (passes/specks.py) fill the largest texture that every OpenGL 4.3 has."""
 KEPT = 3
 """Number of times whose buffers are kept: neighbouring labels use the same moments."""
 

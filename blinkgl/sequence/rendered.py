@@ -227,6 +227,12 @@ class RenderedSequence(SensorSimulation):
         rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
         return track_points(scene, config, times, rng)
 
+    def _crowded(self) -> dict[str, Any]:
+        """Return the manifest's entry on event frames that are drawn with samples, for all their lines."""
+        if self.timeline is None or self.renderer.antialiasing == self.config.render.antialiasing:
+            return {}
+        return {"antialiasing": {"drawn": self.renderer.antialiasing, "because": self.renderer.crowded}}
+
     def _facts_of_labels(self) -> dict[str, Any]:
         labels, facts = self.config.labels, {}
         for name in asked_for(labels):
@@ -247,6 +253,7 @@ class RenderedSequence(SensorSimulation):
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
             "timeline": {"kind": self.config.timeline.kind},
             "triangles": self.triangles,
+            **self._crowded(),
             "objects": [_described(o) for o in scene.objects],
             **self._facts_of_labels(),
             "scene_log": list(scene.log),

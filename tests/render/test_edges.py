@@ -14,7 +14,7 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.contours import CROSSING, LINE, Lines
 from blinkgl.render.mesh_edges import Contour
-from blinkgl.render.passes import Luminance
+from blinkgl.render.passes import Luminance, filtered
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
@@ -456,7 +456,7 @@ def filtered_twice(gl, world, t_ns: int) -> tuple[np.ndarray, np.ndarray, np.nda
         moment = renderer.moment(t_ns)
         pixels, crossings = Lines().in_pixels(moment, moment.visible, renderer.width, renderer.height)
         focal = 0.5 * renderer.width * abs(moment.view.projection[0, 0])
-        written = renderer.luminance(t_ns).read()
+        written = renderer.draw(filtered(Luminance(samples_of("edges"))), t_ns).read()
         return picture, written, filtered_slowly(picture, depths, pixels, crossings, 1 / focal, written)
 
 

@@ -6,11 +6,12 @@ Start: base.py, then luminance.py.
 """
 
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
-from blinkgl.render.passes.edged import Edged, filtered
-from blinkgl.render.passes.gather import Gather, one_value
+from blinkgl.render.passes.edged import Edged
+from blinkgl.render.passes.gather import Gather
 from blinkgl.render.passes.geometry import Geometry, Velocity
 from blinkgl.render.passes.luminance import Brightness, Colour, Luminance, Mean
 from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
+from blinkgl.render.passes.specks import Portraits, Specks, filtered, one_value
 
 PASSES: tuple[type[Pass], ...] = (
     Luminance,
@@ -20,6 +21,8 @@ PASSES: tuple[type[Pass], ...] = (
     Geometry,
     Mean,
     Edged,
+    Portraits,
+    Specks,
     Gather,
     ShadowMap,
 )
@@ -37,11 +40,13 @@ __all__ = [
     "Mean",
     "Output",
     "Pass",
+    "Portraits",
     "ScenePass",
     "ScreenPass",
     "Shaded",
     "ShadowMap",
     "Shot",
+    "Specks",
     "Velocity",
     "filtered",
     "one_value",

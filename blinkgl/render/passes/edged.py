@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.frames import DEPTH_BUFFER, Rectangle, merged
-from blinkgl.render.passes.base import Input, Output, Pass, Shot
-from blinkgl.render.passes.luminance import Mean
+from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
@@ -69,7 +68,8 @@ class Edged(Pass):
         # Pixels without an edge keep their value.
         shot.inputs["picture"].target.copy_into(shot.target)
         moment, drawer = shot.moment, painter.line_drawer
-        drawn = [item for item in (moment.visible if items is None else items) if item.layer != SKY]
+        shown = self.of.items(moment) if isinstance(self.of, ScenePass) else moment.visible
+        drawn = [item for item in (shown if items is None else items) if item.layer != SKY]
         drawer.upload(moment, drawn, *shot.size)
         uniforms, array = drawer.program(self.program, self.defines(None))
         # The picture has no edges.
@@ -89,9 +89,3 @@ class Edged(Pass):
 
         edges = Samples(taps=4, edges=True)
         return (cls(of) for of in (Luminance(edges), Colour(edges)))
-
-
-def filtered(pass_: Pass) -> Pass:
-    """Return a pass with one value per pixel: ``pass_`` with its edges filtered, the mean of its samples."""
-    sharp = Edged(pass_) if pass_.samples.edges else pass_
-    return sharp if pass_.samples.stored == 1 else Mean(sharp)

@@ -14,7 +14,6 @@ from blinkgl.labels import LABELS
 from blinkgl.render.frames import Rectangle
 from blinkgl.render.lens import steps_of
 from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
-from blinkgl.render.passes.edged import Edged
 from blinkgl.render.passes.geometry import Geometry, Velocity
 from blinkgl.render.passes.luminance import Colour
 
@@ -89,9 +88,3 @@ class Gather(ScreenPass):
         drawn = tuple(name for name, label in LABELS.items() if label.buffer)[:8]
         yield cls(Geometry(drawn, lens.shader), lens)
         yield cls(Velocity(4, lens=lens.shader), lens)
-
-
-def one_value(pass_: Pass) -> Pass:
-    """Return ``pass_`` with its edges filtered but without the mean of a finer grid: a gathering pass computes a mean
-    anyway."""
-    return Edged(pass_) if pass_.samples.edges else pass_

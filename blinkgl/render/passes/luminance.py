@@ -18,10 +18,13 @@ from blinkgl.scene.types import Scene
 if TYPE_CHECKING:
     from blinkgl.gl.shader import Uniforms
     from blinkgl.render.draw_items import DrawItem, Kind
+    from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter
 
 
-class _Luminance(Shaded):
+class LuminancePass(Shaded):
+    """A pass that draws the scene's luminance."""
+
     program: ClassVar[str] = "luminance.glsl"
     one_channel: ClassVar[bool] = True
 
@@ -49,14 +52,26 @@ class _Luminance(Shaded):
 
 
 @dataclass(frozen=True)
-class Luminance(_Luminance):
-    """Output "luminance", (H, W) float32, at ``samples``."""
+class Luminance(LuminancePass):
+    """Output "luminance", (H, W) float32, at ``samples``.   specks : as many bodies under a pixel are left
+    out, for :class:`~blinkgl.render.passes.specks.Specks`."""
 
     samples: Samples = Samples()
     shadows: tuple[ShadowMap, ...] = ()
+    specks: int = 0
     still: ClassVar[bool] = True
 
     outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)
+
+    @property
+    def depth(self) -> bool | str:
+        return "texture" if self.specks else super().depth
+
+    def items(self, moment: Moment) -> list[DrawItem]:
+        if not self.specks:
+            return moment.visible
+        apart = set(moment.specks(self.samples.grid, self.specks)[0].tolist())
+        return [item for item in moment.visible if item.object_index not in apart]
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         # Taps are for textures; a uniform colour needs none.
@@ -70,7 +85,7 @@ class Luminance(_Luminance):
 
 
 @dataclass(frozen=True)
-class Brightness(_Luminance):
+class Brightness(LuminancePass):
     """Output "brightness", (h, w, 2) float32: luminance and its rate per second on every n-th pixel in x and y,
     textures filtered as for the whole image."""
 

@@ -27,6 +27,7 @@ def test_everything_compiles(shader):
         "label.glsl": 140,
         "luminance.glsl": 410,
         "shadow.glsl": 28,
+        "specks.glsl": 1,
         "velocity.glsl": 84,
     }
 

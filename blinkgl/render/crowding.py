@@ -1,0 +1,61 @@
+"""Scenes whose outlines crowd: where several surfaces share many pixels, or masks cut holes, lines alone do not say
+what a pixel shows, and filtering them invents events. Such a scene is drawn with samples (docs/trade.md)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from blinkgl.render.contours import Lines
+    from blinkgl.render.draw_items import DrawItem
+    from blinkgl.render.moment import Moment
+    from blinkgl.render.renderer import Renderer
+
+CROWDED_AS = "ssaa4"
+"""Anti-aliasing of such a scene; at equal cost it has less error there than either ``edges`` or ``edges2``."""
+_LOOKS = 5
+"""Times at which a scene is looked at."""
+_TANGLED, _HOLED = 0.03, 0.03
+"""Shares of the picture from which on outlines crowd: pixels with the lines of several surfaces, and masked surfaces.
+Scenes that ``edges`` draws well have at most 0.025 tangled pixels, those that it draws badly 0.05 and more."""
+_SKY = 2
+
+
+def crowding(renderer: Renderer, lines: Lines) -> str:
+    """Return why a scene is drawn with samples, in words; "" where its lines suffice. lines : of its contours."""
+    scene, size = renderer.scene, (renderer.width, renderer.height)
+    times = np.linspace(scene.t0_ns, scene.t1_ns, _LOOKS).astype(np.int64)
+    moments = [renderer.moment(int(t_ns)) for t_ns in times]
+    bodies = [_outlined(moment) for moment in moments]
+    holed = np.mean([_masked(moment, items, *size) for moment, items in zip(moments, bodies)])
+    if holed >= _HOLED:
+        return f"masked surfaces fill {100 * holed:.0f} % of the picture"
+    tangled = np.mean([lines.tangled(moment, items, *size) for moment, items in zip(moments, bodies)])
+    return f"outlines of several surfaces cross in {100 * tangled:.0f} % of the pixels" if tangled >= _TANGLED else ""
+
+
+def _outlined(moment: Moment) -> list[DrawItem]:
+    """Return what is drawn with its outlines: neither the sky nor a body under a pixel."""
+    specks = set(moment.specks(1, len(moment.T_world_obj))[0].tolist())
+    return [item for item in moment.visible if item.layer != _SKY and item.object_index not in specks]
+
+
+def _masked(moment: Moment, items: list[DrawItem], width: int, height: int) -> float:
+    """Return the area of masked surfaces before the camera as a share of the picture's, at most 1: their triangles',
+    of which all corners are in front of it, hidden ones included."""
+    area = 0.0
+    for item in items:
+        if item.material.mask is None:
+            continue
+        vertices = item.mesh.vertices
+        clip = vertices @ moment.mvp[item.object_index][:, :3].T + moment.mvp[item.object_index][:, 3]
+        ahead = np.all(clip[item.mesh.faces, 3] > moment.view.camera.near, axis=1)
+        # Beyond the picture's edges there is no area.
+        flat = np.clip(clip[:, :2] / np.where(clip[:, 3:] > 0, clip[:, 3:], 1.0), -1.0, 1.0)
+        a, b, c = np.moveaxis(flat[item.mesh.faces[ahead]], 1, 0)
+        u, v = b - a, c - a
+        # NDC has an area of 4.
+        area += 0.125 * float(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum())
+    return min(area, 1.0)

@@ -3,6 +3,7 @@ what a pixel shows, and filtering them invents events. Such a scene is drawn wit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,23 +12,20 @@ if TYPE_CHECKING:
     from blinkgl.render.contours import Lines
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
-    from blinkgl.render.renderer import Renderer
 
 CROWDED_AS = "ssaa4"
 """Anti-aliasing of such a scene; at equal cost it has less error there than either ``edges`` or ``edges2``."""
-_LOOKS = 5
-"""Times at which a scene is looked at."""
 _TANGLED, _HOLED = 0.03, 0.03
 """Shares of the picture from which on outlines crowd: pixels with the lines of several surfaces, and masked surfaces.
 Scenes that ``edges`` draws well have at most 0.025 tangled pixels, those that it draws badly 0.05 and more."""
 _SKY = 2
 
 
-def crowding(renderer: Renderer, lines: Lines) -> str:
-    """Return why a scene is drawn with samples, in words; "" where its lines suffice. lines : of its contours."""
-    scene, size = renderer.scene, (renderer.width, renderer.height)
-    times = np.linspace(scene.t0_ns, scene.t1_ns, _LOOKS).astype(np.int64)
-    moments = [renderer.moment(int(t_ns)) for t_ns in times]
+def crowding(moments: Sequence[Moment], lines: Lines, width: int, height: int) -> str:
+    """Return why a scene is drawn with samples, in words; "" where its lines suffice.
+
+    moments : some, of the whole sequence.   lines : of its contours.   width, height : of the picture, px."""
+    size = width, height
     bodies = [_outlined(moment) for moment in moments]
     holed = np.mean([_masked(moment, items, *size) for moment, items in zip(moments, bodies)])
     if holed >= _HOLED:

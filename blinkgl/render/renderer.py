@@ -128,14 +128,19 @@ class Renderer(Releasing):
     def crowded(self) -> str:
         """Return why event frames are drawn with samples although ``edges`` was asked for, in words; "": they are
         not (:func:`crowding`)."""
-        edges = samples_of(self.config.antialiasing).edges
-        return crowding(self, self._painter.line_drawer.lines) if edges else ""
+        if not samples_of(self.config.antialiasing).edges:
+            return ""
+        moments = [self.moment(t_ns) for t_ns in self._some_times(_CROWD_LOOKS)]
+        return crowding(moments, self._painter.line_drawer.lines, self.width, self.height)
+
+    def _some_times(self, count: int) -> list[int]:
+        """Return evenly spaced times of the scene, ns, its ends among them."""
+        return np.linspace(self.scene.t0_ns, self.scene.t1_ns, count).astype(np.int64).tolist()
 
     def _most_specks(self, grid: int) -> int:
         """Return how many bodies under a pixel get their light by their area: half more than at the
         busiest time."""
-        times = np.linspace(self.scene.t0_ns, self.scene.t1_ns, _LOOKS).astype(np.int64)
-        most = max(len(self.moment(int(t)).specks(grid, _MOST_SPECKS)[0]) for t in times)
+        most = max(len(self.moment(t_ns).specks(grid, _MOST_SPECKS)[0]) for t_ns in self._some_times(_SPECK_LOOKS))
         return min(most + most // 2 + (most > 0), _MOST_SPECKS)
 
     def release(self) -> None:
@@ -303,8 +308,8 @@ class Renderer(Releasing):
         return self._labels_in(None).shown_at(x, y, t_ns)
 
 
-_LOOKS = 64
-"""Times at which a scene is searched for bodies under a pixel."""
+_SPECK_LOOKS, _CROWD_LOOKS = 64, 5
+"""Times at which a scene is searched for bodies under a pixel, and for outlines that crowd."""
 _MOST_SPECKS = 32_000
 """Bodies under a pixel that get their light by their area; of more, the farthest are drawn as larger ones are. Their
 portraits (passes/specks.py) fill the largest texture that every OpenGL 4.3 has."""

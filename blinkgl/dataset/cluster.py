@@ -232,6 +232,7 @@ class RayCluster:
 
     def _news(self) -> list[Message]:
         try:
+            assert self._board is not None
             return self._ray.get(self._board.take.remote(), timeout=2.0)
         except Exception:  # noqa: BLE001 - progress is a courtesy
             return []
@@ -304,6 +305,7 @@ def _work(
                 return {"kind": "refused", "error": f"node {socket.gethostname()} finds other meshes or textures"}
     except BlinkGLError as error:
         return {"kind": "refused", "error": str(error)}
+    assert _maker is not None
     return _maker.make(task, attempt, board.put.remote)
 
 

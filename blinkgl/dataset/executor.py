@@ -80,6 +80,7 @@ class Inline:
     def poll(self, timeout_s: float) -> list[Message]:
         if self._next is None:
             return []
+        assert self._maker is not None, "a task is submitted after open"
         (task, attempt), self._next = self._next, None
         return [self._maker.make(task, attempt, self.listener)]
 
@@ -226,7 +227,8 @@ class _Process:
 
     def __init__(self, slot: int, log: Path, environment: dict[str, str]):
         self.slot, self.log = slot, log
-        self.ready, self.task, self.reason = False, None, ""
+        self.ready, self.reason = False, ""
+        self.task: int | None = None
         # Bytes after the last newline: a message may arrive in two reads.
         self._rest = b""
         # Messages have their own pipe: libraries and drivers print to standard output, which is the log.
@@ -247,13 +249,15 @@ class _Process:
                 env=environment,
                 start_new_session=True,
             )
+        assert self.popen.stdin is not None
+        self._orders = self.popen.stdin
         # The child has its copy. With ours open the channel would never end.
         os.close(write_end)
 
     def send(self, order: dict) -> None:
         try:
-            self.popen.stdin.write(json.dumps(order).encode() + b"\n")
-            self.popen.stdin.flush()
+            self._orders.write(json.dumps(order).encode() + b"\n")
+            self._orders.flush()
         except OSError:  # it died just now; the end of its channel will be seen
             pass
 
@@ -268,7 +272,7 @@ class _Process:
             # The signal interrupts a sequence in progress; the closed input ends a waiting worker.
             self.popen.terminate()
         try:
-            self.popen.stdin.close()
+            self._orders.close()
         except OSError:
             pass
 
@@ -279,7 +283,7 @@ class _Process:
 
     def close(self) -> None:
         try:
-            self.popen.stdin.close()
+            self._orders.close()
         except OSError:
             pass
         os.close(self.channel)

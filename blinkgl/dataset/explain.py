@@ -28,7 +28,7 @@ from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import SequenceRequest, simulate_sequence
-from blinkgl.sequence.recorded import RECORDED
+from blinkgl.sequence.recorded import RECORDED, RecordedSequence
 from blinkgl.sequence.rendered import nothing_in_view
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -191,8 +191,8 @@ def _join(result: Explanation, name: str, one: Explanation) -> None:
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path, cost: Cost, result: Explanation) -> float:
     """Explain a sequence of recorded frames, of which nothing is rendered; return its duration, s."""
-    frames = config.frames
-    probe = simulate_sequence(SequenceRequest(config, index, base, labels=False)).alone
+    frames, probe = config.frames, simulate_sequence(SequenceRequest(config, index, base, labels=False)).alone
+    assert frames is not None and isinstance(probe, RecordedSequence)
     files, flows, masks, way = probe.files, probe.flow.files, probe.flow.masks, probe.flow.direction
     duration = (len(files) - 1) / frames.fps
     between = {
@@ -279,7 +279,7 @@ def _shining(light: Light) -> str:
     """Return the lights in words."""
     if light.plain:
         return "sun and sky"
-    count = Counter(lamp.kind for lamp in lamps_of(light))
+    count: Counter[str] = Counter(lamp.kind for lamp in lamps_of(light))
     words = {"sun": "sun", "point": "point light", "spot": "spot light"}
     names = [f"{count[kind]} {word}{'s' * (count[kind] > 1)}" for kind, word in words.items() if count[kind]]
     if light.sky:

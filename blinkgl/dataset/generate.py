@@ -216,7 +216,7 @@ def write_end(writer: SequenceWriter, sequence: SensorSimulation) -> None:
             writer.arrays(POSES, **poses)
         if (camera := sequence.lens) is not None:
             write_lens(writer, camera)
-        if (inertial := sequence.imu()) is not None:
+        if (inertial := sequence.imu()) is not None and sequence.config.imu is not None:
             writer.imu(sequence.config.imu, vars(inertial))
         if (tracks := sequence.tracks()) is not None:
             writer.arrays(TRACKS, **vars(tracks))

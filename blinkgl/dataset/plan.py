@@ -78,7 +78,7 @@ class Tasks(Sequence[Task]):
         """Return the number of the task with this name; None when the run has no such sequence."""
         matched = _NUMBERED.fullmatch(name)
         part = self._by_prefix.get(matched.group(1)) if matched else None
-        if part is None:
+        if matched is None or part is None:
             return None
         _, output, first, count = self._parts[part]
         index = int(matched.group(2))

@@ -234,7 +234,8 @@ def failed(number: int, error: Exception) -> Message:
 
 def report_of(message: Message) -> SequenceReport:
     """Return the report in a "done" message."""
-    return SequenceReport(**{**message["report"], "path": Path(message["report"]["path"])})
+    report: dict[str, Any] = {**message["report"], "path": Path(message["report"]["path"])}
+    return SequenceReport(**report)
 
 
 def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
@@ -283,11 +284,12 @@ def _code() -> dict[str, str]:
 
 def _disk_is_full(error: BaseException) -> bool:
     """Return whether the next sequence would fail in the same way: no space, no permission, a read-only file system."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
             return True
-        if isinstance(error, OutputError) and "no space" in error.problem:
+        if isinstance(cause, OutputError) and "no space" in cause.problem:
             return True
-        error = error.__cause__
+        cause = cause.__cause__
     # The operating system's error is often the cause of a BlinkGLError.
     return False

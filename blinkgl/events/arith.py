@@ -225,9 +225,9 @@ def _exp_reduced(r):
 
 
 @register_jitable
-def exp_f64(v: float) -> float:
+def exp_f64(v: Number) -> Number:
     """Return exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it is exp(-700) ~ 1e-304."""
-    v = np.maximum(v, _EXP_MIN_64)
+    v = np.maximum(v, _EXP_MIN_64)  # type: ignore[bad-assignment]
     # As exp_f32: e^v = 2^n e^r, n ln 2 in two parts, and 2^n straight into the exponent field.
     n = (v * _LOG2E_64 + _ROUND_64) - _ROUND_64
     r = (v - n * _LN2_HI_64) - n * _LN2_LO_64

@@ -72,7 +72,7 @@ class Emulator(ABC):
     """Whether a pixel whose luminance does not change has no events and no changing state. A subclass whose
     :meth:`_advance` is its own, and may change the frames, says it anew."""
 
-    _state: tuple[str, ...] = ()
+    _state: ClassVar[tuple[str, ...]] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -82,12 +82,12 @@ class Emulator(ABC):
 
     @classmethod
     @abstractmethod
-    def response(cls, config: EmulatorConfig) -> Response:
+    def response(cls, config: Any) -> Response:
         """Return how luminance becomes the signal that timelines watch, and the signal's change per event."""
 
     @classmethod
     @abstractmethod
-    def noiseless(cls, config: EmulatorConfig) -> EmulatorConfig:
+    def noiseless(cls, config: Any) -> EmulatorConfig:
         """Return the configuration without noise and bandwidth limit, of this or another emulator; `trade` compares its
         events."""
 

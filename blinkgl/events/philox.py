@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
@@ -70,7 +70,7 @@ def philox4x32(c0: Word, c1: Word, c2: Word, c3: Word, k0: Word, k1: Word) -> tu
 
 
 @register_jitable(inline="always")
-def uniform2(seed: Word, pixel: Word, stream: Word, index: Word) -> tuple[np.ndarray, np.ndarray]:
+def uniform2(seed: Word, pixel: Word, stream: Word, index: Word) -> tuple[Any, Any]:
     """Return two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of
     it)."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
@@ -83,7 +83,7 @@ def normal2(seed: Word, pixel: Word, stream: Word, index: Word) -> tuple[np.ndar
     """Return two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(seed, pixel, stream, index)
     # Box and Muller: radius sqrt(-2 ln u), angle 2 pi v. u is never 0.
-    radius = np.sqrt(_MINUS2 * log_f64(u))
+    radius = np.sqrt(_MINUS2 * log_f64(u))  # type: ignore[bad-specialization]
     c, s = cos_sin_turn(v)
     return radius * c, radius * s
 
@@ -109,7 +109,7 @@ def normal2_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple
     # Words 0 and 1 give the 53 bits of the radius, word 2 the angle, word 3 the spare uniform.
     u = ((((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
     c, s = cos_sin_turn((w2 + _HALF) * _ULP32)
-    radius = np.sqrt(_MINUS2 * log_f64(u))
+    radius = np.sqrt(_MINUS2 * log_f64(u))  # type: ignore[bad-specialization]
     return radius * c, radius * s, (w3 + _HALF) * _ULP32
 
 

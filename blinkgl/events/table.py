@@ -66,7 +66,8 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
 
 def make_emulator(config: EmulatorConfig, height: int, width: int, seed: int = 0) -> Emulator:
     """Return the emulator of a configuration, on the CPU. Raises EventDataError: a size out of range."""
-    return emulator_of(config)(height, width, config, seed)
+    made: Callable[..., Emulator] = emulator_of(config)
+    return made(height, width, config, seed)
 
 
 def _checked(emulator: Any) -> str:
@@ -85,7 +86,7 @@ def _checked(emulator: Any) -> str:
         except Exception as error:
             raise TypeError(f"emulator {name}: `{part}` fails: {error}") from error
 
-    model = getattr(emulator, "Config", None)
+    model: Any = getattr(emulator, "Config", None)
     unless(model is not None, "Config", "is missing")
     unless(
         isinstance(model, type) and issubclass(model, EmulatorConfig) and model is not EmulatorConfig,

@@ -45,7 +45,8 @@ def take_part(taken: np.ndarray, start: int) -> int:
         # Threads begin at different parts, so they rarely ask for the same one.
         part = (start + k) % taken.size
         # The plain read spares the atomic exchange for parts that are taken already.
-        if taken[part] == 0 and _exchange(taken, part, 1) == 0:
+        # (an intrinsic's first parameter is numba's own)
+        if taken[part] == 0 and _exchange(taken, part, 1) == 0:  # type: ignore[missing-argument]
             return part
     return -1
 
@@ -57,7 +58,8 @@ class _Job:
         self._kernel, self._arguments, self._threads = kernel, arguments, threads
         self._taken = np.zeros(parts, np.int64)
         self._lock, self._all_out = threading.Lock(), threading.Lock()
-        self._inside, self._helped, self._closed, self._error = 0, 0, False, None
+        self._inside, self._helped, self._closed = 0, 0, False
+        self._error: BaseException | None = None
         # This lock is released by the last helper that leaves after the work is closed.
         self._all_out.acquire()
 

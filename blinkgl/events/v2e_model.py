@@ -276,8 +276,9 @@ def _start_of(
     # between: mean time from one event to the next, s.
     between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)
     leak = leak.copy()
+    mean = on[moving].astype(np.float64) / leak[moving] if leak.size else np.empty(0)
     if moving.size:
-        rate, mean = shot[moving], on[moving].astype(np.float64) / leak[moving]
+        rate = shot[moving]
         # The mean time to the next event, of leak after T or shot noise before it: (1 - e^-RT)/R = T (1
         # - e^-q)/q, q = R T.
         weight = lambda time: time * _one_minus_exp_over(rate * time)
@@ -297,7 +298,7 @@ def _start_of(
     if noise.size:
         # Where noise fires more often than leak: the rung next to its mean, or the last one that the noise has passed.
         often = np.ones(len(on), bool)
-        often[moving] = mean * config.shot_noise_rate_hz > 1.0 if moving.size else False
+        often[moving] = mean * config.shot_noise_rate_hz > 1.0
         corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
         place = start_places(config.shot_noise_rate_hz, corner, first) * np.where(first > 0.5, on, off)
         # Rungs, one threshold apart, that the noise has passed upwards and downwards.

@@ -16,7 +16,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.events.arith import exp_f64, log_f64
-from blinkgl.events.philox import normal2, uniform2
+from blinkgl.events.philox import Word, normal2, uniform2
 from blinkgl.machine.kernels import kernel
 from blinkgl.srgb import linear_from_srgb, srgb_from_linear
 
@@ -55,7 +55,7 @@ def _log_factorial(k):
 
 
 @register_jitable
-def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
+def poisson(mean: float, seed: Word, pixel: Word, index: Word) -> float:
     """Return a Poisson distributed number with mean >= 0, as float64; it depends only on (seed, pixel, index).
 
     For a small mean the distribution is summed, otherwise transformed rejection with squeeze (Hoermann, "The

@@ -43,6 +43,7 @@ class FlowTo(Label):
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
         # Matrices are subtracted in float64, of clip space the rows x, y and w, so that a still scene has
         # exactly no flow.
+        assert self.towards is not None
         return {f"difference_{self.towards}": (shot.ends[self.towards].mvp - shot.moment.mvp)[:, [0, 1, 3]]}
 
     def finish(self, drawn: Drawn) -> Flow:
@@ -99,7 +100,7 @@ class FlowTo(Label):
         )
 
     def _of(self, frame, what: str) -> np.ndarray:
-        true = getattr(frame, self.towards)
+        true = frame.forward if self.towards == "forward" else frame.backward
         return true.valid if what == "valid" else np.where(true.valid[..., None], true.flow, 0.0)
 
 

@@ -42,6 +42,7 @@ class OcclusionAt(Label):
     @property
     def views(self) -> tuple[View, ...]:
         way = self.towards
+        assert way is not None
         return (
             View(
                 f"occluded_{way}",

@@ -59,7 +59,7 @@ def _checked(label: Any) -> None:
     if _has_own_key(label):
         unless(name not in LabelsConfig.settings, "name", "is taken: `labels:` has such a key for something else")
         new = name not in LabelsConfig.model_fields
-        unless(not new or not hasattr(LabelsConfig, name), "name", "cannot be a key")
+        unless(not new or not hasattr(LabelsConfig, str(name)), "name", "cannot be a key")
         unless(not new or bool(label.about), "about", "is missing")
     unless(label.kind in KINDS, "kind", f"is {label.kind!r} and none of {', '.join(KINDS)}")
     _check_drawing(label, unless)

@@ -30,12 +30,13 @@ class SlotMaker(Maker):
     """Makes slots: ``samples`` files each in the spool folder. The "done" reports the number of sequences
     ("sequences"), how many failed ("failures"), and the last error ("last")."""
 
-    job: StreamJob
+    job: StreamJob  # type: ignore[bad-override-mutable-attribute]
 
     @classmethod
     def of(cls, job: Mapping[str, Any], device: int | None) -> SlotMaker:
         window = job["window_us"]
-        return cls(StreamJob(**{**job, "window_us": None if window is None else tuple(window)}), device)
+        keys: dict[str, Any] = {**job, "window_us": None if window is None else tuple(window)}
+        return cls(StreamJob(**keys), device)
 
     def __init__(self, job: StreamJob, device: int | None = None):
         super().__init__(job, device)

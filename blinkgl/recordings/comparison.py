@@ -49,9 +49,9 @@ class RecordingSide:
     name: str
     count: int = 0
     on: int = 0
-    rate_hz: np.ndarray = field(default=None, repr=False)
-    counts: np.ndarray = field(default=None, repr=False)
-    iei: np.ndarray = field(default=None, repr=False)
+    rate_hz: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+    counts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int64), repr=False)
+    iei: np.ndarray = field(default_factory=lambda: np.zeros(len(IEI_EDGES_US) - 1, np.int64), repr=False)
     frame_correlation: np.ndarray | None = field(default=None, repr=False)
     implied_threshold: np.ndarray | None = field(default=None, repr=False)
 
@@ -105,6 +105,7 @@ class Comparison:
     @property
     def rate_ratio(self) -> np.ndarray:
         """Return events of b per event of a, (K,); NaN where a has none."""
+        assert self.b is not None
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.a.rate_hz > 0, self.b.rate_hz / self.a.rate_hz, np.nan)
 
@@ -112,14 +113,15 @@ class Comparison:
     def iei_distance(self) -> float:
         """Return the largest difference of the two cumulative distributions of the inter-event interval
         (Kolmogorov-Smirnov distance)."""
+        assert self.b is not None
         return histogram_distance(self.a.iei, self.b.iei)
 
-    def rows(self) -> list[tuple[str, str, str]]:
+    def rows(self) -> list[tuple[str, ...]]:
         """Return (quantity, a, b) as text, for a table; quantities of the pair are in the last column."""
         sides = [self.a] + ([self.b] if self.b else [])
         spread = lambda values: _spread(values, np.diff(self.edges_us))
         each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))
-        rows = [
+        rows: list[tuple[str, ...]] = [
             ("sensor", *each(lambda s: s.size)),
             ("events", *each(lambda s: f"{s.count:,}")),
             ("rate", *each(lambda s: f"{s.count / self.duration_s / 1e6:.4g} M/s")),
@@ -261,15 +263,16 @@ def _judged(
     halves = tuple(judge.judge_halves(e, size, span_us) for e, size in zip(events, sizes))
     if len(files) < 2:
         return halves, None
-    if sizes[0] == sizes[1]:
-        return halves, judge.judge(*events, sizes[0], span_us)
-    return halves, judge.judge_unlike(*events, *sizes, span_us)
+    (a, b), (size_a, size_b) = events, sizes
+    if size_a == size_b:
+        return halves, judge.judge(a, b, size_a, span_us)
+    return halves, judge.judge_unlike(a, b, size_a, size_b, span_us)
 
 
 def _accumulate(
     files: list[EventFile], shifts: list[int], edges: np.ndarray, changes: Iterator[np.ndarray | None]
 ) -> Comparison:
-    shapes, intervals = [(f.height, f.width) for f in files], len(edges) - 1
+    shapes, intervals = [(int(f.height or 0), int(f.width or 0)) for f in files], len(edges) - 1
     same = len(files) == 2 and shapes[0] == shapes[1]
     sides = [
         RecordingSide(
@@ -311,11 +314,11 @@ def _accumulate(
             side.frame_correlation, side.implied_threshold = frame_correlation[i], threshold[i]
     if len(files) == 1:
         return Comparison(edges, sides[0], None)
+    a, b = sides
     if not same:
-        return Comparison(edges, *sides)
-    return Comparison(
-        edges, *sides, pixel_correlation=_correlation(sides[0].counts, sides[1].counts), polarity_correlation=polarity
-    )
+        return Comparison(edges, a, b)
+    together = _correlation(a.counts, b.counts)
+    return Comparison(edges, a, b, pixel_correlation=together, polarity_correlation=polarity)
 
 
 @kernel
@@ -360,13 +363,13 @@ def _joined(parts: list[Events], shift: int) -> Events:
 
 def _span(file: EventFile) -> tuple[int, int]:
     """Return the first event's time and one past the last's."""
-    first = last = None
+    first, end = None, 0
     for chunk in file.chunks():
         first = int(chunk.t[0]) if first is None else first
-        last = int(chunk.t[-1])
+        end = int(chunk.t[-1]) + 1
     if first is None:
         raise EventDataError("no events", where=str(file.path))
-    return first, last + 1
+    return first, end
 
 
 def _frame_intervals(

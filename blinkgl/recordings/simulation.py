@@ -226,8 +226,8 @@ def _run(frames, use, config, seed, readout, report, fitting) -> Iterator[Step]:
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
-    size = first[0].shape[:2] if fitting is None else fitting.wanted
-    camera = EventCamera(config, readout, *size, seed, make=make_on_device)
+    height, width = first[0].shape[:2] if fitting is None else fitting.wanted
+    camera = EventCamera(config, readout, height, width, seed, make=make_on_device)
     yield from stepped(itertools.chain([first], frames), camera, use, report=report, fitting=fitting)
 
 
@@ -301,7 +301,7 @@ class _Given:
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int]]:
         shape, name, checks = None, "", FrameChecks()
-        report = self._report
+        white, steadied, by_codes, report = None, None, False, self._report
         for frame, t_ns, name in self._frames:
             if shape is None:
                 shape = frame.shape
@@ -400,7 +400,7 @@ def file_to_events(
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
         shown = None if preview is None else _preview(preview, height, width, start_us, gap_ns, overwrite)
-        video, done = shown and stack.enter_context(shown), 0
+        video, done = None if shown is None else stack.enter_context(shown), 0
         for step in steps:
             if video is not None:
                 _show(video, step)

@@ -9,9 +9,10 @@ import numpy as np
 
 from blinkgl.gl import Target
 from blinkgl.render.frames import Frame, Memory, Rectangle, merged
+from blinkgl.render.passes.base import ScenePass
 
 if TYPE_CHECKING:
-    from blinkgl.camera import CameraModel
+    from blinkgl.camera import PinHole
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.painter import Painter
     from blinkgl.render.passes.base import Pass, Shot
@@ -52,9 +53,10 @@ class Canvas(Memory):
             return None
         # Unknown for one input is unknown for all.
         parts = [frame.changed_since(self._used.get(name)) for name, frame in shot.inputs.items()]
-        if any(part is None for part in parts):
+        known = [part for part in parts if part is not None]
+        if len(known) < len(parts):
             return None
-        return self.pass_.changed(self.painter, merged([r for part in parts for r in part]))
+        return self.pass_.changed(self.painter, merged([r for part in known for r in part]))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -65,7 +67,7 @@ class Canvas(Memory):
 # only those rectangles are read back. Every pixel gets the value of a full redraw.
 
 
-def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
+def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: PinHole) -> Rectangle | None:
     """Return the pixels that the item can touch, from its bounding box; None when it is outside the image."""
     bounds = camera.bounds(item.corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3])
     return None if bounds is None else Rectangle(*bounds)
@@ -80,6 +82,7 @@ class StillCanvas(Canvas):
 
     def draw(self, shot: Shot) -> Frame:
         pass_, painter, moment = self.pass_, self.painter, shot.moment
+        assert isinstance(pass_, ScenePass)
         visible, camera = pass_.items(moment), moment.view.camera
         movers = []
         for item in visible:

@@ -30,7 +30,7 @@ class LineDrawer:
         self._pixels: moderngl.Buffer | None = None
         self._crossings: moderngl.Texture | None = None
         self._rows = np.empty((0, ROW, CROSSING), np.float32)
-        self._programs: dict[tuple, tuple[dict[str, Any], moderngl.VertexArray]] = {}
+        self._programs: dict[tuple, tuple[Uniforms, moderngl.VertexArray]] = {}
 
     def upload(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> None:
         """Upload the lines of these items in a picture of width x height px, for the next drawing."""
@@ -57,10 +57,10 @@ class LineDrawer:
         self._rows.reshape(-1, CROSSING)[: len(crossings)] = crossings
         self._crossings.write(self._rows[:rows], viewport=(0, 0, 2 * ROW, rows))
 
-    def program(self, name: str, defines: dict[str, Any]) -> tuple[dict[str, Any], moderngl.VertexArray | None]:
+    def program(self, name: str, defines: dict[str, Any]) -> tuple[Uniforms, moderngl.VertexArray] | None:
         """Return the uniforms of a program and the array to draw; None where no pixel has a line."""
         if not self._count:
-            return {}, None
+            return None
         key = name, *sorted(defines.items())
         if key not in self._programs:
             program = self.gl.program(name, defines)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import cached_property
+from typing import TypeVar, cast
 
 import moderngl
 import numpy as np
@@ -86,11 +87,11 @@ class Shape:
         """Bind the resources to the program that is drawn next. unit : first free texture unit."""
         if "Shape" not in program:
             raise unused(program, "Shape")
-        program["Shape"].binding = self.BINDING
+        cast(moderngl.UniformBlock, program["Shape"]).binding = self.BINDING
         self._buffer.bind_to_uniform_block(self.BINDING)
         for offset, (name, texture) in enumerate(self._textures.items()):
             if name in program:
-                program[name].value = unit + offset
+                cast(moderngl.Uniform, program[name]).value = unit + offset
                 texture.use(unit + offset)
 
     def release(self) -> None:
@@ -100,6 +101,15 @@ class Shape:
 
 HALF_LEAST, HALF_MOST = 2.0**-14, 65504.0
 """Between these limits the error of a half float is at most 1/2048; below, 3e-8."""
+
+
+Present = TypeVar("Present")
+
+
+def _of(part: Present | None) -> Present:
+    """Return a part of a material that the item drawn has."""
+    assert part is not None
+    return part
 
 
 def half_floats(image: np.ndarray) -> np.ndarray:
@@ -121,7 +131,7 @@ class SceneResources:
     def __init__(self, gl: GLContext, scene: Scene, anisotropy: float = 1.0, mip_bias: float = 0.0):
         self.ctx, self.scene, self.anisotropy, self.mip_bias = gl.ctx, scene, anisotropy, mip_bias
         self._parameter = gl.function("glTexParameterf", None, ctypes.c_uint, ctypes.c_uint, ctypes.c_float)
-        self._buffers: dict[tuple, tuple[moderngl.Buffer, moderngl.Buffer]] = {}
+        self._buffers: dict[tuple, tuple[moderngl.Buffer, ...]] = {}
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
         self._vaos_of_items: dict[tuple[int, int], moderngl.VertexArray] = {}
@@ -178,26 +188,28 @@ class SceneResources:
     def luminance_texture(self, material: Material) -> moderngl.Texture:
         """Return the luminance of texture * base_color, mip-mapped in linear light: R16F for 8-bit images where
         :func:`half_floats` applies, else R32F."""
-        key = ("luminance", id(material.texture), material.base_color, material.wrap)
+        texture = _of(material.texture)
+        key = ("luminance", id(texture), material.base_color, material.wrap)
         if key not in self._textures:
-            image = luminance_image(material.texture.image, material.base_color)[..., None]
-            self._textures[key] = self._light(image, material.texture, material.wrap)
+            image = luminance_image(texture.image, material.base_color)[..., None]
+            self._textures[key] = self._light(image, texture, material.wrap)
         return self._textures[key]
 
     def shares_texture(self, material: Material) -> moderngl.Texture:
         """Return the shares of r, g and b of texture * base_color in its luminance, RGB16F or RGB32F; their sum is
         :meth:`luminance_texture`."""
-        key = ("shares", id(material.texture), material.base_color, material.wrap)
+        texture = _of(material.texture)
+        key = ("shares", id(texture), material.base_color, material.wrap)
         if key not in self._textures:
             # Each channel's share of the luminance, so that r + g + b of the texture is it.
             shares = (LUMA * np.asarray(material.base_color, np.float64)).astype(np.float32)
-            image = linear_image(material.texture.image) * shares
-            self._textures[key] = self._light(image, material.texture, material.wrap)
+            image = linear_image(texture.image) * shares
+            self._textures[key] = self._light(image, texture, material.wrap)
         return self._textures[key]
 
     def colour_texture(self, material: Material) -> moderngl.Texture:
         """Return the linear rgb of the texture alone: sRGB8 when the image is 8-bit, else RGB32F."""
-        return self._colour(material.texture, material.wrap)
+        return self._colour(_of(material.texture), material.wrap)
 
     def _colour(self, texture: Texture, wrap: tuple[Wrap, Wrap]) -> moderngl.Texture:
         key = ("colour", id(texture), wrap)
@@ -216,7 +228,7 @@ class SceneResources:
         """Return the opacity, R32F, one level."""
         key = ("coverage", id(material.mask), material.wrap)
         if key not in self._textures:
-            image = material.mask.alpha.astype(np.float32)[..., None] / np.float32(255)
+            image = _of(material.mask).alpha.astype(np.float32)[..., None] / np.float32(255)
             self._textures[key] = self._upload(image, "mask", wrap=material.wrap, levels=False)
         return self._textures[key]
 
@@ -232,7 +244,7 @@ class SceneResources:
     def emission_texture(self, material: Material, colour: bool) -> moderngl.Texture:
         """Return the material's own emission, linear rgb, or R16F or R32F as :meth:`luminance_texture`, scaled to a
         luminance of at most 1."""
-        given = material.emission_map
+        given = _of(material.emission_map)
         if colour:
             return self._colour(given.texture, given.wrap)
         key = ("emission", id(given.texture), material.emission, given.wrap)
@@ -313,9 +325,8 @@ class SceneResources:
             owned.release()
         self._buffers, self._textures, self._volumes, self._shapes = {}, {}, {}, {}
 
-    def _mesh_buffers(
-        self, mesh: Mesh, uv_scale: tuple[float, float], whole: bool
-    ) -> tuple[moderngl.Buffer, moderngl.Buffer]:
+    def _mesh_buffers(self, mesh: Mesh, uv_scale: tuple[float, float], whole: bool) -> tuple[moderngl.Buffer, ...]:
+        """Return the buffers of a mesh's vertices and faces."""
         key = (id(mesh), uv_scale, whole)
         if key not in self._buffers:
             data = np.empty((len(mesh.vertices), 8), np.float32)
@@ -370,7 +381,7 @@ class SceneResources:
             )
         if half:
             image = half_floats(image)
-        dtype = {np.uint8: "f1", np.float16: "f2"}.get(image.dtype.type, "f4")
+        dtype = {"uint8": "f1", "float16": "f2"}.get(image.dtype.name, "f4")
         texture = self.ctx.texture(
             (width, height),
             components,

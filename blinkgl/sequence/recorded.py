@@ -300,7 +300,8 @@ class RecordedSequence(SensorSimulation):
             EventCamera(
                 config.events,
                 config.readout,
-                *size,
+                size[0],
+                size[1],
                 kernel_seed(config.seed, request.index, Role.EVENTS),
                 make=make_on_device,
             )
@@ -325,7 +326,7 @@ class RecordedSequence(SensorSimulation):
     def _check_flow(self, size: tuple[int, int]) -> None:
         """Raise AssetError for flow that contradicts the images, on a few pairs spread over the sequence."""
         files, back = self.flow.files, self.flow.backward
-        chosen = np.unique(np.linspace(0, len(files) - 1, _CHECKED_PAIRS).astype(int)) if files else ()
+        chosen = np.unique(np.linspace(0, len(files) - 1, _CHECKED_PAIRS if files else 0).astype(int))
         ends = {k: [read_frame(self.files[n]) for n in ((k + 1, k) if back else (k, k + 1))] for k in chosen}
         pairs = [(one, other, *read_flow_of(files[k], size, self._form)) for k, (one, other) in ends.items()]
         if pairs and not any(valid.any() for _, _, _, valid in pairs):
@@ -360,6 +361,7 @@ class RecordedSequence(SensorSimulation):
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         frames, stated = self._recorded, open_stills(self.files[0])
+        assert self.camera is not None
         levels = None if stated.white is None else (0.0, float(stated.white))
         steps = stepped(
             timed(self._given()),

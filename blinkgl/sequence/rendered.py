@@ -103,6 +103,7 @@ class RenderedSequence(SensorSimulation):
         self.renderer.gl.resume()
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
+        assert self.camera is not None
         try:
             # A tensor's frame stays on the card, which works beside the processor by itself.
             run = emulate_beside if self.camera.tensor_device is None else emulate
@@ -112,6 +113,7 @@ class RenderedSequence(SensorSimulation):
 
     def _frames(self) -> Iterator[EventFrame]:
         """Yield the frames of the event pass."""
+        assert self.camera is not None and self.timeline is not None
         return drawn(self.renderer, self.timeline, self.camera.records_truth, self.camera.tensor_device)
 
     def _in_order(self) -> Iterator[Item]:
@@ -163,8 +165,9 @@ class RenderedSequence(SensorSimulation):
         span = min(interval, self.scene.t1_ns - t_ns)
         if 4 * span < interval:
             return Picture(t_ns, image)  # of so short a motion the rest of an interval does not follow
-        flow = self.renderer.labels(t_ns, LabelRequest("flow_forward"), t_ns + span).forward.flow
-        return Picture(t_ns, image, np.nan_to_num(flow) * np.float32(interval / span))
+        forward = self.renderer.labels(t_ns, LabelRequest("flow_forward"), t_ns + span).forward
+        assert forward is not None
+        return Picture(t_ns, image, np.nan_to_num(forward.flow) * np.float32(interval / span))
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -189,7 +192,11 @@ class RenderedSequence(SensorSimulation):
             "K": scene.camera.K,
             "resolution": np.array([scene.camera.width, scene.camera.height], np.int64),
             "near": np.array(scene.camera.near),
-            **({} if self.lens is None else {"lens": np.array(self.lens.kind), "distortion": self.lens.distortion}),
+            **(
+                {}
+                if self.lens is None
+                else {"lens": np.array(self.lens.kind), "distortion": np.asarray(self.lens.distortion, np.float64)}
+            ),
         }
 
     @property

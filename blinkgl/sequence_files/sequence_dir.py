@@ -147,14 +147,14 @@ class SequenceWriter:
         # Memory is limited: drawing waits when the disk is this many files behind.
         self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
         self._truth: EventLabelsWriter | None = None
+        self._events: DsecEventWriter | None = None
         try:
             if self._with_truth:
                 self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS, codec=self.codec)
-            self._events = (
-                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us, codec=self.codec)
-                if self._with_events
-                else None
-            )
+            if self._with_events:
+                assert self.height is not None and self.width is not None
+                place = self._tmp / "events.h5"
+                self._events = DsecEventWriter(place, self.height, self.width, self.t_offset_us, codec=self.codec)
         except BaseException:
             self._discard()
             raise
@@ -170,9 +170,9 @@ class SequenceWriter:
         self._discard()
         if isinstance(error, OutputError) and str(self._tmp) in (error.where or ""):
             # The user knows the final name, not the temporary's.
-            where = error.where.replace(str(self._tmp), str(self.final))
+            where = str(error.where).replace(str(self._tmp), str(self.final))
             raise OutputError(error.problem, where=where, accepted=error.accepted) from error
-        if kind is None:
+        if kind is None and error is not None:
             raise error
 
     # ---- what a sequence consists of -------------------------------------------------------------------------
@@ -180,6 +180,7 @@ class SequenceWriter:
     def append_events(self, events: Events) -> None:
         """Append the next events, in time order (µs on the sequence's clock)."""
         self._check()
+        assert self._events is not None, "of a sequence without events"
         self._events.append(events)
         if self._truth is not None and len(events):
             # A copy: the thread writes them after the caller has continued.
@@ -190,12 +191,14 @@ class SequenceWriter:
         has one. Pixels that a format cannot hold are counted in ``lost`` and the manifest. Raises TypeError: a value of
         another shape or number type."""
         label = label_of(name)
+        assert self.height is not None and self.width is not None, "a rig's own folder has no labels"
         if (wrong := label.wrong(value, self.height, self.width)) is not None:
             raise TypeError(f"label '{name}': {wrong}")
         value = label.own(value)
         if label.stamps is not None and label.towards is None:
             self._stamp(label.stamps, str(int(t_us)))
         elif label.stamps is not None:
+            assert to_us is not None
             self._stamp(label.stamps, f"{int(t_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
         # Without a configuration (a test, a converter) only a label's first format is written.
         for form in label.forms[:1] if self.labels is None else label.written(self.labels):
@@ -203,15 +206,15 @@ class SequenceWriter:
 
     def arrays(self, name: str, **arrays: np.ndarray) -> None:
         """Write named numeric arrays as ``name``, an .npz file."""
-        arrays = {k: np.array(v) for k, v in arrays.items()}
-        if bad := [k for k, v in arrays.items() if v.dtype.hasobject]:
+        columns: dict[str, Any] = {k: np.array(v) for k, v in arrays.items()}
+        if bad := [k for k, v in columns.items() if v.dtype.hasobject]:
             raise TypeError(f"{name}: object arrays would be pickled: {bad}")
 
         def save(path: Path) -> None:
             with open(
                 path, "wb"
             ) as file:  # NumPy stamps zip members 1980-01-01, so the bytes do not depend on the clock
-                np.savez(file, **arrays)
+                np.savez(file, **columns)
 
         self.external(name, save)
 
@@ -260,6 +263,7 @@ class SequenceWriter:
     # ---- machinery -------------------------------------------------------------------------------------------
 
     def _encoded(self, label: Label, form: Form, value: Any) -> bytes:
+        assert form.encode is not None
         data = form.encode(value)
         if isinstance(data, tuple):
             data, lost = data
@@ -374,7 +378,7 @@ class SequenceWriter:
 
     def _discard(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
-        if getattr(self, "_events", None) is not None:
+        if self._events is not None:
             self._events.abort()
         if self._truth is not None:
             self._truth.abort()

@@ -102,7 +102,7 @@ class DenseFlow:
     on preset and the other side. Smaller pictures are continued at their borders, and the flow is cut out again."""
 
     def __init__(self, preset: int = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) -> None:
-        self._dis = cv2.DISOpticalFlow_create(preset)
+        self._dis = cv2.DISOpticalFlow_create(preset)  # type: ignore[missing-attribute]
 
     @staticmethod
     def codes(frame: np.ndarray) -> np.ndarray:
@@ -115,7 +115,7 @@ class DenseFlow:
         below, right = max(0, self.LEAST - height), max(0, self.LEAST - width)
         if below or right:
             a, b = (cv2.copyMakeBorder(one, 0, below, 0, right, cv2.BORDER_REPLICATE) for one in (a, b))
-        return self._dis.calc(a, b, None)[:height, :width]
+        return self._dis.calc(a, b, None)[:height, :width]  # type: ignore[no-matching-overload]
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the flow (H, W, 2) float32 px from a to b and from b to a, of codes."""
@@ -128,7 +128,9 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
     height, width = a.shape
     grid = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
     # Reads flow at integer pixels and between them.
-    look = lambda image, flow: cv2.remap(image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    look = lambda image, flow: cv2.remap(  # type: ignore[no-matching-overload]
+        image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     pictures = [(np.ascontiguousarray(one, np.float32), np.log(one + _EPS)) for one in (a, b)]
     seen_a, seen_b = _consistent(forward, look(backward, forward)), _consistent(backward, look(forward, backward))
     f = np.float32

@@ -96,9 +96,11 @@ class Look(Protocol):
 
 
 class Moving(Protocol):
-    """The speeds of a scene.   unbounded : names of bodies of which only single times are known."""
+    """The speeds of a scene."""
 
-    unbounded: Sequence[str]
+    @property
+    def unbounded(self) -> Sequence[str]:
+        """Return the names of the bodies of which only single times are known."""
 
     def look(self, t_ns: int) -> Any: ...
 

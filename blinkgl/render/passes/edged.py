@@ -71,10 +71,10 @@ class Edged(Pass):
         shown = self.of.items(moment) if isinstance(self.of, ScenePass) else moment.visible
         drawn = [item for item in (shown if items is None else items) if item.layer != SKY]
         drawer.upload(moment, drawn, *shot.size)
-        uniforms, array = drawer.program(self.program, self.defines(None))
-        # The picture has no edges.
-        if array is None:
+        program = drawer.program(self.program, self.defines(None))
+        if program is None:  # the picture has no edges
             return
+        uniforms, array = program
         self.bind(uniforms, shot)
         drawer.use(_CROSSINGS_UNIT)
         uniforms["crossings"].value = _CROSSINGS_UNIT

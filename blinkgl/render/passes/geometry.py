@@ -47,7 +47,7 @@ class Geometry(ScenePass):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        return tuple(Output(name, LABELS[name].buffer) for name in self.names)
+        return tuple(Output(name, LABELS[name].buffer or "") for name in self.names)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         through = {"LENS": 1, "LENS_CLAIMS": 1, "GEOMETRY_STAGE": 1, self.lens: 1} if self.lens else {}

@@ -75,7 +75,7 @@ class Luminance(LuminancePass):
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         # Taps are for textures; a uniform colour needs none.
-        taps = {"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {}
+        taps = {"TAPS4": 1} if self.samples.taps == 4 and kind is not None and kind.textured else {}
         stretched = {"STRETCHED": 1} if taps and self.samples.edges else {}
         return taps | stretched | ({"NEAREST_LEVEL": 1} if stretched and self.samples.grid == 1 else {})
 

@@ -41,16 +41,16 @@ _SAMPLES = 16  # per leg, for arc length, mean rate and the check of the curve
 class FreeSpace:
     """A box without the inside of obstacles' bounding spheres.
 
-    low, high : (3,) corners; a body's *origin* must stay inside.
+    low, high : (3,) corners, sequences, too; a body's *origin* must stay inside.
     ground_z  : bodies must stay above it by their radius (None: no ground).
     centres, radii : (M, 3), (M,) spheres.
     """
 
-    low: ArrayLike
-    high: ArrayLike
+    low: np.ndarray
+    high: np.ndarray
     ground_z: float | None = None
-    centres: ArrayLike = field(default_factory=lambda: np.zeros((0, 3)))
-    radii: ArrayLike = field(default_factory=lambda: np.zeros(0))
+    centres: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    radii: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         for name, shape in (("low", (3,)), ("high", (3,)), ("centres", (-1, 3)), ("radii", (-1,))):
@@ -244,6 +244,7 @@ def waypoints(
             best, least = (times, points), outside
         if outside <= 0.0:
             break
+    assert best is not None
     return best
 
 

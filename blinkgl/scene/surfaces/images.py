@@ -158,7 +158,7 @@ def _decode_ldr(data: bytes, where: str) -> np.ndarray:
         pixels = np.empty((height, width, 3), np.uint8)
         for rows in _blocks(height, width):
             block = image.crop((0, rows.start, width, rows.stop))
-            pixels[rows] = block if block.mode == "RGB" else block.convert("RGB")
+            pixels[rows] = np.asarray(block if block.mode == "RGB" else block.convert("RGB"))
         return pixels
 
 

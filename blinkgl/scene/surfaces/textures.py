@@ -90,7 +90,7 @@ def _perlin_noise(rng, size: int, cells: int) -> np.ndarray:
     gx, gy = np.cos(angle), np.sin(angle)
     i, j, f = _lattice(size, cells)
     w = _smooth(f)
-    total = 0.0
+    total = np.zeros((size, size))
     # The four corners of each pixel's cell: those before and after it, in y and in x.
     for rows, dy, wy in ((i, f, 1 - w), (j, f - 1, w)):
         across, along = gx[rows], gy[rows] * dy[:, None]
@@ -222,7 +222,7 @@ def _pips(rng: np.random.Generator, size: int) -> np.ndarray:
     material, the pips light on dark or dark on light. It is not one of the pools' kinds, because it fits only a die."""
     base = np.array(_STUFFS[int(rng.integers(len(_STUFFS)))], float) * rng.uniform(0.85, 1.1, 3)
     grain = rng.uniform(0.1, 0.4)
-    warped = _stretch(sum(0.6**k * _perlin_noise(rng, size, 8 * 2**k) for k in range(4)))
+    warped = _stretch(np.sum([0.6**k * _perlin_noise(rng, size, 8 * 2**k) for k in range(4)], axis=0))
     vein = 0.5 + 0.5 * np.sin(rng.uniform(4, 14) * warped)
     stuff = np.clip((1 - grain * vein)[..., None] * base, DARKEST, BRIGHTEST)
     light = float((stuff @ [0.299, 0.587, 0.114]).mean()) > 110

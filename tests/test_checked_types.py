@@ -1,0 +1,21 @@
+"""The list of files that the type checker leaves out is true: each entry is a file, none is named twice."""
+
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+CONFIG = tomllib.loads((ROOT / "pyrefly.toml").read_text(encoding="utf-8"))
+
+
+def test_every_entry_of_the_type_checkers_lists_matches_a_file():
+    excluded = CONFIG["project-excludes"]
+    assert len(excluded) == len(set(excluded))
+    entries = [*excluded, *(one["matches"] for one in CONFIG["sub-config"])]
+    assert [entry for entry in entries if not any(ROOT.glob(entry))] == []
+
+
+def test_whole_rooms_are_checked():
+    left_out = {str(path.relative_to(ROOT)) for entry in CONFIG["project-excludes"] for path in ROOT.glob(entry)}
+    for room in ("events", "render", "timeline", "sequence", "labels", "imaging", "camera", "config", "front"):
+        unchecked = [name for name in left_out if name.startswith(f"blinkgl/{room}/")]
+        assert not unchecked, unchecked

@@ -1,5 +1,6 @@
 """The list of files that the type checker leaves out is true: each entry is a file, none is named twice."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -19,3 +20,12 @@ def test_whole_rooms_are_checked():
     for room in ("events", "render", "timeline", "sequence", "labels", "imaging", "camera", "config", "front"):
         unchecked = [name for name in left_out if name.startswith(f"blinkgl/{room}/")]
         assert not unchecked, unchecked
+
+
+def test_the_oldest_python_is_one_number():
+    floor = re.search(r"python_requires = >=(3\.\d+)", (ROOT / "setup.cfg").read_text(encoding="utf-8"))[1]
+    ruff = tomllib.loads((ROOT / "ruff.toml").read_text(encoding="utf-8"))["target-version"]
+    assert ruff == "py" + floor.replace(".", "")
+    doctor = (ROOT / "blinkgl" / "show" / "doctor.py").read_text(encoding="utf-8")
+    assert f"sys.version_info >= ({floor.replace('.', ', ')})" in doctor and f"Python {floor} or newer" in doctor
+    assert "python_version" not in (ROOT / "setup.cfg").read_text(encoding="utf-8")

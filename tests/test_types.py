@@ -125,17 +125,3 @@ def test_a_users_program_is_checked(tmp_path):
     assert {e["line"] for e in errors} == wrong, "\n".join(
         f"{e['line']}: {e['description']}" for e in errors if e["line"] not in wrong
     )
-
-
-def test_class_variables_say_of_what():
-    """Python 3.10 cannot evaluate a bare ``ClassVar`` that is written as text, and pydantic evaluates all."""
-    bare = [
-        f"{path.relative_to(REPOSITORY)}:{node.lineno}"
-        for room in ("blinkgl", "eflow")
-        for path in (REPOSITORY / room).rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.AnnAssign)
-        and isinstance(node.annotation, ast.Name)
-        and node.annotation.id == "ClassVar"
-    ]
-    assert not bare

@@ -1,7 +1,7 @@
 #version 430 core
 // Label pass: any subset of the shader's labels at once. The renderer defines OUT_<NAME> as the attachment number of
 // each requested label. include/labels/<name>.glsl, or the label's row (blinkgl/labels), computes a label; the includes
-// labels_need.glsl and labels.glsl are generated from the table of labels (blinkgl/labels/shader.py).
+// labels_need.glsl and labels.glsl are generated from the table of labels (blinkgl/labels/table.py).
 //
 // A label is a function label_<name>(), which may use
 //   local        object-local position, and uniform vec2 image_size (include/image_size.glsl), px of the target

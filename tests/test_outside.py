@@ -1,6 +1,7 @@
 """What the code host reads: workflows run targets that exist, on the Pythons that the project is for."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,42 @@ def test_forms_ask_for_what_helps():
         assert {"name", "description", "body"} <= form.keys() and any(
             part.get("validations", {}).get("required") for part in form["body"]
         )
+
+
+NAMED = re.compile(
+    r"(?<![\w/.-])((?:blinkgl|eflow|tools|tests|shaders|configs|docs)/[\w/.-]+\.(?:py|glsl|md|yaml|toml))"
+)
+ELSEWHERE = {
+    "configs/blinkflow_v1.yaml": "BlinkSim's",
+    "tests/blender/played.py": "its commit is named beside it",
+    "shaders/include/deform/shear.glsl": "a plug-in's, in a test",
+    "shaders/include/labels/position.glsl": "a plug-in's, in a test",
+}
+
+
+def test_files_that_are_named_exist():
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    if not tracked:
+        pytest.skip("not a git checkout")
+    known, gone = set(tracked), []
+    for name in tracked:
+        if not name.endswith((".py", ".glsl", ".md", ".yaml", ".toml", ".cfg")) or name == "CHANGELOG.md":
+            continue
+        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), 1):
+            for named in NAMED.findall(line):
+                below = "/".join([named.split("/")[0], *named.split("/")[2:]])
+                if not {named, below} & known and "NAME" not in named and named not in ELSEWHERE:
+                    gone.append(f"{name}:{number}: {named}")
+    assert gone == []
+
+
+def test_modules_that_docstrings_name_exist():
+    gone = []
+    for room in ("blinkgl", "eflow"):
+        for path in (ROOT / room).rglob("*.py"):
+            for module in re.findall(r":mod:`~?((?:blinkgl|eflow)[\w.]*)`", path.read_text(encoding="utf-8")):
+                place = ROOT / module.replace(".", "/")
+                tool = ROOT / module.replace("blinkgl.tools", "tools", 1).replace(".", "/")
+                if not any(p.is_dir() or p.with_suffix(".py").is_file() for p in (place, tool)):
+                    gone.append(f"{path.relative_to(ROOT)}: {module}")
+    assert gone == []

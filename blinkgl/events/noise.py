@@ -10,7 +10,7 @@ ladder with a rung at the noise's mean has the lowest rate. Thresholds that diff
 with spread, move the ladder a little with every pair of events. A pixel stays longer on a ladder with a lower rate, so
 its long-term rate is the harmonic mean over the positions of the ladder. That is the rate of the table, and pixels
 start on ladders with the same distribution (:func:`start_places`). The table was computed as the stationary state of
-Markov chains, without random numbers (by ``tools/noise_rates.py`` of 348eebef).
+Markov chains, without random numbers, by ``tools/noise_rates.py``.
 
 With a dead time the reference is taken again at the noise's value at its end, and pixels leave their ladder. A dead
 time shorter than a frame moves them to ladders with a high rate, where noise crosses one level in both directions

@@ -1,8 +1,8 @@
 """GLSL programs from files: one file per program, ``#include``, ``#define`` variants, errors that name the user's line.
 
 A file in ``shaders/`` holds all stages of one program, separated by ``#ifdef VERTEX_SHADER`` / ``#ifdef
-FRAGMENT_SHADER``; it is compiled once per stage. ``#include "camera.glsl"`` reads ``shaders/include/camera.glsl``, with
-an automatic include guard, so that two includes may share a third. The compiler gets one text, with a table of the file
+FRAGMENT_SHADER``; it is compiled once per stage. ``#include "lens.glsl"`` reads ``shaders/include/lens.glsl``, with an
+automatic include guard, so that two includes may share a third. The compiler gets one text, with a table of the file
 and line that each of its lines came from: drivers disagree about ``#line`` with a file number, but all of them count
 lines.
 """

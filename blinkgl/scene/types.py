@@ -413,7 +413,7 @@ class Scene:
     rig        : the moving rig with its sensors.
     background : linear radiance where nothing is hit.
     log        : one line per important decision (collisions cut, objects dropped), for the manifest.
-    omissions  : one line per file with features that are not drawn (:mod:`blinkgl.scene.omissions`), for the user and
+    omissions  : one line per file with features that are not drawn, for the user and
     the manifest.
     dynamics   : of the objects that an engine moves; None: there are none.
     fog        : between the camera and everything; None: clear air.

@@ -1,4 +1,4 @@
-"""Samples rendered during training: a :class:`blinkgl.online.SampleStream` as a source.
+"""Samples rendered during training: a :class:`blinkgl.online.stream.SampleStream` as a source.
 
 with open_online(SourceConfig(recipe="configs/eflow/real_data.yaml", online=True, workers=2), seed=0) as source:
     sample = source[0]              # waits until it is rendered

@@ -66,4 +66,5 @@ def _seen_through(camera: DistortedModel) -> PinHole:
             accepted=f"at most {LARGEST} along a side: less distortion, or fewer pixels",
         )
     # x0 and y0 are edges of the first pixel, whose centre, pixel 0, lies half a pixel further.
-    return PinHole(x1 - x0, y1 - y0, focal, focal, -x0 - 0.5, -y0 - 0.5, camera.near)
+    cx, cy = -x0 - 0.5, -y0 - 0.5
+    return PinHole(x1 - x0, y1 - y0, fx=focal, fy=focal, cx=cx, cy=cy, near=camera.near)

@@ -323,25 +323,33 @@ class Esim(Emulator):
         return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
 
     def _levels(self, log: np.ndarray) -> Levels:
-        return Levels(log, self._upper, self._lower, self._on, self._off, self._fired, self._last_ns)
+        return Levels(
+            log=log,
+            upper=self._upper,
+            lower=self._lower,
+            on=self._on,
+            off=self._off,
+            fired=self._fired,
+            last_ns=self._last_ns,
+        )
 
     def _interval(self, t0_ns: int, t1_ns: int) -> Interval:
         dt_ns = t1_ns - t0_ns
         # In the order of the fields of Interval. The last bound: at most one event per refractory
         # period, and one at either end.
         return Interval(
-            t0_ns,
-            dt_ns,
-            t0_ns // 1000,
-            np.float32(self.config.log_eps),
-            self._on_all,
-            self._off_all,
-            self.config.threshold_jitter * Q_ONE,
-            self._floor_on,
-            self._floor_off,
-            self._refractory_ns,
-            self._inverse_threshold,
-            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
-            self.seed,
-            self.width,
+            t0_ns=t0_ns,
+            dt_ns=dt_ns,
+            base_us=t0_ns // 1000,
+            eps=np.float32(self.config.log_eps),
+            on_all=self._on_all,
+            off_all=self._off_all,
+            jitter=self.config.threshold_jitter * Q_ONE,
+            floor_on=self._floor_on,
+            floor_off=self._floor_off,
+            refractory_ns=self._refractory_ns,
+            inverse_threshold=self._inverse_threshold,
+            bound_per_pixel=dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+            seed=self.seed,
+            width=self.width,
         )

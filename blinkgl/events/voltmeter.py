@@ -413,21 +413,21 @@ class DvsVoltmeter(Emulator):
         # In the order of the fields of Interval. The last bound: at most one event per dead time, and
         # one at either end.
         interval = Interval(
-            self.t_ns,
-            dt_ns,
-            base_us,
-            c.k1,
-            c.k2,
-            c.k3,
-            c.k4,
-            c.k5,
-            c.k6,
-            self._scale,
-            self.seed,
-            self.width,
-            self.frames,
-            self._refractory_ns,
-            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+            t0_ns=self.t_ns,
+            dt_ns=dt_ns,
+            base_us=base_us,
+            k1=c.k1,
+            k2=c.k2,
+            k3=c.k3,
+            k4=c.k4,
+            k5=c.k5,
+            k6=c.k6,
+            scale=self._scale,
+            seed=self.seed,
+            width=self.width,
+            step=self.frames,
+            refractory_ns=self._refractory_ns,
+            bound_per_pixel=dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
         )
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         return self._run(_bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)

@@ -90,7 +90,9 @@ def read_trajectory(
 
     per_second = None if rate is None else check.number(rate, "rate", above=0, most=1e9)
     given = None if times is None else check.path(times, "times")
-    declared = trajectories.PoseFile(form, columns, time_unit, maps_from, axes, per_second, given)
+    declared = trajectories.PoseFile(
+        form=form, columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=per_second, times=given
+    )
     return trajectories.read_trajectory(check.path(path, "path"), declared, notes)
 
 
@@ -362,16 +364,16 @@ def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:
 
     fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
     return Declared(
-        None if fps is None else check.number(fps, "fps", above=0, most=1e9),
-        None if stamps is None else check.path(stamps, "timestamps"),
-        given.get(unit),
-        bool(given.get("zero_time", False)),
-        None if white is None else check.number(white, "white_level", above=0, most=1e9),
-        given.get("range"),
-        given.get("background"),
+        fps=None if fps is None else check.number(fps, "fps", above=0, most=1e9),
+        timestamps=None if stamps is None else check.path(stamps, "timestamps"),
+        time_unit=given.get(unit),
+        zero_time=bool(given.get("zero_time", False)),
+        white_level=None if white is None else check.number(white, "white_level", above=0, most=1e9),
+        range=given.get("range"),
+        background=given.get("background"),
         # The events' stream is no frames' stream: which frames belong to it is found where both are opened.
-        None if unit != "time_unit" or given.get("stream") is None else str(given["stream"]),
-        given.get("damaged", "refuse"),
+        stream=None if unit != "time_unit" or given.get("stream") is None else str(given["stream"]),
+        damaged=given.get("damaged", "refuse"),
     )
 
 

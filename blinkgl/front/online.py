@@ -87,21 +87,21 @@ class OnlineSequences(Closing):
         if split not in ("train", "test"):
             raise ConfigError("unknown split", where="split", value=split, accepted="train, test")
         job = StreamJob(
-            "",
-            "",
-            "",
-            None,
-            kind,
-            check.whole(per_sequence, "per_sequence", 1, 1000),
-            _window_us(window_ms),
-            check.whole(steps, "steps", 1, 10_000),
-            check.whole(min_events, "min_events", 0, 1_000_000_000),
-            check.number(max_flow, "max_flow", above=0),
-            check.number(min_density, "min_density", least=0),
-            split,
-            seed,
-            rank,
-            world,
+            out="",
+            base="",
+            recipe="",
+            num=None,
+            kind=kind,
+            samples=check.whole(per_sequence, "per_sequence", 1, 1000),
+            window_us=_window_us(window_ms),
+            steps=check.whole(steps, "steps", 1, 10_000),
+            min_events=check.whole(min_events, "min_events", 0, 1_000_000_000),
+            max_flow=check.number(max_flow, "max_flow", above=0),
+            min_density=check.number(min_density, "min_density", least=0),
+            split=split,
+            seed=seed,
+            rank=rank,
+            world=world,
         )
         self.first = check.whole(first, "first", 0, 2**62)
         template = RunTemplate({**template.tree, "seed": stream_seed(template.seed, seed)}, template.base)

@@ -202,17 +202,17 @@ class Gathered:
         """Return the recording of the camera of all items."""
         t_us = np.array(self._t_us, np.int64)
         return Recording(
-            sequence.config,
-            Events.concatenate(self._events),
-            t_us[:-1],
-            tuple(self._labels[:-1]),
-            t_us,
-            np.stack(self._pictures) if self._pictures else None,
-            sequence.frames,
-            sum(sequence.losses[:2]),
-            tuple(self._images),
-            sequence.imu(),
-            sequence.tracks(),
+            config=sequence.config,
+            events=Events.concatenate(self._events),
+            t_us=t_us[:-1],
+            labels=tuple(self._labels[:-1]),
+            image_t_us=t_us,
+            images=np.stack(self._pictures) if self._pictures else None,
+            frames=sequence.frames,
+            lost=sum(sequence.losses[:2]),
+            camera=tuple(self._images),
+            imu=sequence.imu(),
+            tracks=sequence.tracks(),
         )
 
 

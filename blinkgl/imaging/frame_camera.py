@@ -124,15 +124,15 @@ class FrameCamera:
             dt_s = (self._starts[k + 1] - self._starts[k]) * 1e-9
             self._setting = next_setting(self.config.auto_exposure, setting, _mean(clean), dt_s)
         return CameraImage(
-            k,
-            exposure.start_ns,
-            exposure.end_ns,
-            exposure.exposure_ns,
-            exposure.row_ns,
-            setting.gain,
-            count,
-            step_px,
-            pictures,
+            k=k,
+            start_ns=exposure.start_ns,
+            end_ns=exposure.end_ns,
+            exposure_ns=exposure.exposure_ns,
+            row_ns=exposure.row_ns,
+            gain=setting.gain,
+            instants=count,
+            step_px=step_px,
+            pictures=pictures,
         )
 
     def facts(self) -> dict[str, Any]:

@@ -303,14 +303,14 @@ class Label:
         """Return what the shader debugger shows and grades."""
         return (
             View(
-                self.name,
-                self.heading,
-                self.unit,
-                self.kind,
-                lambda value: value,
-                self.reference,
-                self.judged_in or self.unit,
-                self.tolerance,
-                self.error,
+                name=self.name,
+                title=self.heading,
+                unit=self.unit,
+                kind=self.kind,
+                of=lambda value: value,
+                reference=self.reference,
+                judged_in=self.judged_in or self.unit,
+                tolerance=self.tolerance,
+                error=self.error,
             ),
         )

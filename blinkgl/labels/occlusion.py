@@ -45,16 +45,16 @@ class OcclusionAt(Label):
         assert way is not None
         return (
             View(
-                f"occluded_{way}",
-                f"occluded, {way}",
-                "",
-                "mask",
-                lambda value: value,
-                lambda scene, frame: getattr(frame, way).occluded,
-                "fraction of pixels",
-                1e-3,
-                grading.different,
-                "mean",
+                name=f"occluded_{way}",
+                title=f"occluded, {way}",
+                unit="",
+                kind="mask",
+                of=lambda value: value,
+                reference=lambda scene, frame: getattr(frame, way).occluded,
+                judged_in="fraction of pixels",
+                tolerance=1e-3,
+                error=grading.different,
+                statistic="mean",
                 same_triangle=False,
             ),
         )

@@ -79,15 +79,15 @@ class Ids(Label):
     def views(self) -> tuple[View, ...]:
         return (
             View(
-                "id",
-                "instance id",
-                self.unit,
-                self.kind,
-                lambda value: value,
-                self.reference,
-                "mismatch",
-                0.0,
-                grading.different,
+                name="id",
+                title="instance id",
+                unit=self.unit,
+                kind=self.kind,
+                of=lambda value: value,
+                reference=self.reference,
+                judged_in="mismatch",
+                tolerance=0.0,
+                error=grading.different,
                 same_triangle=False,
             ),
         )

@@ -38,15 +38,15 @@ def windows(
         if not _moves_as_asked(job, forward.flow[forward.valid], forward.valid.size, [new]):
             continue
         yield WindowSample(
-            old,
-            new,
-            t,
-            span,
-            forward.flow,
-            forward.valid,
-            None if backward is None else backward.flow,
-            None if backward is None else backward.valid,
-            f"{name}/{t}us+{span}us",
+            old=old,
+            new=new,
+            t_us=t,
+            span_us=span,
+            flow=forward.flow,
+            valid=forward.valid,
+            backward=None if backward is None else backward.flow,
+            backward_valid=None if backward is None else backward.valid,
+            name=f"{name}/{t}us+{span}us",
         )
 
 

@@ -97,15 +97,15 @@ def read_sample(path: Path) -> WindowSample | StreamSample:
         )
         return StreamSample(windows, arrays["times"], arrays["flow"], arrays["valid"], name)
     return WindowSample(
-        _events(arrays, "old"),
-        _events(arrays, "new"),
-        int(arrays["t"]),
-        int(arrays["span"]),
-        arrays["flow"],
-        arrays["valid"],
-        arrays.get("backward"),
-        arrays.get("backward_valid"),
-        name,
+        old=_events(arrays, "old"),
+        new=_events(arrays, "new"),
+        t_us=int(arrays["t"]),
+        span_us=int(arrays["span"]),
+        flow=arrays["flow"],
+        valid=arrays["valid"],
+        backward=arrays.get("backward"),
+        backward_valid=arrays.get("backward_valid"),
+        name=name,
     )
 
 

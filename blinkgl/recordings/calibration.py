@@ -208,23 +208,23 @@ def calibrate_events(
     streams = [clip.simulate(one, seed + 1) for one in (base, found.config())]
     judged = [_judged(clip, stream, halves) for stream in streams]
     return Calibration(
-        name,
-        clip,
-        base,
-        found.config(),
-        found.values(),
-        found.uncertainty(),
-        found.undetermined,
-        found.cost,
-        found.evaluations,
-        halves,
-        judged[0],
-        judged[1],
-        streams[0],
-        streams[1],
-        notes,
-        clip.gamma,
-        warnings,
+        recording=name,
+        clip=clip,
+        before=base,
+        config=found.config(),
+        values=found.values(),
+        uncertainty=found.uncertainty(),
+        undetermined=found.undetermined,
+        cost=found.cost,
+        evaluations=found.evaluations,
+        halves=halves,
+        judged_before=judged[0],
+        judged=judged[1],
+        simulated_before=streams[0],
+        simulated=streams[1],
+        notes=notes,
+        gamma=clip.gamma,
+        warnings=warnings,
     )
 
 
@@ -303,16 +303,16 @@ def judge_half(recorded: GroupSums, simulated: GroupSums, told: float = float("n
     # Fewer pixels than 400 say little about a rate of a fraction of a hertz.
     hz = lambda parts: float(parts[4].sum() / (pixels[1] * recorded.seconds.sum())) if pixels[1] >= 400 else np.nan
     return Judged(
-        int(b.sum()),
-        int(a.sum()),
-        float(b[1] / max(b[0], 1)),
-        float(a[1] / max(a[0], 1)),
-        interval_distance(recorded, simulated),
-        float(products[0] / norm) if norm > 0 else float("nan"),
-        correlation(alike),
-        hz(other),
-        hz(own),
-        told,
+        events=int(b.sum()),
+        recorded=int(a.sum()),
+        on_off=float(b[1] / max(b[0], 1)),
+        recorded_on_off=float(a[1] / max(a[0], 1)),
+        interval_distance=interval_distance(recorded, simulated),
+        polarity_correlation=float(products[0] / norm) if norm > 0 else float("nan"),
+        count_correlation=correlation(alike),
+        still_hz=hz(other),
+        recorded_still_hz=hz(own),
+        told=told,
     )
 
 

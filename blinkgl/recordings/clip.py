@@ -171,19 +171,19 @@ def clip_of_frames(
     light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
     tiles = Tiles(size, len(path), most, seed)
     return Clip(
-        [(t, tiles.cut(g)) for g, t in path],
-        clock,
-        edges,
-        tiles.events(events.window(int(edges[0]), int(edges[-1])), ~full),
-        tiles.cut(~full),
-        tiles.cut(still & ~full),
-        tiles.cut(light),
-        tiles.cut(change),
-        size,
-        tiles.share,
-        bursts,
-        facts,
-        gamma,
+        frames=[(t, tiles.cut(g)) for g, t in path],
+        clock_us=clock,
+        edges_us=edges,
+        events=tiles.events(events.window(int(edges[0]), int(edges[-1])), ~full),
+        used=tiles.cut(~full),
+        still=tiles.cut(still & ~full),
+        light=tiles.cut(light),
+        change=tiles.cut(change),
+        sensor=size,
+        share=tiles.share,
+        bursts=bursts,
+        facts=facts,
+        gamma=gamma,
     )
 
 
@@ -293,15 +293,15 @@ def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = D
     path = [(frame, int(edges[0]) * 1000 - 1000), *((frame, int(t) * 1000) for t in edges)]
     everywhere = np.ones(size, bool)
     return Clip(
-        [(t, f) for f, t in path],
-        edges,
-        edges,
-        events.window(begin, end),
-        everywhere,
-        everywhere,
-        np.zeros(size, np.uint8),
-        np.zeros((parts, *size), np.float32),
-        size,
+        frames=[(t, f) for f, t in path],
+        clock_us=edges,
+        edges_us=edges,
+        events=events.window(begin, end),
+        used=everywhere,
+        still=everywhere,
+        light=np.zeros(size, np.uint8),
+        change=np.zeros((parts, *size), np.float32),
+        sensor=size,
     )
 
 

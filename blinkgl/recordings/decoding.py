@@ -46,7 +46,15 @@ class Codes:
 
     def of(self, source: FrameSource) -> Codes:
         """Return these with what a file says."""
-        return Codes(self.gamma, self.white_level, self.range, self.own, source.transfer, source.levels, source.origin)
+        return Codes(
+            gamma=self.gamma,
+            white_level=self.white_level,
+            range=self.range,
+            own=self.own,
+            transfer=source.transfer,
+            levels=source.levels,
+            origin=source.origin,
+        )
 
 
 UNKNOWN = Codes()

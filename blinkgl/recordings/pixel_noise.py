@@ -160,16 +160,16 @@ def fit_pixels_of(
     numbers = [one.pixel(width) for one in (halves[1], made)]
     fired = [np.bincount(of, minlength=height * width) for of in numbers]
     return PixelFit(
-        name,
-        size,
-        config,
-        {key: value for key, value in uncertainty.items() if value > 0},
-        _undetermined(answered, dead),
-        len(halves[1]),
-        len(made),
-        (fired[0][fired[0] > 0], fired[1][fired[1] > 0]),
-        (_gaps(halves[1], numbers[0]), _gaps(made, numbers[1])),
-        seconds,
+        recording=name,
+        size=size,
+        config=config,
+        uncertainty={key: value for key, value in uncertainty.items() if value > 0},
+        undetermined=_undetermined(answered, dead),
+        recorded=len(halves[1]),
+        simulated=len(made),
+        counts=(fired[0][fired[0] > 0], fired[1][fired[1] > 0]),
+        intervals=(_gaps(halves[1], numbers[0]), _gaps(made, numbers[1])),
+        seconds=seconds,
     )
 
 

@@ -126,7 +126,20 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: GroupSums |
     )
     looks, full = _looks(part, clip.size, span_us, None if against is None else against.full)
     return GroupSums(
-        rates, lights, isi, counts, quiet, still_counts, products, pixels, polarity, mine, alike, looks, full, seconds
+        rates=rates,
+        lights=lights,
+        isi=isi,
+        counts=counts,
+        still=quiet,
+        still_counts=still_counts,
+        products=products,
+        pixels=pixels,
+        polarity=polarity,
+        both=mine,
+        alike=alike,
+        looks=looks,
+        full=full,
+        seconds=seconds,
     )
 
 
@@ -291,7 +304,18 @@ def target(recorded: GroupSums, together: bool = False) -> Target:
     # A block weighs the same in the sum of squares, however many numbers it has.
     weight = np.array([WEIGHTS[b] / np.sqrt(sizes[b]) for b in block])
     chance, jackknife = np.zeros(len(values)), np.zeros((GROUPS, len(values)))
-    return Target(recorded, probes, values, chance, floor, weight, jackknife, block, spread, together)
+    return Target(
+        sums=recorded,
+        probes=probes,
+        values=values,
+        chance=chance,
+        floor=floor,
+        weight=weight,
+        jackknife=jackknife,
+        block=block,
+        spread=spread,
+        together=together,
+    )
 
 
 def _spread(looks: np.ndarray) -> np.ndarray:

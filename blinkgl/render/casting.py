@@ -110,7 +110,18 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None) -> Hits:
     found = hit[:, 0] >= 0
     ids = np.array([obj.instance_id for obj, _ in parts] + [0], np.int32)
     local = np.full((len(xy), 3), np.nan)
-    hits = Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
+    hits = Hits(
+        xy=xy,
+        t_ns=int(t_ns),
+        hit=found,
+        depth=depth,
+        instance=ids[hit[:, 0]],
+        part=hit[:, 0],
+        triangle=hit[:, 1],
+        front=hit[:, 2] == 1,
+        bary=bary,
+        local=local,
+    )
     return replace(hits, local=local_at(scene, hits, t_ns))
 
 
@@ -272,7 +283,15 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     moved = applied(scene, there_hits, lambda obj: relative_pose_at(scene, obj, t_ns))
     seen, hidden_by = is_seen(scene, hits, t_ns, moved, inside & (depth >= camera.near))
     occluded = valid & ~seen
-    return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
+    return Flow(
+        t_ns=int(t_ns),
+        flow=flow,
+        valid=valid,
+        occluded=occluded,
+        outside=valid & ~inside,
+        depth=depth,
+        hidden_by=hidden_by,
+    )
 
 
 def moved_in_space(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:

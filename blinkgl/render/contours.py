@@ -120,7 +120,15 @@ class Lines:
         room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
         if room > len(self._lines):
             self._lines = np.empty((2 * room, LINE))
-        arrays = _Arrays(pool.starts, pool.places, pool.faces, pool.planes, pool.edges, pool.sharp, pool.culled)
+        arrays = _Arrays(
+            starts=pool.starts,
+            places=pool.places,
+            faces=pool.faces,
+            planes=pool.planes,
+            edges=pool.edges,
+            sharp=pool.sharp,
+            culled=pool.culled,
+        )
         poses = moment.T_cam_obj, moment.mvp
         count = _emit(numbers, bodies, *poses, arrays, float(width), float(height), self._lines)
         return self._lines[:count]

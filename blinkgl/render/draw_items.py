@@ -127,7 +127,16 @@ class DrawItem:
         self.deformer = self.mesh.deformer
         shape, more = shape_of(self.deformer), more_of(self.material, self.mesh)
         masked = self.material.mask is not None
-        self.kind = Kind(self.textured, self.lit, self.two_sided, shape, self.rgb, masked, more, self.faceted)
+        self.kind = Kind(
+            textured=self.textured,
+            lit=self.lit,
+            two_sided=self.two_sided,
+            shape=shape,
+            rgb=self.rgb,
+            masked=masked,
+            more=more,
+            faceted=self.faceted,
+        )
         self.extended = masked or bool(more)
         self.corners = box_corners(self.low, self.high)
 
@@ -229,17 +238,17 @@ def _draw_item(index: int, obj: SceneObject, part: Part, scene: Scene, grey: _Gr
         )
     mirrors = part.culled and mesh.deformer is not None and mesh.deformer.mirrors
     return DrawItem(
-        index,
-        mesh,
-        material,
-        centre,
-        radius,
-        low,
-        high,
-        _LAYER[category],
-        not part.culled or mirrors,
-        not material.unlit,
-        not obj.is_static,
+        object_index=index,
+        mesh=mesh,
+        material=material,
+        centre=centre,
+        radius=radius,
+        low=low,
+        high=high,
+        layer=_LAYER[category],
+        two_sided=not part.culled or mirrors,
+        lit=not material.unlit,
+        moves=not obj.is_static,
         rgb=grey.rgb(material, mesh),
         casts=category in ("object", "wall") and not material.unlit,
         faceted=not material.unlit and facets.flat(mesh),

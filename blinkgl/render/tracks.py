@@ -59,15 +59,15 @@ def _followed(scene: Scene, hits: Hits, times: list[int], query: np.ndarray) -> 
         xy[:, k], world[:, k], depth[:, k], seen = places(scene, hits, t_ns)
         occluded[:, k] = ~seen
     return Tracks(
-        np.array([t // 1000 for t in times], np.int64),
-        query,
-        xy,
-        occluded,
-        world,
-        depth,
-        hits.instance.astype(np.uint16),
-        np.stack([hits.part, hits.triangle], axis=1).astype(np.int32),
-        hits.bary,
+        t_us=np.array([t // 1000 for t in times], np.int64),
+        query_points=query,
+        target_points=xy,
+        occluded=occluded,
+        points_world=world,
+        depth=depth,
+        instance=hits.instance.astype(np.uint16),
+        surface=np.stack([hits.part, hits.triangle], axis=1).astype(np.int32),
+        weights=hits.bary,
     )
 
 
@@ -136,16 +136,16 @@ def _of_surfaces(scene: Scene, points: int, times: list[int], rng: np.random.Gen
         ids = np.array([obj.instance_id for obj, _ in parts], np.int32)[chosen[:, 0]]
         nothing = np.zeros(draws)
         hits = Hits(
-            np.zeros((draws, 2)),
-            times[0],
-            np.ones(draws, bool),
-            nothing,
-            ids,
-            chosen[:, 0],
-            chosen[:, 1],
-            np.ones(draws, bool),
-            np.column_stack([1 - u - v, u, v]),
-            np.zeros((draws, 3)),
+            xy=np.zeros((draws, 2)),
+            t_ns=times[0],
+            hit=np.ones(draws, bool),
+            depth=nothing,
+            instance=ids,
+            part=chosen[:, 0],
+            triangle=chosen[:, 1],
+            front=np.ones(draws, bool),
+            bary=np.column_stack([1 - u - v, u, v]),
+            local=np.zeros((draws, 3)),
         )
         tracks = _followed(scene, hits, times, np.zeros((draws, 3)))
         rows = np.flatnonzero(~tracks.occluded.all(axis=1))[:left]

@@ -75,7 +75,13 @@ def histogram(
     median = float(np.median(values))
     label = min(max(place(min(max(median, low), high)), LEFT + 60), WIDTH - LEFT - 60)
     return Histogram(
-        bars, step - 1, float(low), float(high), median, place(median) if low <= median <= high else None, label
+        bars=bars,
+        bar_width=step - 1,
+        low=float(low),
+        high=float(high),
+        median=median,
+        median_x=place(median) if low <= median <= high else None,
+        label_x=label,
     )
 
 

@@ -172,13 +172,13 @@ def make_light(config: LightConfig, rng: np.random.Generator | None = None, furt
     further : lamps in addition to the configuration's."""
     drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
     return Light(
-        config.sun_direction(*drawn),
-        config.sun,
-        config.sky,
-        config.sun_color,
-        config.sky_color,
-        math.radians(config.sun_size),
-        (*(_lamp(one) for one in config.lights), *further),
+        sun_direction=config.sun_direction(*drawn),
+        sun=config.sun,
+        sky=config.sky,
+        sun_color=config.sun_color,
+        sky_color=config.sky_color,
+        sun_size=math.radians(config.sun_size),
+        lamps=(*(_lamp(one) for one in config.lights), *further),
         shadows=config.shadows,
         shadow_size=config.shadow_size,
     )
@@ -194,7 +194,15 @@ def _lamp(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
         return Lamp("point", strength, StaticPath(lamp_pose(config.position)), reach)
     outer = math.radians(config.angle / 2)
     pose = lamp_pose(config.position, np.subtract(config.look_at, config.position))
-    return Lamp("spot", strength, StaticPath(pose), reach, outer * (1 - config.edge), outer, config.size)
+    return Lamp(
+        kind="spot",
+        strength=strength,
+        path=StaticPath(pose),
+        reach=reach,
+        inner=outer * (1 - config.edge),
+        outer=outer,
+        size=config.size,
+    )
 
 
 def lit_by(panorama: Environment, factor: float, light: Light) -> Light:

@@ -71,14 +71,14 @@ def measured(path: PosePath, config: ImuConfig, t0_ns: int, t1_ns: int, rng: np.
     bias_w = config.gyroscope_random_walk * np.sqrt(dt) * np.cumsum(walk[0], 0) + 0.0
     bias_a = config.accelerometer_random_walk * np.sqrt(dt) * np.cumsum(walk[1], 0) + 0.0
     return Inertial(
-        np.array(times, np.int64),
-        rate + bias_w + config.gyroscope_noise_density / np.sqrt(dt) * white[0],
-        force + bias_a + config.accelerometer_noise_density / np.sqrt(dt) * white[1],
-        rate,
-        force,
-        bias_w,
-        bias_a,
-        T_cam_imu,
+        t_ns=np.array(times, np.int64),
+        rate=rate + bias_w + config.gyroscope_noise_density / np.sqrt(dt) * white[0],
+        acceleration=force + bias_a + config.accelerometer_noise_density / np.sqrt(dt) * white[1],
+        ideal_rate=rate,
+        ideal_acceleration=force,
+        rate_bias=bias_w,
+        acceleration_bias=bias_a,
+        T_cam_imu=T_cam_imu,
     )
 
 

@@ -269,7 +269,17 @@ class TensorEsim(Batch):
         step = on if self._same_steps else torch.where(above, on, off)
         gap = torch.maximum(log - upper, lower - log)
         whole = (log - take(self._log)).abs()
-        return Firing(index, self._env_of(index), log, whole, gap, above.to(torch.int64), on, off, step)
+        return Firing(
+            flat=index,
+            env=self._env_of(index),
+            log=log,
+            whole=whole,
+            gap=gap,
+            polarity=above.to(torch.int64),
+            on=on,
+            off=off,
+            step=step,
+        )
 
     def _at_once(self, f: Firing, counts: Tensor, sizes: Sizes, v: Interval, cap: Tensor | None) -> Found:
         """Return all events in raster order and move the levels."""

@@ -232,7 +232,17 @@ class TensorV2e(Batch):
         # kappa = 2 pi f_c dt / 275, time constants per DN of (I + 20).
         kappa = given([2 * np.pi * config.cutoff_hz * dt * 1e-9 / 275.0 for dt in lengths])
         dt, since = given([dt * 1e-9 for dt in lengths]), given(since_1)
-        step = Step(v.t0_ns, v.t0_ns - 1000 * v.base_us, v.dt_ns, dt, given(since_0), since, kappa, None, None)
+        step = Step(
+            t0_ns=v.t0_ns,
+            start_ns=v.t0_ns - 1000 * v.base_us,
+            dt_ns=v.dt_ns,
+            dt=dt,
+            since_0=given(since_0),
+            since_1=since,
+            kappa=kappa,
+            low=None,
+            high=None,
+        )
         return Numbers(step, column(kappa), column(since), lengths)
 
     def _refuse_noise(self, interval: Interval) -> None:

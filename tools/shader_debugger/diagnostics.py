@@ -40,10 +40,30 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
         source = sources[stage]
         line, (file, own) = _line(source.text, number), source.locate(number)
         if not file:  # a generated line: an include guard, a #define
-            found.append(Diagnostic(source.name, 0, 0, kind, text, stage, f"generated line: {line}"))
+            found.append(
+                Diagnostic(
+                    file=source.name,
+                    line=0,
+                    column=0,
+                    kind=kind,
+                    text=text,
+                    stage=stage,
+                    excerpt=f"generated line: {line}",
+                )
+            )
             continue
         column = _column(line, text, column)
-        found.append(Diagnostic(file, own, column, kind, text, stage, excerpt(folder, file, own, column)))
+        found.append(
+            Diagnostic(
+                file=file,
+                line=own,
+                column=column,
+                kind=kind,
+                text=text,
+                stage=stage,
+                excerpt=excerpt(folder, file, own, column),
+            )
+        )
     if any(d.kind == "error" for d in found):
         return found
     said = str(error).removeprefix(f"{error.where}: ")
@@ -56,7 +76,17 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
         return [Diagnostic(next(iter(sources.values())).name, 0, 0, "error", said)]
     file, _, number = (error.where or "").rpartition(":")
     if file and number.isdigit():
-        return [Diagnostic(file, int(number), 1, "error", said, "", excerpt(folder, file, int(number), 1))]
+        return [
+            Diagnostic(
+                file=file,
+                line=int(number),
+                column=1,
+                kind="error",
+                text=said,
+                stage="",
+                excerpt=excerpt(folder, file, int(number), 1),
+            )
+        ]
     return [Diagnostic(error.where or "shaders", 0, 0, "error", said)]
 
 

@@ -175,7 +175,15 @@ def _of_label(label: Label, view: View) -> Quantity:
     def error(g, r, gpu, ref):
         return view.error(g, r, gpu.when.interval_s)
 
-    return Quantity(view.name, view.judged_in, view.tolerance, error, view.statistic, view.same_triangle, view.note)
+    return Quantity(
+        name=view.name,
+        unit=view.judged_in,
+        tolerance=view.tolerance,
+        error=error,
+        statistic=view.statistic,
+        same_triangle=view.same_triangle,
+        note=view.note,
+    )
 
 
 QUANTITIES = OfLabels(_of_label, _BEFORE, _SHADED)

@@ -194,7 +194,15 @@ def body_of(body: Proportions, level: int = 0) -> Body:
     vertices[:, 2] -= floor
     bind[:, 2, 3] -= floor
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    made = Body(vertices, outward, uvs, faces, joints, weights, np.linalg.inv(bind))
+    made = Body(
+        vertices=vertices,
+        normals=outward,
+        uvs=uvs,
+        faces=faces,
+        joints=joints,
+        weights=weights,
+        inverse_bind=np.linalg.inv(bind),
+    )
     for array in made:
         array.setflags(write=False)
     return made

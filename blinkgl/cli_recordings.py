@@ -158,12 +158,6 @@ def compare(
     stream: of_events.Stream = None,
     damaged: of_events.Damaged = "refuse",
     sort: of_events.Sort = False,
-    judge: Annotated[
-        bool,
-        typer.Option(
-            "--judge", help="Also report how well a classifier distinguishes A from B, and the halves of each."
-        ),
-    ] = False,
 ) -> int:
     """Describe a recording, or compare it with events or frames. The table has counts, rates, intervals, and
     polarity against brightness."""
@@ -189,7 +183,6 @@ def compare(
         frame_delay_ms=frame_delay_ms,
         interval_ms=interval_ms,
         zero_time=zero_time,
-        judge=judge,
         reading=EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort),
     )
 

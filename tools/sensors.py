@@ -39,10 +39,10 @@ from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.calibration import judge_half
 from blinkgl.recordings.clip import Clip, FrameReading, clip_of_frames, read_recording, timed_frames
-from blinkgl.recordings.judge import judge
 from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import sums
+from blinkgl.tools.judge import judge
 from blinkgl.tools.real_recordings import read, table
 from blinkgl.types.events import Events
 

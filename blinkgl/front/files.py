@@ -130,7 +130,6 @@ def compare(
     frames: str | os.PathLike | None = None,
     interval_ms: float = 20.0,
     zero_time: bool = False,
-    judge: bool = False,
     gamma: str | float | None = None,
     frame_delay_ms: float = 0.0,
     **declared: Unpack[DeclaredBoth],
@@ -143,7 +142,6 @@ def compare(
     what the file does not say of them, as of :func:`simulate_file` (``frames_time_unit`` is its ``time_unit``).
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event, and frames from the
     first.
-    judge : also compute how well a classifier separates b from a, and the halves of each: ``told_apart``, ``halves``.
     time_unit, size … : of both event files, as of :func:`open_events`.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
@@ -157,7 +155,6 @@ def compare(
         frame_delay_ms=check.number(frame_delay_ms, "frame_delay_ms", least=-1e6, most=1e6),
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
-        judge=bool(judge),
         reading=event_reading(declared),
     )
 

@@ -30,7 +30,6 @@ from blinkgl.recordings.clip import (
     read_recording,
     timed_frames,
 )
-from blinkgl.recordings.judge import judge
 from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
 from blinkgl.recordings.statistics import GroupSums, correlation, interval_distance, sums
@@ -47,8 +46,7 @@ class Judged:
     interval_distance : Kolmogorov-Smirnov distance of the intervals between the events of a pixel.
     polarity_correlation : of polarity sums per interval, blurred by a pixel; NaN for a still scene.
     count_correlation : of the events of single pixels.   still_hz : rate of the pixels that saw no change, events per
-    second and pixel; NaN where there are too few of them.   told : AUC of the judge (:mod:`~blinkgl.recordings.judge`);
-    NaN where there are too few patches."""
+    second and pixel; NaN where there are too few of them."""
 
     events: int
     recorded: int
@@ -59,7 +57,6 @@ class Judged:
     count_correlation: float
     still_hz: float
     recorded_still_hz: float
-    told: float = float("nan")
 
     @property
     def rate_ratio(self) -> float:
@@ -244,12 +241,7 @@ def _judged(clip: Clip, stream: Events, halves: tuple[tuple[int, int], tuple[int
 
     def of(part: tuple[int, int]) -> Judged:
         own = sums(clip.events, clip, *part)
-        span = int(clip.edges_us[part[0]]), int(clip.edges_us[part[1]])
-        try:
-            told = judge(clip.events, stream, clip.size, span).auc
-        except EventDataError:  # too few events
-            told = float("nan")
-        return judge_half(own, sums(stream, clip, *part, own), told)
+        return judge_half(own, sums(stream, clip, *part, own))
 
     return of(halves[0]), of(halves[1])
 
@@ -293,7 +285,7 @@ def _without_lag(
     return again
 
 
-def judge_half(recorded: GroupSums, simulated: GroupSums, told: float = float("nan")) -> Judged:
+def judge_half(recorded: GroupSums, simulated: GroupSums) -> Judged:
     """Return the comparison of ``simulated`` with ``recorded``; its products must be with ``recorded``."""
     own, other = recorded.without(None), simulated.without(None)
     total = lambda parts: parts[0].sum(axis=0) + parts[4]  # OFF, ON of those that moved and of those that did not
@@ -312,7 +304,6 @@ def judge_half(recorded: GroupSums, simulated: GroupSums, told: float = float("n
         count_correlation=correlation(alike),
         still_hz=hz(other),
         recorded_still_hz=hz(own),
-        told=told,
     )
 
 

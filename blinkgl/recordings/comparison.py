@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,15 +23,10 @@ from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
-if TYPE_CHECKING:
-    from blinkgl.recordings.judge import Judgement
-
 IEI_EDGES_US = np.logspace(0, 7, 71)
 """Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
 LOG_OFFSET = 10.0
 """Added to the 8-bit code before the logarithm, so that the dark noise of real frames does not dominate."""
-TOLD = 0.6
-"""AUC of the judge above which its features are reported."""
 BLUR_PX = 1.0
 """Sigma of the Gaussian on both maps before a correlation, which removes single-event quantisation and sub-pixel
 shifts."""
@@ -80,17 +75,14 @@ class Comparison:
     differ in size.
 
     pixel_correlation : Pearson correlation over the pixels of the event counts of a and b.   polarity_correlation :
-    (K,) the same of their blurred polarity sums in each interval.   told_apart : how well a judge distinguishes b from
-    a; None: not requested, or there is no b.   halves : how well it distinguishes the halves of each recording, a's
-    first.   notes : what was guessed, left out or unusual when files and frames were read, a line each."""
+    (K,) the same of their blurred polarity sums in each interval.   notes : what was guessed, left out or unusual when
+    files and frames were read, a line each."""
 
     edges_us: np.ndarray
     a: RecordingSide
     b: RecordingSide | None
     pixel_correlation: float | None = None
     polarity_correlation: np.ndarray | None = None
-    told_apart: Judgement | None = None
-    halves: tuple[Judgement, ...] = ()
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -143,17 +135,6 @@ class Comparison:
                     ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}"),
                 ]
             rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
-        if self.halves:
-            cells = [f"{j.auc:.3f} ± {j.spread:.3f}" for j in self.halves]
-            rows += [("judge: a recording's own halves, AUC", cells[0], cells[1] if self.b else "")]
-        if self.told_apart:
-            told = self.told_apart
-            rows += [("judge: A from B, AUC", "", f"{told.auc:.3f} ± {told.spread:.3f}")]
-            if told.paired is not None:
-                rows += [("judge: A from B, the same patch in both, AUC", "", f"{told.paired:.3f}")]
-            if told.auc > TOLD:
-                by = "; ".join(f"{name} {100 * share:.0f} %" for name, share in told.telling)
-                rows += [("judge: by what", "", by)]
         return rows
 
     def to_dict(self) -> dict[str, Any]:
@@ -181,8 +162,6 @@ class Comparison:
             "edges_us": _plain(self.edges_us),
             "duration_s": self.duration_s,
             "iei_edges_us": _plain(IEI_EDGES_US),
-            "told_apart": None if self.told_apart is None else asdict(self.told_apart),
-            "halves": [asdict(one) for one in self.halves],
             "a": side(self.a),
             **pair,
         }
@@ -198,7 +177,6 @@ def compare(
     frame_delay_ms: float = 0.0,
     interval_ms: float = 20.0,
     zero_time: bool = False,
-    judge: bool = False,
     reading: EventReading = AS_FILE,
 ) -> Comparison:
     """Compare event file ``a`` with event file ``b``, with ``frames``, or with both, over their common time; alone,
@@ -211,11 +189,10 @@ def compare(
     gamma : of their codes; None: as of :func:`~blinkgl.recordings.decoding.meaning`, where grey images count as the
     camera's own, whose codes are intensities.
     frame_delay_ms : added to the frames' times; a stamp of the exposure's start is before its centre. zero_time : count
-    both recordings from their first event, and frames from the first of them. judge : also train a classifier to
-    distinguish them (:mod:`~blinkgl.recordings.judge`), which holds their events in memory. reading : what is declared
+    both recordings from their first event, and frames from the first of them. reading : what is declared
     of both event files.
 
-    Raises EventDataError: frames of another size than a recording, no common time, too few events for a judge.
+    Raises EventDataError: frames of another size than a recording, no common time.
     AssetError: unreadable.
     """
     if b is not None and frames is None and not _is_event_file(b):
@@ -244,29 +221,7 @@ def compare(
         )
     result = _accumulate(files, shifts, edges, changes)
     result.notes += [f"{file.path}: {line}" for file in files for line in file.notes] + notes
-    if judge:
-        result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))
     return result
-
-
-def _judged(
-    files: list[EventFile], shifts: list[int], span_us: tuple[int, int]
-) -> tuple[tuple[Judgement, ...], Judgement | None]:
-    """Compare the halves of each, and the two with each other: patch by patch where they are of one size."""
-    from blinkgl.recordings import judge
-
-    events = [
-        _joined([chunk.window(span_us[0] + d, span_us[1] + d) for chunk in f.chunks()], d)
-        for f, d in zip(files, shifts)
-    ]
-    sizes = [(int(f.height or 0), int(f.width or 0)) for f in files]
-    halves = tuple(judge.judge_halves(e, size, span_us) for e, size in zip(events, sizes))
-    if len(files) < 2:
-        return halves, None
-    (a, b), (size_a, size_b) = events, sizes
-    if size_a == size_b:
-        return halves, judge.judge(a, b, size_a, span_us)
-    return halves, judge.judge_unlike(a, b, size_a, size_b, span_us)
 
 
 def _accumulate(

@@ -14,6 +14,10 @@ from blinkgl.types.events import Events
 
 SIDE_PX = 16
 WINDOWS = 16
+LEAST_IN_PATCH = 8
+"""Events; patches with fewer are not used."""
+LEAST_PATCHES = 100
+"""Fewer patches with events are not enough."""
 """Number of time windows; a patch is SIDE_PX x SIDE_PX pixels by one of them."""
 NEAR_US = 2000
 """An event has company where an adjacent pixel fired at most this long before."""

@@ -16,8 +16,7 @@ from blinkgl.machine.kernels import kernel
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.clip import TILE_PX, Clip
 from blinkgl.recordings.comparison import BLUR_PX, histogram_distance
-from blinkgl.recordings.judge import LEAST_IN_PATCH, LEAST_PATCHES
-from blinkgl.recordings.patches import NAMES, SIDE_PX, patches
+from blinkgl.recordings.patches import LEAST_IN_PATCH, LEAST_PATCHES, NAMES, SIDE_PX, patches
 from blinkgl.types.events import Events
 
 GROUPS = 16

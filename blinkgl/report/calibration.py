@@ -49,8 +49,6 @@ def rows(result: Calibration) -> list[tuple[str, list[str]]]:
     if not np.isnan(result.judged[0].polarity_correlation):
         found.append(("polarity, correlation", each(lambda j: "1", lambda j: f"{j.polarity_correlation:.3f}")))
         found.append(("events of a pixel, correlation", each(lambda j: "1", lambda j: f"{j.count_correlation:.3f}")))
-    if not np.isnan([b.told + f.told for b, f in sides]).all():
-        found.append(("judge, AUC", each(lambda j: "0.5", lambda j: text(j.told, "{:.3f}"))))
     if not np.isnan(result.judged[0].still_hz):
         found.append(
             (

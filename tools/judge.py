@@ -14,14 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from blinkgl.errors import EventDataError
-from blinkgl.recordings.patches import NAMES, WINDOWS, patches
+from blinkgl.recordings.patches import LEAST_IN_PATCH, LEAST_PATCHES, NAMES, WINDOWS, patches
 from blinkgl.types.events import Events
 
 FOLDS = 4
-LEAST_IN_PATCH = 8
-"""Events, on either side; patches with fewer are not used."""
-LEAST_PATCHES = 100
-"""Patches of either side; fewer are not enough."""
 MOST_PATCHES = 20_000
 _BINS, _ROUNDS, _RATE = 24, 80, 0.15
 _TELLING = 3

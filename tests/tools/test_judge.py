@@ -8,14 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from blinkgl.cli import run
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.io.formats import write_events
-from blinkgl.recordings.comparison import compare
-from blinkgl.recordings.judge import LEAST_PATCHES, area, boosted, judge, judge_halves
-from blinkgl.recordings.patches import WINDOWS
+from blinkgl.recordings.patches import LEAST_PATCHES, WINDOWS
 from blinkgl.recordings.simulation import frames_to_events
+from blinkgl.tools.judge import area, boosted, judge, judge_halves, judge_unlike
 from blinkgl.types.events import Events
 
 H, W = 96, 128
@@ -48,23 +45,13 @@ def test_stumps_learn_what_one_feature_says_and_nothing_of_chance():
     assert abs(area(boosted(x[:1000], shuffled[:1000], x[1000:])[0], shuffled[1000:]) - 0.5) < 0.08
 
 
-def test_the_same_law_cannot_be_told_apart_and_another_can(tmp_path):
-    names = {
-        "a": poisson(8),
-        "same": poisson(8, seed=1),
-        "more_on": poisson(8, 0.65, seed=2),
-        "small": poisson(8, 0.9, seed=3, size=(64, 80)),
-    }
-    for name, events in names.items():
-        write_events(tmp_path / f"{name}.npz", events, *((64, 80) if name == "small" else (H, W)))
-    told = {n: compare(tmp_path / "a.npz", tmp_path / f"{n}.npz", judge=True) for n in ("same", "more_on", "small")}
-    assert abs(told["same"].told_apart.auc - 0.5) < 0.06
-    assert told["more_on"].told_apart.auc > 0.8 and told["small"].told_apart.auc > 0.95
-    assert all(abs(half.auc - 0.5) < 0.12 for result in told.values() for half in result.halves)
-    alone = compare(tmp_path / "a.npz", judge=True)
-    assert alone.told_apart is None and len(alone.halves) == 1
-    assert "judge: A from B, AUC" in [row[0] for row in told["same"].rows()]
-    assert told["same"].to_dict()["told_apart"]["auc"] == told["same"].told_apart.auc
+def test_the_same_law_cannot_be_told_apart_and_another_can():
+    span, a = (0, 1_000_000), poisson(8)
+    assert abs(judge(a, poisson(8, seed=1), (H, W), span).auc - 0.5) < 0.08
+    assert judge(a, poisson(8, 0.65, seed=2), (H, W), span).auc > 0.8
+    small = poisson(8, 0.9, seed=3, size=(64, 80))
+    assert judge_unlike(a, small, (H, W), (64, 80), span).auc > 0.95
+    assert abs(judge_halves(a, (H, W), span).auc - 0.5) < 0.12
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +112,6 @@ def test_two_halves_of_one_stream_are_not_told_apart(moving):
     assert abs(found.auc - 0.5) < 0.06 and abs(found.paired - 0.5) < 0.06
 
 
-def test_too_few_events_is_one_line(tmp_path, capsys):
-    write_events(tmp_path / "a.npz", poisson(0.05), H, W)
-    assert run(["compare", str(tmp_path / "a.npz"), "--judge", "--out", str(tmp_path / "out")]) == 2
-    assert "too few patches with events for a judge" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+def test_too_few_events_are_refused():
     with pytest.raises(EventDataError, match=str(LEAST_PATCHES)):
         judge_halves(poisson(0.05), (H, W), (0, 1_000_000))

@@ -189,7 +189,11 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
             value = float(rng.normal(mean, deviation))
             if low <= value <= high:
                 return value
-        return mean
+        from scipy.special import ndtr, ndtri
+
+        # Limits so narrow that hardly a value lies in them: the same law, from its distribution function.
+        part = rng.uniform(*ndtr([(low - mean) / deviation, (high - mean) / deviation]))
+        return min(max(float(mean + deviation * ndtri(part)), low), high)
     low, high = (_number(x) for x in spec)
     if kind == "integer":
         return int(rng.integers(int(low), int(high), endpoint=True))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.stats import kstest
 
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
@@ -299,6 +300,13 @@ def test_the_threshold_that_is_not_given_follows_from_the_ratio(model):
         validate(model, {"contrast_threshold": 0.2, "contrast_threshold_off": 0.2, "threshold_ratio": 1.1})
     with pytest.raises(ConfigError, match="contrast_threshold_off: too large"):
         validate(model, {"contrast_threshold": 5, "threshold_ratio": 3})
+
+
+@pytest.mark.parametrize("low", [4.999, 4.9999995])
+def test_narrow_limits_of_a_normal_law_are_drawn_over_all_of_them(low):
+    """About the middle of so narrow limits the law is uniform; nothing is drawn so often as its mean."""
+    values = np.array([draw({"c": {"normal": [5, 1, low, 10 - low]}}, 0, k)["c"] for k in range(300)])
+    assert len(set(values)) == 300 and kstest((values - low) / (10 - 2 * low), "uniform").pvalue > 1e-3
 
 
 def test_the_normal_distribution():

@@ -118,9 +118,9 @@ class Motion:
         areas, sums, rows = np.zeros(BINS), np.zeros(BINS), np.zeros((len(self._items), 4))
         velocities = np.full((len(self._items), POINTS + 2, 2), np.nan)
         ranges = surfaces.ranges[few.astype(np.intp), np.arange(len(few))]
+        drawn, shapes = (T, D, self._body, ranges, sides), (points, rates, surfaces.faces)
         seen = view.planes, view.near, (view.corner, view.size, view.jacobians)
-        made = areas, sums, rows, velocities
-        largest = speeds.look(T, D, self._body, ranges, sides, points, rates, surfaces.faces, *seen, light, *made)
+        largest = speeds.look(drawn, shapes, seen, light, (areas, sums), rows, velocities)
         return Look(t_ns, areas, sums, float(largest), rows, velocities)
 
     def fastest(self, ta_ns: int, tb_ns: int, max_px: float) -> float:

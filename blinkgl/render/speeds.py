@@ -183,26 +183,50 @@ def _twice_area(p, q):
 
 
 @kernel(error_model="numpy")
+def _clipped(corners3, codes, polygon, other, view, row, corners, total):
+    """Cut a triangle at the edges of the view and add its corners to the sums over its polygon and its item; return
+    (the array that holds the rest, its number of corners, twice its area at distance 1)."""
+    planes, near, lens = view
+    polygon[0], polygon[1], polygon[2] = corners3
+    rest, count, area = polygon, 3, 0.0
+    if codes[0] | codes[1] | codes[2]:
+        rest, count = _in_view(polygon, other, planes, near, codes[0] & codes[1] & codes[2], row)
+    for k in range(count):
+        q = rest[k]
+        q[6], q[7], q[8] = _velocity(q[0], q[1], q[2], q[3], q[4], q[5], lens)
+        _add(q, corners, total, row)
+        area += _twice_area(q, rest[(k + 1) % count])
+    return rest, count, area
+
+
+@kernel(error_model="numpy")
+def _count(area, fastest, corners, count, total, histogram):
+    """Add a polygon of this area, px², and these corners to the sums over its item and to the histogram of speeds."""
+    areas, sums = histogram
+    total[_WHOLE] += area
+    total[_MEAN_X] += area * corners[_SUM_X] / count
+    total[_MEAN_Y] += area * corners[_SUM_Y] / count
+    if fastest >= SLOWEST:
+        k = min(max(int((math.log2(fastest) + 40.0) * OCTAVE), 0), BINS - 1)
+        areas[k] += area
+        sums[k] += area * fastest
+
+
+@kernel(error_model="numpy")
 def look(
-    T: np.ndarray,
-    D: np.ndarray,
-    body: np.ndarray,
-    ranges: np.ndarray,
-    sides: np.ndarray,
-    points: np.ndarray,
-    rates: np.ndarray,
-    faces: np.ndarray,
-    planes: np.ndarray,
-    near: float,
-    lens: tuple[np.ndarray, ...],
+    bodies: tuple[np.ndarray, ...],
+    shapes: tuple[np.ndarray, ...],
+    view: tuple,
     light: tuple[np.ndarray, ...],
-    areas: np.ndarray,
-    sums: np.ndarray,
+    histogram: tuple[np.ndarray, ...],
     rows: np.ndarray,
     velocities: np.ndarray,
 ) -> float:
-    """Fill the arrays of a :class:`~blinkgl.render.motion.Look` and return the largest speed. light : of
-    :func:`_patterns`."""
+    """Fill the arrays of a :class:`~blinkgl.render.motion.Look` and return the largest speed.
+
+    bodies : poses and their rates in camera axes; of each item its body, ranges and side.   shapes : points, their
+    rates, faces.   view : planes, near, lens.   light : of :func:`_patterns`.   histogram : areas and sums."""
+    (T, D, body, ranges, sides), (points, rates, faces), (planes, near, lens) = bodies, shapes, view
     room, largest, lit = 0, 0.0, len(light[0]) > 0
     for i in range(len(body)):
         room = max(room, int(ranges[i, 1] - ranges[i, 0]))
@@ -219,40 +243,22 @@ def look(
             if sides[i] * _behind(a, b, c) > 0.0:
                 continue
             corners[:] = 0.0
-            rest = polygon
-            whole = outside[ka] | outside[kb] | outside[kc]
-            if not whole and not lit:
+            rest, codes = polygon, (outside[ka], outside[kb], outside[kc])
+            if not codes[0] | codes[1] | codes[2] and not lit:
                 area, count = _twice_area(a, b) + _twice_area(b, c) + _twice_area(c, a), 3
                 _add(a, corners, total, row)
                 _add(b, corners, total, row)
                 _add(c, corners, total, row)
             else:
-                polygon[0], polygon[1], polygon[2] = a, b, c
-                count, area = 3, 0.0
-                if whole:
-                    common = outside[ka] & outside[kb] & outside[kc]
-                    rest, count = _in_view(polygon, other, planes, near, common, row)
-                for k in range(count):
-                    q = rest[k]
-                    q[6], q[7], q[8] = _velocity(q[0], q[1], q[2], q[3], q[4], q[5], lens)
-                    _add(q, corners, total, row)
-                    area += _twice_area(q, rest[(k + 1) % count])
+                rest, count, area = _clipped((a, b, c), codes, polygon, other, view, row, corners, total)
                 if count == 0:
                     continue
             row[SEEN] = 1.0
-            area = 0.5 * abs(area) * corners[_DENSITY]
-            fastest = corners[_FASTEST]
+            area, fastest = 0.5 * abs(area) * corners[_DENSITY], corners[_FASTEST]
             if lit:
                 fastest = max(fastest, _patterns(rest, count, area, light, lens))
             largest = max(largest, fastest)
-            area *= ranges[i, 4]
-            total[_WHOLE] += area
-            total[_MEAN_X] += area * corners[_SUM_X] / count
-            total[_MEAN_Y] += area * corners[_SUM_Y] / count
-            if fastest >= SLOWEST:
-                k = min(max(int((math.log2(fastest) + 40.0) * OCTAVE), 0), BINS - 1)
-                areas[k] += area
-                sums[k] += area * fastest
+            _count(area * ranges[i, 4], fastest, corners, count, total, histogram)
         _represent(moved, outside, last - first, total, velocities[i])
     return largest
 

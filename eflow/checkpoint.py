@@ -247,7 +247,12 @@ def keep_best(run: Path, model: FlowModel, ema: dict[str, Tensor] | None, step: 
 def optimizer_tensors(model: FlowModel, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Return AdamW's state by parameter name, and the states of torch's random generators (CPU, and GPU if any)."""
     names = {p: n for n, p in model.named_parameters()}
-    tensors = {f"{names[p]}/{k}": v for p, s in optimizer.state.items() for k, v in s.items() if torch.is_tensor(v)}
+    tensors = {
+        f"{name}/{k}": v
+        for p, name in names.items()
+        for k, v in optimizer.state.get(p, {}).items()
+        if torch.is_tensor(v)
+    }
     tensors["/rng/cpu"] = torch.get_rng_state()
     if torch.cuda.is_available():
         tensors["/rng/cuda"] = torch.cuda.get_rng_state()
@@ -314,9 +319,10 @@ def resume_run(folder: Path, config: TrainConfig, model: FlowModel, optimizer, e
     state = read_state(folder)
     saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
     saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
-    done = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
+    done: dict[str, Any] = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
     for path in sorted({*saved, *now}):
-        before, wanted = saved.get(path), now.get(path)
+        before: Any = saved.get(path)
+        wanted: Any = now.get(path)
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
         if before is not None and wanted is not None:
             free = free or ("content" in state and _PLACES.fullmatch(path))
@@ -353,7 +359,7 @@ def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig
             )
 
 
-def _leaves(tree, prefix: str = "") -> dict[str, object]:
+def _leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
     if isinstance(tree, dict) and tree:
         return {
             k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()
@@ -365,6 +371,7 @@ def _leaves(tree, prefix: str = "") -> dict[str, object]:
 
 def weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
     """Return the weights that ``init_from`` names, and that name. Raises AssetError: they are of another model."""
+    assert config.init_from is not None
     model = load_model(config.init_from, expected=None)
     if model.config.name != config.model.name:
         raise AssetError(

@@ -22,12 +22,12 @@ moves. Medians of windows were .17 to .27 for seven recordings of moving cameras
 def chosen(file: EventFile, asked: WindowsAsked, load: Callable[[str], infer.Predictor]) -> tuple[str, str]:
     """Return (name of a network, the line that says why): by the flow of :data:`BODIES`, which reads two windows, at
     three places of the recording. load : makes the predictor of a network."""
-    distances = []
+    distances, height, width = [], int(file.height or 0), int(file.width or 0)
     predictor = load(BODIES)
     for pair in _pairs(file, asked, predictor):
         if len(pair.old) and len(pair.new):
             flow, _ = predictor(pair)
-            distances.append(from_affine(flow, hit_pixels((pair.old, pair.new), file.height, file.width)))
+            distances.append(from_affine(flow, hit_pixels((pair.old, pair.new), height, width)))
     if not distances:
         return CAMERA, f"{CAMERA}, since there is no pair of windows with events ({BODIES} needs two)"
     distance = float(np.median(distances))

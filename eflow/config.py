@@ -76,7 +76,7 @@ class _Refined(Config):
     )
 
     @rule("trunk")
-    def _widths(trunk):
+    def _widths(trunk: tuple[int, ...] | None):
         if trunk is not None and not all(8 <= w <= 1024 for w in trunk):
             raise Refused("not widths", where="trunk", value=list(trunk), accepted="three numbers from 8 to 1024")
 
@@ -197,7 +197,7 @@ class AugmentConfig(Config):
     scale: tuple[float, float] = Field((-0.2, 0.5), description="log2 of the scale factor, [low, high]")
 
     @rule("scale")
-    def _ordered(scale):
+    def _ordered(scale: tuple[float, float]):
         if not -3 <= scale[0] <= scale[1] <= 3:
             raise Refused("not a range", where="scale", value=list(scale), accepted="[low, high] within [-3, 3]")
 
@@ -256,7 +256,7 @@ class SourceConfig(Config):
             )
 
     @rule("window_ms")
-    def _ordered(window_ms):
+    def _ordered(window_ms: tuple[float, float] | None):
         if window_ms is not None and not 0.01 <= window_ms[0] <= window_ms[1] <= 1e6:
             raise Refused("not a range", where="window_ms", value=list(window_ms), accepted="0.01 <= low <= high, ms")
 
@@ -291,7 +291,7 @@ class DataConfig(Config):
             raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
 
     @rule("crop", "augment.transpose")
-    def _square(crop, transpose):
+    def _square(crop: tuple[int, int] | None, transpose: float):
         if transpose and (crop is None or crop[0] != crop[1]):
             raise Refused("transposed samples differ in size: set a square crop, or augment.transpose to 0")
 

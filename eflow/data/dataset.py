@@ -51,11 +51,11 @@ class Mixture:
     """
 
     def __init__(self, sizes: list[int | None], weights: list[float], seed: int):
-        endless = [size is None for size in sizes]
-        sizes = [ENDLESS if size is None else size for size in sizes]
-        if not sizes or min(sizes) < 1 or len(sizes) != len(weights) or min(weights) < 0 or sum(weights) <= 0:
+        counted = [ENDLESS if size is None else size for size in sizes]
+        if not counted or min(counted) < 1 or len(counted) != len(weights) or min(weights) < 0 or sum(weights) <= 0:
             raise ValueError("sizes and weights")
-        self.sizes, self.seed, self.epoch_length, self.endless = sizes, seed, sum(sizes), endless
+        self.sizes, self.seed, self.epoch_length = counted, seed, sum(counted)
+        self.endless = [size is None for size in sizes]
         share = np.array(weights, float) / sum(weights) * self.epoch_length
         counts = np.floor(share).astype(int)
         for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
@@ -157,7 +157,7 @@ class FlowDataset(Dataset):
     def __len__(self) -> int:
         return int(self._starts[-1])
 
-    def __getitem__(self, key: Key | int) -> dict | None:
+    def __getitem__(self, key: Key | int) -> dict | None:  # type: ignore[bad-override-param-name]
         if isinstance(key, Key):
             return self._drawn(key)
         # Endless sources are empty intervals here, which "right" steps over.
@@ -171,6 +171,7 @@ class FlowDataset(Dataset):
         source = self.sources[key.source]
         # The next sample of an endless source belongs to its next draw.
         tries = 1 if is_endless(source) else min(len(source), MOST_TRIES)
+        name = ""
         for step in range(tries):
             sample = source[key.index if is_endless(source) else (key.index + step) % len(source)]
             name, sample = sample.name, self._with_events(sample)
@@ -209,7 +210,7 @@ class FlowDataset(Dataset):
         except EventDataError as error:
             raise EventDataError(error.problem, where=f"{s.name}: {error.where}") from None
         out = {k: torch.from_numpy(g) for k, g in grids.items()}
-        if s.flow is not None:
+        if s.flow is not None and s.valid is not None:
             if not np.isfinite(s.flow[s.valid]).all():
                 raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
             out["flow"] = torch.from_numpy(np.ascontiguousarray(s.flow.transpose(2, 0, 1), dtype=np.float32))
@@ -357,7 +358,7 @@ class _Carrying(Dataset):
     def __len__(self) -> int:
         return len(self.dataset)
 
-    def __getitem__(self, key: Key | int) -> dict | BlinkGLError:
+    def __getitem__(self, key: Key | int) -> dict | BlinkGLError | None:  # type: ignore[bad-override-param-name]
         try:
             return self.dataset[key]
         except BlinkGLError as error:

@@ -12,12 +12,19 @@ from blinkgl.config.base import placed
 from blinkgl.config.run import load_run
 from blinkgl.machine.closing import Closing
 from blinkgl.online.job import MIX, StreamJob, stream_seed
+from blinkgl.online.samples import StreamSample, WindowSample
 from blinkgl.online.stream import SampleStream
 from eflow.config import SourceConfig
 from eflow.data.window import RawSample, raw_sample
 
 LEAST_APART = 512
 """Rendered samples between two uses of one, at least."""
+
+
+def _windows(sample: WindowSample | StreamSample) -> RawSample:
+    """Return a sample of a stream of windows as sources give it."""
+    assert isinstance(sample, WindowSample)
+    return raw_sample(sample)
 
 
 class OnlineSource(Closing):
@@ -40,16 +47,16 @@ class OnlineSource(Closing):
 
     def __getitem__(self, n: int) -> RawSample:
         if self._uses == 1:
-            return raw_sample(self.stream.take(n))
+            return _windows(self.stream.take(n))
         newest, age = divmod(n, self._uses)
         if age == 0 and (gone := newest - self._uses * self._apart) >= self.stream.first:
             self.stream.drop(gone)
         wanted = newest - age * self._apart
-        return raw_sample(self.stream.peek(wanted if wanted >= 0 else wanted % (newest + 1)))
+        return _windows(self.stream.peek(wanted if wanted >= 0 else wanted % (newest + 1)))
 
     def first(self) -> RawSample:
         """Return the first sample of a training without consuming it."""
-        return raw_sample(self.stream.peek(self.stream.first))
+        return _windows(self.stream.peek(self.stream.first))
 
     def move(self, n: int, to: Path) -> None:
         """Move sample n to a file (read it by :func:`blinkgl.online.samples.read_sample`)."""
@@ -67,8 +74,9 @@ def open_online(
     first : the first sample to take.   batch : samples taken together.   loaded : samples that loader processes may
     take before their turn.
     Raises BlinkGLError: the recipe is bad, or cannot be rendered here."""
-    template = load_run(s.recipe, s.set)
-    template = load_run(s.recipe, s.set, seed=stream_seed(template.seed, seed))
+    recipe = str(s.recipe)
+    template = load_run(recipe, s.set)
+    template = load_run(recipe, s.set, seed=stream_seed(template.seed, seed))
     job = StreamJob(
         "",
         "",
@@ -84,7 +92,7 @@ def open_online(
     apart = max(LEAST_APART, loaded)
     kept = s.uses * apart if s.uses > 1 else 0
     first, ahead = max(0, first // s.uses - kept), 1 + (batch + kept) // (MIX * s.samples)
-    with placed(lambda where: f"{s.recipe}: {where}" if where else s.recipe):
+    with placed(lambda where: f"{recipe}: {where}" if where else recipe):
         stream = SampleStream.of(template, job, workers=s.workers, first=first, ahead=ahead)
         return OnlineSource(stream, s.uses, apart)
 

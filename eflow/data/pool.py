@@ -70,9 +70,12 @@ class PoolSource:
                 raise AssetError("not a window of eflow render, but a stream", where=str(path))
             for flow, valid in ((sample.flow, sample.valid), (sample.backward, sample.backward_valid)):
                 if flow is not None or valid is not None:
-                    fits = np.shape(flow) == (sample.height, sample.width, 2) and np.shape(valid) == sample.valid.shape
+                    size = sample.height, sample.width
                     if (
-                        not fits
+                        flow is None
+                        or valid is None
+                        or flow.shape != (*size, 2)
+                        or valid.shape != size
                         or flow.dtype != np.float32
                         or valid.dtype != bool
                         or not np.isfinite(flow[valid]).all()

@@ -66,12 +66,13 @@ class Window:
         there = np.ones(len(self.t) + len(t), bool)
         there[at] = False
         # The rest keep their order, around the places of the new events.
-        columns = []
+        columns: list[np.ndarray] = []
         for old, new in ((self.x, x), (self.y, y), (self.t, t), (self.p, p)):
             column = np.empty(len(there), old.dtype)
             column[at], column[there] = new[order], old
             columns.append(column)
-        return Window(*columns, self.t0, self.t1)
+        x, y, t, p = columns
+        return Window(x, y, t, p, self.t0, self.t1)
 
 
 def hit_pixels(windows: Iterable[Window], height: int, width: int) -> np.ndarray:
@@ -118,7 +119,8 @@ class RawSample:
         turn = lambda a: None if a is None else np.flip(a, image_axis)
         sign = np.ones(2, np.float32)
         sign[component] = -1
-        signed = lambda f: None if f is None else turn(f) * sign  # a new array: sources may share theirs
+        # a new array: sources may share theirs
+        signed = lambda f: None if f is None else np.flip(f, image_axis) * sign
         return replace(
             self,
             old=self.old.flipped(axis, size),
@@ -133,7 +135,7 @@ class RawSample:
     def transpose(self) -> RawSample:
         """Return the sample with rows and columns, and components of flow, exchanged."""
         turn = lambda a: None if a is None else a.swapaxes(0, 1)
-        swapped = lambda f: None if f is None else turn(f)[..., ::-1]
+        swapped = lambda f: None if f is None else f.swapaxes(0, 1)[..., ::-1]
         return replace(
             self,
             old=self.old.transposed(),

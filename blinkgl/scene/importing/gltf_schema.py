@@ -216,14 +216,8 @@ class Animation(_Part):
 
 
 class Spot(_Part):
-    innerConeAngle: Annotated[float, Field(ge=0, lt=1.5708)] = 0.0
+    innerConeAngle: Annotated[float, Field(ge=0, le=1.5708)] = 0.0
     outerConeAngle: Annotated[float, Field(gt=0, le=1.5708)] = 0.7853981633974483
-
-    @model_validator(mode="after")
-    def _inside(self):
-        if self.innerConeAngle >= self.outerConeAngle:
-            raise ValueError("a spot light's inner cone is not inside its outer cone")
-        return self
 
 
 class PunctualLight(_Part):

@@ -1,12 +1,14 @@
 """Mesh files (obj, ply, each by a reader of its own; stl, off, 3mf by :mod:`blinkgl.scene.importing.trimesh_files`;
 glb, gltf by :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
-Sizes that a file declares are checked against limits before memory is allocated, and only files in the file's own
-folder are read.
+Sizes that a file declares are checked against limits before memory is allocated, and only files below a border are
+read (:mod:`blinkgl.scene.importing.neighbours`).
 """
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,10 +22,11 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, play as play_clip, shown
-from blinkgl.scene.importing.gltf_file import buffer_contents
-from blinkgl.scene.importing.obj import read_obj
+from blinkgl.scene.importing.gltf_file import files_of_gltf, parse
+from blinkgl.scene.importing.neighbours import Neighbours
+from blinkgl.scene.importing.obj import files_of_obj, read_obj
 from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
-from blinkgl.scene.importing.ply import read_ply
+from blinkgl.scene.importing.ply import checked_ply, files_of_ply, read_ply
 from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
@@ -51,6 +54,15 @@ class Asset:
     clips: tuple[str, ...] = ()
     replay: Callable[[AnimationConfig], Asset] | None = None
 
+    @property
+    def has_looks(self) -> bool:
+        """Return whether its file chose its looks: textures, light of its own, colours of vertices, or anything but one
+        plain grey, which exporters write where no one chose."""
+        worn = [part.material for part in self.parts]
+        pictured = any(m.texture is not None or m.bumps is not None or any(m.emission) for m in worn)
+        own = pictured or any(part.mesh.colours is not None for part in self.parts)
+        return self.has_materials and (own or len({c for m in worn for c in m.base_color}) > 1)
+
     def normalised(self) -> Asset:
         """Return it with the bounding box centred on the origin and bounding radius 1; a deforming one by its whole
         region. Raises AssetError where nothing of it is visible."""
@@ -71,8 +83,11 @@ def load_asset(
     uv_size: float | None = None,
     up: str = "auto",
     play: ClipOf | None = None,
+    border: Path | None = None,
 ) -> Asset:
     """Return one object from a file.
+
+    border : folder that the files which it names must lie below; None: its own.
 
     play : for a glTF file, returns the clip that it plays (:func:`clip_of`); None: it is at rest.
     up : the file's upward axis, which becomes z, "y" or "z"; "auto" is y for glb and gltf, by their standard, and z for
@@ -81,13 +96,17 @@ def load_asset(
         texture (projected where the file has none or degenerate ones).
     uv_size : edge of one repeat of projected texture coordinates.
     Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or
-    ``max_bytes`` bytes, references outside its folder, a required extension that is not supported; ConfigError:
+    ``max_bytes`` bytes, buffers beyond the border, a required extension that is not supported; ConfigError:
     ``play`` does not find its clip.
     """
     path = Path(path)
     where = str(path)
     with reading("mesh", where):
-        found, digest = _found(path, max_faces, max_bytes, keep_materials, max_texture, source_hash, up, play)
+        data = contents(path, "mesh", max_bytes=max_bytes)
+        digest = source_hash or identity_of(path, data, border, keep_materials).whole
+        found = _found(
+            data, Neighbours(path, border, Omissions(path.name)), max_faces, keep_materials, max_texture, up, play
+        )
         limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, where)
         has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
         common = {"name": path.stem, "where": where, "source_hash": digest, "log": found.log}
@@ -102,7 +121,7 @@ def load_asset(
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
     asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
     given = {"max_faces": max_faces, "max_bytes": max_bytes, "keep_materials": keep_materials, "uv_size": uv_size}
-    again = partial(load_asset, path, **given, max_texture=max_texture, source_hash=source_hash, up=up)
+    again = partial(load_asset, path, **given, max_texture=max_texture, source_hash=source_hash, up=up, border=border)
     return replace(asset, replay=lambda config: again(play=clip_of(config))) if asset.clips else asset
 
 
@@ -122,26 +141,28 @@ class _Found(NamedTuple):
     clips: list[str]
 
 
-def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, play) -> tuple[_Found, str]:
-    """Return the meshes of the file, and the hash of its content."""
-    where, suffix = str(path), path.suffix.lower()
-    if suffix not in MESH_SUFFIXES:
-        raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
-    data = contents(path, "mesh", max_bytes=max_bytes)
-    # A .gltf file is only its JSON: the buffers beside it decide about the mesh, too.
-    digest = source_hash or content_hash(data, *dependencies(path, data))
+def _found(data: bytes, near: Neighbours, max_faces: int, materials: bool, max_texture: int, up, play) -> _Found:
+    """Return the meshes of the file."""
+    suffix = _suffix(near.path)
     is_gltf = suffix in (".glb", ".gltf")
     # Only glTF's standard says which axis is up.
     turn = Z_UP if up == "y" or (up == "auto" and is_gltf) else None
     if is_gltf:
-        document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=materials)
-        return _of_document(document, play, turn), digest
+        limits = {"max_faces": max_faces, "max_texture": max_texture}
+        return _of_document(gltf.read(near.path, data, **limits, materials=materials, border=near.border), play, turn)
     if play is not None:
-        raise AssetError("only glTF files have animations", where=where, accepted="a gltf or glb file, or no animation")
-    omissions, log = Omissions(path.name), []
-    raws = _reader(suffix)(path, data, max_faces, max_texture if materials else None, omissions, log)
+        accepted = "a gltf or glb file, or no animation"
+        raise AssetError("only glTF files have animations", where=str(near.path), accepted=accepted)
+    raws = _reader(suffix)(data, near, max_faces, max_texture if materials else None)
     raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
-    return _Found(raws, [None] * len(raws), log, omissions, []), digest
+    return _Found(raws, [None] * len(raws), near.log, near.omissions, [])
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise AssetError("unknown kind of mesh file", where=str(path), value=suffix, accepted=" ".join(MESH_SUFFIXES))
+    return suffix
 
 
 def _reader(suffix: str) -> Callable[..., list[RawMesh]]:
@@ -154,6 +175,59 @@ def _reader(suffix: str) -> Callable[..., list[RawMesh]]:
     from blinkgl.scene.importing.trimesh_files import read_meshes
 
     return read_meshes
+
+
+def border_of(path: Path, base: Path) -> Path:
+    """Return the folder that the files of a recipe's mesh lie below: the recipe's, or the mesh's own outside of it."""
+    return base if path.resolve().is_relative_to(base.resolve()) else path.parent
+
+
+class Identity(NamedTuple):
+    """What decides how an asset looks. files : hash of each file beside the mesh that is read for it, by its name from
+    the mesh's folder; "missing" where none is there.   shape : one hash of the mesh and its buffers.   whole : of
+    all."""
+
+    files: dict[str, str]
+    shape: str
+    whole: str
+
+
+def identity_of(path: Path, data: bytes, border: Path | None = None, materials: bool = True) -> Identity:
+    """Return the identity of a mesh file with the content ``data``: of its buffers, and with ``materials`` of its MTL
+    files and images. Raises AssetError: a file that cannot be read, a buffer that is missing or beyond the border."""
+    near, suffix = Neighbours(path, border), path.suffix.lower()
+    buffers = files_of_gltf(data, near, "buffers") if suffix == ".gltf" else ()
+    shape, files = [data], {}
+    for name, file in buffers:
+        shape.append(contents(file, "buffer"))
+        files[name] = content_hash(shape[-1])
+    looks = {".gltf": partial(files_of_gltf, key="images"), ".obj": files_of_obj, ".ply": files_of_ply}
+    looks[".glb"] = looks[".gltf"]
+    beside = looks[suffix](data, near) if materials and suffix in looks else ()
+    seen: dict[str, str] = {}
+    for name, file in beside:
+        where = name if file is None else Path(os.path.relpath(file, path.parent)).as_posix()
+        if where not in seen:
+            seen[where] = "missing" if file is None else content_hash(contents(file, "file"))
+    rows = [f"{name} {digest}".encode() for name, digest in seen.items()]
+    return Identity(files | seen, content_hash(*shape), content_hash(*shape, *rows))
+
+
+def check_header(path: Path, data: bytes, max_faces: int) -> None:
+    """Raise AssetError for a mesh file that its first lines, or what they say about its size, show to be unusable."""
+    suffix, where = _suffix(path), str(path)
+    with reading("mesh", where):
+        if suffix in (".glb", ".gltf"):
+            parse(data, where)
+        elif suffix == ".ply":
+            checked_ply(data, max_faces, where)
+        elif suffix == ".obj":
+            if re.search(rb"(?:^|[\r\n])[ \t]*fo?[ \t]", data) is None:
+                raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+        else:
+            from blinkgl.scene.importing.trimesh_files import check_kind
+
+            check_kind(suffix[1:], data, max_faces, where)
 
 
 def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:
@@ -203,8 +277,9 @@ def sides_of(material: Material, wanted: bool | None) -> bool | None:
     return material.both_sides if material.both_sides is None or wanted is None else wanted
 
 
-def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
-    """Return contents of the buffer files that a .gltf refers to (they are part of its content); [] for other files."""
-    if path.suffix.lower() != ".gltf":
-        return []
-    return buffer_contents(path, contents(path, "mesh") if data is None else data)
+def bytes_of(asset: Asset) -> int:
+    """Return the bytes of an asset's meshes and textures."""
+    meshes = [part.mesh for part in asset.parts]
+    own = sum(a.nbytes for m in meshes for a in (m.vertices, m.faces, m.normals, m.uvs))
+    worn = {id(part.material.texture): part.material.texture for part in asset.parts}
+    return own + sum(texture.image.nbytes for texture in worn.values() if texture is not None)

@@ -3,7 +3,6 @@ images beside such a file."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +12,14 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import MAX_COORDINATE, crease_normals, weld
 from blinkgl.scene.geometry.polygons import triangulate
-from blinkgl.scene.importing.gltf_file import inside
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
 from blinkgl.scene.reading import Omissions, contents, limit_faces
-from blinkgl.scene.surfaces.images import content_hash, decode_image
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, UNKNOWN_FORMAT, content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
+from blinkgl.srgb import linear_from_srgb
 
+OPACITY = "opacity of vertex colours (left out)"
 MAX_CORNERS = 50_000
 """Most corners of a polygon: ear clipping may take a time that grows with their square."""
 
@@ -112,21 +113,38 @@ def _check(given: Polygons, max_faces: int, where: str) -> None:
         raise AssetError(problem, where=place, value=value, accepted=f"0 to {last}")
 
 
-def beside(folder: Path, inner: str, name: str, where: str, omissions: Omissions) -> Path | None:
-    """Return a file that is named relative to the folder ``inner`` below ``folder``, or to that; None where it is
-    missing, which is added to ``omissions``. Raises AssetError for one outside ``folder``."""
-    name = name.strip('"').replace("\\", "/")
-    for base in dict.fromkeys((inner, "")):
-        try:
-            return inside(folder, os.path.normpath(os.path.join(base, name)), where)
-        except AssetError as error:
-            if "missing" not in error.problem:
-                raise
-    omissions.add(f"'{name}', which is missing")
-    return None
+def texture_beside(image: Path | None, max_texture: int, omissions: Omissions) -> Texture | None:
+    """Return the texture of a file beside a mesh; None: there is none, or none of a known format, which is noted."""
+    if image is None:
+        return None
+    try:
+        return texture_of(image, max_texture)
+    except AssetError as error:
+        if UNKNOWN_FORMAT not in error.problem or image.suffix.lower() in IMAGE_SUFFIXES:
+            raise
+        omissions.add(f"'{image.name}', whose format is not known")
+        return None
 
 
 def texture_of(image: Path, max_texture: int) -> Texture:
     """Return the texture of an image file. Raises AssetError naming it."""
     data = contents(image, "image")
     return Texture(decode_image(data, max_texture, str(image)), image.name, content_hash(data))
+
+
+def linear_colours(codes: np.ndarray, near: Neighbours, most: float | None = None) -> np.ndarray:
+    """Return (n, 3) linear light of (n, 3) sRGB codes; what is no number is white, which is noted.
+
+    most : the code of white; None: 1, or 255 or 65535 where whole numbers, or one beyond 2, say so."""
+    known = np.isfinite(codes).all(axis=1)
+    if not known.all():
+        near.log.append(f"{near.path.stem}: {(~known).sum()} colours are no numbers, they are drawn white")
+    largest = float(codes[known].max(initial=0))
+    if most is None:
+        whole = largest > 2 or bool((codes[known] % 1 == 0).all())
+        most = next((m for m in (1.0, 255.0, 65535.0) if largest <= m), 65535.0) if whole else 1.0
+        if most > 1:
+            near.log.append(f"{near.path.stem}: colours up to {largest:g} are taken as parts of {most:g}")
+    if largest > most:
+        near.log.append(f"{near.path.stem}: colours up to {largest:g} are drawn as {most:g}")
+    return linear_from_srgb(np.where(known[:, None], codes / most, 1.0).clip(0, 1))

@@ -6,78 +6,185 @@ import io
 import logging
 import re
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import trimesh
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import RawMesh, tinted, transformed
-from blinkgl.scene.importing.polygons import Polygons, raw_meshes
-from blinkgl.scene.reading import MAX_BYTES, Omissions, limit_faces
+from blinkgl.scene.importing.polygons import OPACITY, Polygons, linear_colours, raw_meshes
+from blinkgl.scene.reading import MAX_BYTES, limit_faces
 from blinkgl.srgb import linear_from_srgb
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings are of no use to a user
 
 
-def read_meshes(
-    path: Path, data: bytes, max_faces: int, max_texture: int | None, omissions: Omissions, log: list[str]
-) -> list[RawMesh]:
-    """Return raw meshes of an stl, off or 3mf file.
+def read_meshes(data: bytes, near: Neighbours, max_faces: int, max_texture: int | None) -> list[RawMesh]:
+    """Return raw meshes of an stl, off or 3mf file. ``near`` gets what is not drawn, and what was decided.
 
-    max_texture : None leaves colours out.   omissions, log : get what is not drawn, and what was decided. Raises
-    AssetError: truncated, corrupt, no faces, more than ``max_faces``."""
-    where, kind = str(path), path.suffix.lower()[1:]
+    max_texture : None leaves colours out. Raises AssetError: truncated, corrupt, no faces, more than ``max_faces``."""
+    where, kind = str(near.path), near.path.suffix.lower()[1:]
     if kind == "off":
-        return _off(data, max_faces, max_texture is not None, where, log)
-    {"stl": _check_stl, "3mf": _check_3mf}[kind](data, max_faces, where)
+        return _off(data, max_faces, max_texture is not None, near)
+    check_kind(kind, data, max_faces, where)
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     raws = []
     for node in loaded.graph.nodes_geometry:
         place, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            raws.append(transformed(_raw_mesh(mesh, max_texture is not None), np.asarray(place, np.float64)))
+            raw = RawMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+            raws.append(transformed(raw, np.asarray(place, np.float64)))
     if not raws:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    if kind == "3mf" and any(tag in _model_of(data) for tag in (b"basematerials", b"texture2d", b"colorgroup")):
-        omissions.add("colours and textures of 3MF (drawn white)")
+    if kind == "stl" and max_texture is not None:
+        return [_coloured_stl(data, raw, near) for raw in raws]
+    if kind == "3mf" and max_texture is not None:
+        _note_3mf(_model_of(data), near)
     return raws
 
 
-def _raw_mesh(mesh: trimesh.Trimesh, wanted: bool) -> RawMesh:
-    """Return raw triangles, with the colours of faces where they are ``wanted``."""
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    if not wanted or getattr(mesh.visual, "kind", None) != "face":
-        return RawMesh(vertices, faces)
-    codes = np.asarray(mesh.visual.face_colors)[:, :3] / 255
-    material, tint = tinted(None, linear_from_srgb(np.repeat(codes, 3, axis=0)))
-    # Colours belong to faces, so no two share a vertex.
-    apart = np.arange(faces.size).reshape(-1, 3)
-    return RawMesh(vertices[faces.ravel()], apart, None, None, material, colours=tint)
+def _coloured_stl(data: bytes, raw: RawMesh, near: Neighbours) -> RawMesh:
+    """Return the triangles with the colours of a binary STL file, five bits a channel in the two bytes behind each
+    face: those of Magics, whose header has "COLOR=" and the colour of all others, or of VisCAM and SolidView."""
+    count = (len(data) - 84) // 50
+    if len(raw.faces) != count or (len(data) - 84) % 50:
+        return raw
+    bits = np.frombuffer(data, np.dtype([("corners", "V48"), ("bits", "<u2")]), count, 84)["bits"].astype(np.int64)
+    low, middle, high = bits & 31, bits >> 5 & 31, bits >> 10 & 31
+    whole = data[:80].partition(b"COLOR=")[2][:4]
+    if b"MATERIAL=" in data[:80]:
+        near.omissions.add("the material of Magics (drawn by its colour alone)")
+    if len(whole) == 4:  # red is in the low bits, and bit 15 says that a face has the colour of all
+        codes, own = np.column_stack([low, middle, high]) / 31, bits >> 15 == 0
+        rest = np.frombuffer(whole, np.uint8)[:3] / 255
+    else:  # blue is in the low bits, and bit 15 says that a face has a colour
+        codes, own, rest = np.column_stack([high, middle, low]) / 31, bits >> 15 == 1, np.ones(3)
+        if not own.any():
+            return raw
+    colours = linear_from_srgb(np.repeat(np.where(own[:, None], codes, rest), 3, axis=0))
+    material, tint = tinted(None, colours)
+    return RawMesh(
+        raw.vertices[raw.faces.ravel()], np.arange(3 * count).reshape(-1, 3), material=material, colours=tint
+    )
 
 
-def _off(data: bytes, max_faces: int, wanted: bool, where: str, log: list[str]) -> list[RawMesh]:
-    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces."""
+# Tags of a 3MF model that are understood, and those without effect on shape; the colours of others are not drawn.
+_3MF = set("model resources object mesh vertices vertex triangles triangle build item components component".split())
+_3MF |= {"metadata", "metadatagroup"}
+_3MF_COLOURS = set("basematerials base colorgroup color texture2d texture2dgroup tex2coord compositematerials".split())
+_3MF_COLOURS |= {"composite", "multiproperties", "multi"}
+
+
+def _note_3mf(model: bytes, near: Neighbours) -> None:
+    tags = {tag.decode() for tag in re.findall(rb"<(?:[A-Za-z0-9_.-]+:)?([A-Za-z0-9_]+)", model)}
+    if tags & _3MF_COLOURS:
+        near.omissions.add("colours and textures of 3MF (drawn white)")
+    near.omissions.unknown("elements of 3MF", tags - _3MF - _3MF_COLOURS)
+
+
+# "4" and "n" (in lower case) are points of other than three numbers.
+_OFF_HEAD = re.compile(r"\s*((?:ST|st)?[Cc]?N?)(4?n?)(?i:OFF)(?!\s*(?i:BINARY))")
+
+
+def off_counts(data: bytes, where: str) -> tuple[str, int, int, str]:
+    """Return (letters before OFF, vertices, faces, the text behind the counts). Geomview allows an OFF file to lack its
+    keyword. Raises AssetError: another file, or points of other than three numbers."""
     text = re.sub(r"#.*", "", data.decode("latin-1"))
-    head = re.match(r"\s*((?:ST)?C?N?OFF)(?!\s*BINARY)", text, re.IGNORECASE)
-    if head is None:
-        raise AssetError("the mesh is no OFF file of text", where=where, value=text[:20], accepted="OFF, COFF, NOFF")
-    kind, rows = head[1].upper(), [words for line in text[head.end() :].splitlines() if (words := line.split())]
-    number, count = (int(word) for word in rows[0][:2])
-    vertices, faces = rows[1 : 1 + max(number, 0)], rows[1 + number : 1 + number + count]
-    sizes = np.array([int(row[0]) for row in faces], np.int64)
-    if len(vertices) != number or len(faces) != count or any(len(r) <= n for r, n in zip(faces, sizes, strict=True)):
-        raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
-    places = np.array([int(place) for row in faces for place in row[1 : 1 + int(row[0])]], np.int64)
-    given, first = Polygons(np.array([row[:3] for row in vertices], np.float64), places, sizes), 6 if "N" in kind else 3
-    if wanted and "C" in kind:
-        given.colours = np.array([row[first : first + 3] for row in vertices], np.float64)[places.clip(0, number - 1)]
-    elif wanted and all(len(row) >= size + 4 for row, size in zip(faces, sizes, strict=True)):
-        given.colours = np.repeat(np.array([row[1 + int(row[0]) :][:3] for row in faces], np.float64), sizes, axis=0)
-    if given.colours is not None:  # whole numbers up to 255, or fractions
-        given.colours = linear_from_srgb((given.colours / (255 if given.colours.max() > 1 else 1)).clip(0, 1))
-    return raw_meshes(given, [None], max_faces, where, log)
+    head = _OFF_HEAD.match(text)
+    begin = head.end() if head else 0
+    counts = re.match(r"\s*(\d+)\s+(\d+)(?:\s+\d+)?[^\S\n]*", text[begin:])
+    if counts is None or (head and head[2]):
+        accepted = "OFF, COFF, NOFF, CNOFF, STOFF, without 4 or n, or the counts"
+        raise AssetError("the mesh is no OFF file of text", where=where, value=text[:20], accepted=accepted)
+    return head[1].upper() if head else "", int(counts[1]), int(counts[2]), text[begin + counts.end() :]
+
+
+def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[RawMesh]:
+    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces.
+    Numbers stand in free form; only the end of a line ends the colour of a face."""
+    where = str(near.path)
+    kind, number, count, text = off_counts(data, where)
+    limit_faces(count, max_faces, where)
+    truncated = AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
+    # The numbers of a vertex: x y z, normal, colour, texture coordinates. A colour may lack its opacity.
+    plain = 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
+    words, body = text.split(), [line.split() for line in text.splitlines() if line.strip()]
+    tinted_by = 4 if "C" in kind else 0
+    if tinted_by and number and body and len(body[0]) == plain + 3:
+        tinted_by = 3
+    width = plain + tinted_by
+    if len(words) < number * width:
+        raise truncated
+    vertices = np.array(words[: number * width], np.float64).reshape(number, width)
+    sizes, places, specs = _off_faces(text, number * width, count, truncated)
+    given = Polygons(vertices[:, :3], places, sizes)
+    corner = places.clip(0, max(number - 1, 0))
+    first = 6 if "N" in kind else 3
+    if "N" in kind:
+        given.normals = vertices[corner, 3:6]
+    if "ST" in kind:
+        given.uvs = vertices[corner, -2:]
+    if wanted and tinted_by:
+        texts = [words[k * width + first : k * width + first + tinted_by] for k in range(number)]
+        given.colours = _off_colours(texts, near)[corner]
+    elif wanted and any(specs):
+        given.colours = np.repeat(_off_colours(specs, near), sizes, axis=0)
+    return raw_meshes(given, [None], max_faces, where, near.log)
+
+
+def _off_faces(text: str, skipped: int, count: int, truncated: AssetError) -> tuple[np.ndarray, np.ndarray, list]:
+    """Return ((P,) corners of each face, (C,) their vertices, the words of each face's colour) behind ``skipped``
+    numbers of a text."""
+    lines = iter(text.splitlines())
+    row: list[str] = []
+    while skipped > 0 or not row:
+        if (line := next(lines, None)) is None:
+            break
+        row = line.split()
+        row, skipped = row[skipped:], max(0, skipped - len(row))
+    sizes, places, specs = [], [], []
+    for _ in range(count):
+        while not row or len(row) <= int(row[0]):
+            if (line := next(lines, None)) is None:
+                raise truncated
+            row += line.split()
+        size = int(row[0])
+        sizes.append(size)
+        places += row[1 : 1 + size]
+        specs.append(row[1 + size :])
+        row = []
+    return np.array(sizes, np.int64), np.array(places, np.int64), specs
+
+
+def _off_colours(specs: list[list[str]], near: Neighbours) -> np.ndarray:
+    """Return (n, 3) linear colours of words: three or four numbers, whole ones of 255, or fractions; none is white."""
+    numbered = [len(spec) >= 3 for spec in specs]
+    if any(len(spec) in (1, 2) for spec in specs):
+        near.omissions.add("colours by their number in a colour map (drawn white)")
+    elif not all(numbered):
+        near.log.append(f"{near.path.stem}: {numbered.count(False)} of {len(specs)} faces have no colour and are white")
+    made = np.ones((len(specs), 3))
+    chosen = [spec for spec in specs if len(spec) >= 3]
+    codes = np.array([spec[:3] for spec in chosen], np.float64).reshape(-1, 3)
+    opacities = np.array([float(spec[3]) for spec in chosen if len(spec) > 3])
+    whole = not any("." in word or "e" in word for spec in chosen for word in spec[:3])
+    # An opacity of 1 beside whole numbers up to 1 says that they are fractions.
+    fractions = codes.max(initial=0) <= 1 and (not whole or (len(opacities) > 0 and opacities.max() <= 1))
+    most = 1.0 if fractions else 255.0
+    if (opacities < most).any():
+        near.omissions.add(OPACITY)
+    made[numbered] = linear_colours(codes, near, most)
+    return made
+
+
+def check_kind(kind: str, data: bytes, max_faces: int, where: str) -> None:
+    """Check what an stl, off or 3mf file says about its size. Raises AssetError: truncated, or too many faces."""
+    if kind == "off":
+        limit_faces(off_counts(data, where)[2], max_faces, where)
+    else:
+        {"stl": _check_stl, "3mf": _check_3mf}[kind](data, max_faces, where)
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:

@@ -65,7 +65,7 @@ def random_world(
         generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE, Role.SHAPE)
     )
     objects, textures = pools(config, base)
-    log: list[str] = []
+    log = [*objects.notes, *textures.notes]
     omissions: dict[str, None] = {}
     floor = config.ground.height if config.ground else 0.0
 

@@ -22,7 +22,7 @@ from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.reading import resolve
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below
-from blinkgl.scene.worlds.random_world import pools
+from blinkgl.scene.worlds.random_world import forget_pools, pools
 from blinkgl.sequence.recorded import matching_folders, used_images
 
 
@@ -31,6 +31,7 @@ def check_assets(plan: Plan) -> dict[str, str]:
 
     Raises ConfigError and AssetError: missing folders, empty pools, pools too small for the split, too few frame
     folders."""
+    forget_pools()
     hashes: dict[str, str] = {}
     for group in plan.used:
         with placed(str, said=f"in group '{group.name}': " if group.name else ""):

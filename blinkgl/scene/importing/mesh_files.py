@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".3mf", ".glb", ".gltf")
 ClipOf = Callable[[gltf.Document], Animation]
 
 
@@ -143,7 +142,10 @@ class _Found(NamedTuple):
 
 def _found(data: bytes, near: Neighbours, max_faces: int, materials: bool, max_texture: int, up, play) -> _Found:
     """Return the meshes of the file."""
-    suffix = _suffix(near.path)
+    suffix = near.path.suffix.lower()
+    if suffix not in _KINDS:
+        accepted = " ".join(MESH_SUFFIXES)
+        raise AssetError("unknown kind of mesh file", where=str(near.path), value=suffix, accepted=accepted)
     is_gltf = suffix in (".glb", ".gltf")
     # Only glTF's standard says which axis is up.
     turn = Z_UP if up == "y" or (up == "auto" and is_gltf) else None
@@ -153,24 +155,12 @@ def _found(data: bytes, near: Neighbours, max_faces: int, materials: bool, max_t
     if play is not None:
         accepted = "a gltf or glb file, or no animation"
         raise AssetError("only glTF files have animations", where=str(near.path), accepted=accepted)
-    raws = _reader(suffix)(data, near, max_faces, max_texture if materials else None)
+    raws = (_KINDS[suffix].read or _others())(data, near, max_faces, max_texture if materials else None)
     raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
     return _Found(raws, [None] * len(raws), near.log, near.omissions, [])
 
 
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in MESH_SUFFIXES:
-        raise AssetError("unknown kind of mesh file", where=str(path), value=suffix, accepted=" ".join(MESH_SUFFIXES))
-    return suffix
-
-
-def _reader(suffix: str) -> Callable[..., list[RawMesh]]:
-    """Return the function that reads a kind of file other than glTF."""
-    if suffix == ".obj":
-        return read_obj
-    if suffix == ".ply":
-        return read_ply
+def _others() -> Callable[..., list[RawMesh]]:
     # Here: trimesh takes half as long to import as everything else that a worker needs, and most scenes do not use it.
     from blinkgl.scene.importing.trimesh_files import read_meshes
 
@@ -193,41 +183,52 @@ class Identity(NamedTuple):
 
 
 def identity_of(path: Path, data: bytes, border: Path | None = None, materials: bool = True) -> Identity:
-    """Return the identity of a mesh file with the content ``data``: of its buffers, and with ``materials`` of its MTL
-    files and images. Raises AssetError: a file that cannot be read, a buffer that is missing or beyond the border."""
-    near, suffix = Neighbours(path, border), path.suffix.lower()
-    buffers = files_of_gltf(data, near, "buffers") if suffix == ".gltf" else ()
-    shape, files = [data], {}
-    for name, file in buffers:
+    """Return the identity of a file with the content ``data``: of a mesh's buffers, and with ``materials`` of its MTL
+    files and images, too. Raises AssetError: a file that cannot be read, a buffer that is missing or beyond the
+    border."""
+    near, kind = Neighbours(path, border), _KINDS.get(path.suffix.lower())
+    shape, files, looks = [data], {}, {}
+    for name, file in files_of_gltf(data, near, "buffers") if path.suffix.lower() == ".gltf" else ():
+        assert file is not None
         shape.append(contents(file, "buffer"))
         files[name] = content_hash(shape[-1])
-    looks = {".gltf": partial(files_of_gltf, key="images"), ".obj": files_of_obj, ".ply": files_of_ply}
-    looks[".glb"] = looks[".gltf"]
-    beside = looks[suffix](data, near) if materials and suffix in looks else ()
-    seen: dict[str, str] = {}
-    for name, file in beside:
-        where = name if file is None else Path(os.path.relpath(file, path.parent)).as_posix()
-        if where not in seen:
-            seen[where] = "missing" if file is None else content_hash(contents(file, "file"))
-    rows = [f"{name} {digest}".encode() for name, digest in seen.items()]
-    return Identity(files | seen, content_hash(*shape), content_hash(*shape, *rows))
+    for name, file in kind.beside(data, near) if kind and materials else ():
+        key = name if file is None else Path(os.path.relpath(file, path.parent)).as_posix()
+        looks[key] = "missing" if file is None else looks.get(key) or content_hash(contents(file, "file"))
+    rows = [f"{name} {digest}".encode() for name, digest in looks.items()]
+    return Identity(files | looks, content_hash(*shape), content_hash(*shape, *rows))
 
 
 def check_header(path: Path, data: bytes, max_faces: int) -> None:
     """Raise AssetError for a mesh file that its first lines, or what they say about its size, show to be unusable."""
-    suffix, where = _suffix(path), str(path)
-    with reading("mesh", where):
-        if suffix in (".glb", ".gltf"):
-            parse(data, where)
-        elif suffix == ".ply":
-            checked_ply(data, max_faces, where)
-        elif suffix == ".obj":
-            if re.search(rb"(?:^|[\r\n])[ \t]*fo?[ \t]", data) is None:
-                raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-        else:
-            from blinkgl.scene.importing.trimesh_files import check_kind
+    with reading("mesh", str(path)):
+        _KINDS[path.suffix.lower()].check(data, max_faces, str(path))
 
-            check_kind(suffix[1:], data, max_faces, where)
+
+def _check_obj(data: bytes, max_faces: int, where: str) -> None:
+    if re.search(rb"(?:^|[\r\n])[ \t]*fo?[ \t]", data) is None:
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+
+
+def _check_other(data: bytes, max_faces: int, where: str) -> None:
+    from blinkgl.scene.importing.trimesh_files import check_kind
+
+    check_kind(Path(where).suffix.lower()[1:], data, max_faces, where)
+
+
+class _Kind(NamedTuple):
+    """A kind of file. check : raises AssetError for a broken header.   beside : names and files of its look.   read :
+    returns its meshes; None: by another way."""
+
+    check: Callable[[bytes, int, str], Any]
+    beside: Callable[[bytes, Neighbours], Iterable[tuple[str, Path | None]]] = lambda data, near: ()
+    read: Callable[..., list[RawMesh]] | None = None
+
+
+_GLTF = _Kind(lambda data, max_faces, where: parse(data, where), partial(files_of_gltf, key="images"))
+_KINDS = {".obj": _Kind(_check_obj, files_of_obj, read_obj), ".ply": _Kind(checked_ply, files_of_ply, read_ply)}
+_KINDS |= dict.fromkeys((".stl", ".off", ".3mf"), _Kind(_check_other)) | dict.fromkeys((".glb", ".gltf"), _GLTF)
+MESH_SUFFIXES = tuple(_KINDS)
 
 
 def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:

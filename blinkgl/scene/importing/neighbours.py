@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.reading import Omissions
-
-_OUTSIDE = "lies outside the folder of the pool or recipe"
 
 
 @dataclass(eq=False)
@@ -27,21 +25,19 @@ class Neighbours:
     def find(self, name: str, inner: Path | None = None) -> Path:
         """Return the file that ``name`` means, relative to the folder ``inner``, or to that of the mesh. Where no file
         has that name, the only one of other case has it. Raises AssetError: missing, or beyond the border."""
-        folder, why = self.path.parent, "is missing"
-        plain = name.strip('"').replace("\\", "/")
-        if "://" in plain:
-            why = "is on a network"
-        for base in dict.fromkeys((inner or folder, folder) if plain and "://" not in plain else ()):
-            try:
-                file = base / plain
-                if not self._within(file):
-                    why = _OUTSIDE
-                elif (file := _of_any_case(base, file)) and self._within(file):
-                    if file.name != Path(plain).name:
-                        self.log.append(f"{self.path.stem}: '{name}' is taken from {file.name}")
-                    return file
-            except (OSError, ValueError, RuntimeError):  # a name too long or with a NUL, or a link to itself
-                continue
+        plain, why = name.strip('"').replace("\\", "/"), "is on a network" if "://" in name else "is missing"
+        # Letters of either case; what glob knows as a pattern stands for itself.
+        either = "".join(f"[{c.lower()}{c.upper()}]" if c.isalpha() else f"[{c}]" if c in "*?[" else c for c in plain)
+        for base in dict.fromkeys((inner or self.path.parent, self.path.parent)):
+            with suppress(OSError, ValueError, RuntimeError):  # a name too long or with a NUL, or a link to itself
+                within = "://" not in plain and self._within(base / plain)
+                why = why if within or "://" in plain else "lies outside the folder of the pool or recipe"
+                if within and (base / plain).is_file():
+                    return base / plain
+                alike = [file for file in base.glob(either) if file.is_file()] if within and plain[0] != "/" else []
+                if len(alike) == 1 and self._within(alike[0]):
+                    self.log.append(f"{self.path.stem}: '{name}' is taken from {alike[0].name}")
+                    return alike[0]
         raise AssetError(f"refers to a file that {why}", where=str(self.path), value=name)
 
     def optional(self, names: Iterable[str], inner: Path | None = None) -> Path | None:
@@ -57,19 +53,3 @@ class Neighbours:
 
     def _within(self, file: Path) -> bool:
         return file.resolve().is_relative_to((self.border or self.path.parent).resolve())
-
-
-def _of_any_case(base: Path, file: Path) -> Path | None:
-    """Return the file itself, or the only one below ``base`` whose name differs by case; None: there is none."""
-    if file.is_file():
-        return file
-    at = base
-    for part in os.path.relpath(file, base).split(os.sep):
-        step = at / part
-        if part != ".." and not step.exists():
-            alike = [name for name in os.listdir(at) if name.casefold() == part.casefold()]
-            if len(alike) != 1:
-                return None
-            step = at / alike[0]
-        at = step
-    return at if at.is_file() else None

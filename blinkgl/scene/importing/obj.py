@@ -19,7 +19,7 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh
-from blinkgl.scene.importing.polygons import OPACITY, Polygons, linear_colours, raw_meshes, texture_beside
+from blinkgl.scene.importing.polygons import Polygons, linear_colours, raw_meshes, texture_beside
 from blinkgl.scene.reading import Omissions, contents
 from blinkgl.scene.types import REPEAT, Material, Wrap
 from blinkgl.srgb import linear_from_srgb
@@ -31,7 +31,7 @@ _NOT_DRAWN = {"p": "points and lines", "l": "points and lines"}
 _NOT_DRAWN |= dict.fromkeys(("curv", "curv2", "surf"), "curves and curved surfaces")
 _SHINE, _CLEAR, _EMISSIVE = "shine (drawn matt)", "transparency (drawn opaque)", "emissive light"
 # What the statements of MTL are, by their names in lower case; "" has no effect on what is drawn.
-_MTL = dict.fromkeys("kd d tr map_kd ka map_ka ns ni illum sharpness tf map_aat pr pcr".split(), "")
+_MTL: dict[str, str] = dict.fromkeys("kd d tr map_kd ka map_ka ns ni illum sharpness tf map_aat pr pcr".split(), "")
 _MTL |= dict.fromkeys(("map_bump", "bump", "norm"), "normal maps") | {"map_ke": _EMISSIVE, "disp": "displacement maps"}
 _MTL |= dict.fromkeys("map_ks map_ns map_pr map_pm map_ps map_pc refl aniso anisor".split(), _SHINE)
 _MTL |= dict.fromkeys(("map_d", "map_tr", "map_opacity"), _CLEAR) | {"decal": "decals"}
@@ -213,16 +213,9 @@ def _beyond(given: object, count: int, where: str) -> AssetError:
 def _colours(rows: np.ndarray, given: np.ndarray, near: Neighbours) -> np.ndarray | None:
     """Return (n, 3) linear colours of ``rows`` x, y, z, r, g, b, a of vertices that have ``given`` many numbers: at
     least six where there is a colour; None: without colours."""
-    coloured = given >= 6
-    if not coloured.any():
+    if not (coloured := given >= 6).any():
         return None
-    if not coloured.all():
-        near.log.append(f"{near.path.stem}: {(~coloured).sum()} of {len(rows)} vertices have no colour and are white")
-    if (rows[given >= 7, 6] < 1).any():
-        near.omissions.add(OPACITY)
-    colours = np.ones((len(rows), 3))
-    colours[coloured] = linear_colours(rows[coloured, 3:6], near)
-    return colours
+    return linear_colours(np.where(coloured[:, None], rows[:, 3:6], np.nan), near, None, rows[given >= 7, 6])
 
 
 # ---- MTL

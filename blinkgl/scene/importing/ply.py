@@ -14,7 +14,7 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import RawMesh
-from blinkgl.scene.importing.polygons import OPACITY, Polygons, linear_colours, raw_meshes, texture_beside
+from blinkgl.scene.importing.polygons import Polygons, linear_colours, raw_meshes, texture_beside
 from blinkgl.scene.types import Material
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
@@ -70,7 +70,7 @@ def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
             materials.append(None if texture is None else Material(texture=texture))
         if textures and given.uvs is None:
             near.omissions.add("a texture, since there are no texture coordinates")
-        if len(materials) > 1:
+        if len(materials) > 1 and isinstance(number, np.ndarray):
             # A face's number counts textures from 0, and -1 is none; material 0 is for faces without a texture.
             given.surfaces = np.clip(np.nan_to_num(number), -1, len(materials) - 2).astype(np.int64) + 1
     return raw_meshes(given, materials, max_faces, where, near.log)
@@ -78,24 +78,22 @@ def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
 
 def _coordinates(
     elements: dict[str, dict[str, Column]], sizes: np.ndarray, inside: np.ndarray, near: Neighbours
-) -> tuple[np.ndarray | None, np.ndarray]:
+) -> tuple[np.ndarray | None, Column]:
     """Return ((C, 2) texture coordinates of corners, None without; (P,) the texture of each face)."""
     vertex, face = elements["vertex"], elements["face"]
     own, rows = (elements.get(name, {}) for name in _PART)
-    at = rows.get("texture_vertex_indices")
-    if isinstance(at, tuple) and {"u", "v"} <= set(own) and len(own["u"]):
-        # Artec's scanners: a list of coordinates, and for each face which of them its corners have.
-        if np.array_equal(at[0], sizes):
-            chosen = at[1].astype(np.int64).clip(0, len(own["u"]) - 1)
-            return _columns_of(own, ("u", "v"))[chosen], np.asarray(rows.get("tx", np.zeros(len(sizes))))
-        near.omissions.add("texture coordinates that do not fit the faces")
-    texture = face.get("texnumber")
-    number = texture if isinstance(texture, np.ndarray) else np.zeros(len(sizes))
-    lists = [face[name] for name in _OF_CORNERS if isinstance(face.get(name), tuple)]
-    for lengths, values in lists[:1]:
-        if np.array_equal(lengths, 2 * sizes):
+    number = face.get("texnumber", np.zeros(len(sizes)))
+    lists = [(face[name], 2 * sizes) for name in _OF_CORNERS if isinstance(face.get(name), tuple)]
+    # Artec's scanners: a list of coordinates, and for each face which of them its corners have.
+    listed = isinstance(rows.get("texture_vertex_indices"), tuple) and {"u", "v"} <= set(own) and len(own["u"]) > 0
+    for (lengths, values), expected in [(rows["texture_vertex_indices"], sizes)] if listed else lists[:1]:
+        if not np.array_equal(lengths, expected):
+            near.omissions.add("texture coordinates that do not fit the faces")
+        elif listed:
+            chosen = values.astype(np.int64).clip(0, len(own["u"]) - 1)
+            return _columns_of(own, ("u", "v"))[chosen], rows.get("tx", number)
+        else:
             return values.reshape(-1, 2).astype(np.float64), number
-        near.omissions.add("texture coordinates that do not fit the faces")
     names = next((names for names in _COORDINATES if set(names) <= set(vertex)), None)
     return None if names is None else _columns_of(vertex, names)[inside], number
 
@@ -116,14 +114,10 @@ def _colours(element: dict[str, Column], near: Neighbours) -> np.ndarray | None:
     """Return (n, 3) linear colours of an element's items; None: it has none. One byte is a fraction of 255, two of
     65535; what larger numbers are fractions of, their size says."""
     for names in _COLOURS:
-        if set(names) <= set(element) and not any(isinstance(element[name], tuple) for name in names):
-            kind = np.asarray(element[names[0]]).dtype.str[1:]
-            most = {"u1": 255.0, "u2": 65535.0}.get(kind)
-            codes = _columns_of(element, names)
+        if set(names) <= set(element):
+            most = {"u1": 255.0, "u2": 65535.0}.get(np.asarray(element[names[0]]).dtype.str[1:])
             opacity = next((element[name] for name in _OPACITIES if name in element), np.ones(0))
-            if (np.asarray(opacity) < (most or (1.0 if codes.max(initial=0) <= 1 else 255.0))).any():
-                near.omissions.add(OPACITY)
-            return linear_colours(codes, near, most)
+            return linear_colours(_columns_of(element, names), near, most, np.asarray(opacity))
     return None
 
 

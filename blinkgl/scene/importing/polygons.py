@@ -132,19 +132,26 @@ def texture_of(image: Path, max_texture: int) -> Texture:
     return Texture(decode_image(data, max_texture, str(image)), image.name, content_hash(data))
 
 
-def linear_colours(codes: np.ndarray, near: Neighbours, most: float | None = None) -> np.ndarray:
-    """Return (n, 3) linear light of (n, 3) sRGB codes; what is no number is white, which is noted.
+def linear_colours(
+    codes: np.ndarray, near: Neighbours, most: float | None = None, opacity: np.ndarray | float = 1.0
+) -> np.ndarray:
+    """Return (n, 3) linear light of (n, 3) sRGB codes; white where one is no number. What is guessed is noted.
 
-    most : the code of white; None: 1, or 255 or 65535 where whole numbers, or one beyond 2, say so."""
-    known = np.isfinite(codes).all(axis=1)
-    if not known.all():
-        near.log.append(f"{near.path.stem}: {(~known).sum()} colours are no numbers, they are drawn white")
-    largest = float(codes[known].max(initial=0))
+    most : the code of white; None: 1, or 255 or 65535 where whole numbers, or one beyond 2, say so.   opacity : the
+    codes of what is not drawn, 1 without."""
+    unknown = ~np.isfinite(codes).all(axis=1)
+    if unknown.any():
+        near.log.append(
+            f"{near.path.stem}: {unknown.sum()} of {len(codes)} have no colour, or no number: they are white"
+        )
+    largest = float(codes[~unknown].max(initial=0))
     if most is None:
-        whole = largest > 2 or bool((codes[known] % 1 == 0).all())
-        most = next((m for m in (1.0, 255.0, 65535.0) if largest <= m), 65535.0) if whole else 1.0
+        whole = largest > 2 or bool((codes[~unknown] % 1 == 0).all())
+        most = next((m for m in (1.0, 255.0) if largest <= m), 65535.0) if whole else 1.0
         if most > 1:
             near.log.append(f"{near.path.stem}: colours up to {largest:g} are taken as parts of {most:g}")
     if largest > most:
         near.log.append(f"{near.path.stem}: colours up to {largest:g} are drawn as {most:g}")
-    return linear_from_srgb(np.where(known[:, None], codes / most, 1.0).clip(0, 1))
+    if np.size(opacity) and float(np.min(opacity)) < (most if np.ndim(opacity) else 1):
+        near.omissions.add(OPACITY)
+    return linear_from_srgb(np.where(unknown.reshape(-1, 1), 1.0, codes / most).clip(0, 1))

@@ -6,6 +6,7 @@ import io
 import logging
 import re
 import zipfile
+from itertools import islice, takewhile
 
 import numpy as np
 import trimesh
@@ -13,9 +14,8 @@ import trimesh
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import RawMesh, tinted, transformed
-from blinkgl.scene.importing.polygons import OPACITY, Polygons, linear_colours, raw_meshes
+from blinkgl.scene.importing.polygons import Polygons, linear_colours, raw_meshes
 from blinkgl.scene.reading import MAX_BYTES, limit_faces
-from blinkgl.srgb import linear_from_srgb
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings are of no use to a user
 
@@ -52,22 +52,18 @@ def _coloured_stl(data: bytes, raw: RawMesh, near: Neighbours) -> RawMesh:
     if len(raw.faces) != count or (len(data) - 84) % 50:
         return raw
     bits = np.frombuffer(data, np.dtype([("corners", "V48"), ("bits", "<u2")]), count, 84)["bits"].astype(np.int64)
-    low, middle, high = bits & 31, bits >> 5 & 31, bits >> 10 & 31
-    whole = data[:80].partition(b"COLOR=")[2][:4]
+    codes, own = np.stack([bits & 31, bits >> 5 & 31, bits >> 10 & 31], axis=1), bits >> 15 == 1
+    head, rest = data[:80].partition(b"COLOR=")[2], np.full(3, 31.0)
     if b"MATERIAL=" in data[:80]:
         near.omissions.add("the material of Magics (drawn by its colour alone)")
-    if len(whole) == 4:  # red is in the low bits, and bit 15 says that a face has the colour of all
-        codes, own = np.column_stack([low, middle, high]) / 31, bits >> 15 == 0
-        rest = np.frombuffer(whole, np.uint8)[:3] / 255
-    else:  # blue is in the low bits, and bit 15 says that a face has a colour
-        codes, own, rest = np.column_stack([high, middle, low]) / 31, bits >> 15 == 1, np.ones(3)
-        if not own.any():
-            return raw
-    colours = linear_from_srgb(np.repeat(np.where(own[:, None], codes, rest), 3, axis=0))
-    material, tint = tinted(None, colours)
-    return RawMesh(
-        raw.vertices[raw.faces.ravel()], np.arange(3 * count).reshape(-1, 3), material=material, colours=tint
-    )
+    if len(head) > 3:  # bit 15 says that a face has the colour of all, and red is in the low bits
+        own, rest = ~own, np.frombuffer(head[:3], np.uint8) * (31 / 255)
+    elif not own.any():
+        return raw
+    colours = np.where(own[:, None], codes if len(head) > 3 else codes[:, ::-1], rest)
+    material, tint = tinted(None, linear_colours(np.repeat(colours, 3, axis=0), near, 31.0))
+    faces = np.arange(3 * count).reshape(-1, 3)
+    return RawMesh(raw.vertices[raw.faces.ravel()], faces, material=material, colours=tint)
 
 
 # Tags of a 3MF model that are understood, and those without effect on shape; the colours of others are not drawn.
@@ -107,76 +103,41 @@ def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[Ra
     where = str(near.path)
     kind, number, count, text = off_counts(data, where)
     limit_faces(count, max_faces, where)
-    truncated = AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
     # The numbers of a vertex: x y z, normal, colour, texture coordinates. A colour may lack its opacity.
-    plain = 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
-    words, body = text.split(), [line.split() for line in text.splitlines() if line.strip()]
-    tinted_by = 4 if "C" in kind else 0
-    if tinted_by and number and body and len(body[0]) == plain + 3:
-        tinted_by = 3
-    width = plain + tinted_by
-    if len(words) < number * width:
-        raise truncated
-    vertices = np.array(words[: number * width], np.float64).reshape(number, width)
-    sizes, places, specs = _off_faces(text, number * width, count, truncated)
-    given = Polygons(vertices[:, :3], places, sizes)
-    corner = places.clip(0, max(number - 1, 0))
-    first = 6 if "N" in kind else 3
-    if "N" in kind:
-        given.normals = vertices[corner, 3:6]
-    if "ST" in kind:
-        given.uvs = vertices[corner, -2:]
-    if wanted and tinted_by:
-        texts = [words[k * width + first : k * width + first + tinted_by] for k in range(number)]
-        given.colours = _off_colours(texts, near)[corner]
+    first, width = (6 if "N" in kind else 3), 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
+    tints = 0 if "C" not in kind else 3 if len(text.lstrip().split("\n")[0].split()) == width + 3 else 4
+    stream = iter(re.findall(r"\n|[^\s]+", text + "\n"))
+    words = (word for word in stream if word != "\n")
+    rows = [list(islice(words, width + tints)) for _ in range(number)]
+    faces, specs = [], []
+    for size in (next(words, "-1") for _ in range(count)):
+        faces.append([size, *islice(words, max(int(size), 0))])
+        specs.append(list(takewhile(lambda word: word != "\n", stream)))
+    sizes = np.array([len(face) - 1 for face in faces], np.int64)
+    if any(len(row) < width + tints for row in rows[-1:]) or any(int(f[0]) != len(f) - 1 for f in faces):
+        raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
+    points = np.array(rows, np.float64).reshape(number, width + tints)
+    given = Polygons(points[:, :3], np.array([place for f in faces for place in f[1:]], np.int64), sizes)
+    corner = given.places.clip(0, max(number - 1, 0))
+    given.normals = points[corner, 3:6] if "N" in kind else None
+    given.uvs = points[corner, -2:] if "ST" in kind else None
+    if wanted and tints:
+        given.colours = _off_colours([row[first : first + tints] for row in rows], near)[corner]
     elif wanted and any(specs):
         given.colours = np.repeat(_off_colours(specs, near), sizes, axis=0)
     return raw_meshes(given, [None], max_faces, where, near.log)
 
 
-def _off_faces(text: str, skipped: int, count: int, truncated: AssetError) -> tuple[np.ndarray, np.ndarray, list]:
-    """Return ((P,) corners of each face, (C,) their vertices, the words of each face's colour) behind ``skipped``
-    numbers of a text."""
-    lines = iter(text.splitlines())
-    row: list[str] = []
-    while skipped > 0 or not row:
-        if (line := next(lines, None)) is None:
-            break
-        row = line.split()
-        row, skipped = row[skipped:], max(0, skipped - len(row))
-    sizes, places, specs = [], [], []
-    for _ in range(count):
-        while not row or len(row) <= int(row[0]):
-            if (line := next(lines, None)) is None:
-                raise truncated
-            row += line.split()
-        size = int(row[0])
-        sizes.append(size)
-        places += row[1 : 1 + size]
-        specs.append(row[1 + size :])
-        row = []
-    return np.array(sizes, np.int64), np.array(places, np.int64), specs
-
-
 def _off_colours(specs: list[list[str]], near: Neighbours) -> np.ndarray:
     """Return (n, 3) linear colours of words: three or four numbers, whole ones of 255, or fractions; none is white."""
-    numbered = [len(spec) >= 3 for spec in specs]
     if any(len(spec) in (1, 2) for spec in specs):
         near.omissions.add("colours by their number in a colour map (drawn white)")
-    elif not all(numbered):
-        near.log.append(f"{near.path.stem}: {numbered.count(False)} of {len(specs)} faces have no colour and are white")
-    made = np.ones((len(specs), 3))
-    chosen = [spec for spec in specs if len(spec) >= 3]
-    codes = np.array([spec[:3] for spec in chosen], np.float64).reshape(-1, 3)
-    opacities = np.array([float(spec[3]) for spec in chosen if len(spec) > 3])
-    whole = not any("." in word or "e" in word for spec in chosen for word in spec[:3])
+    codes = np.array([[*spec[:4], "nan"][:4] if len(spec) > 2 else ["nan"] * 4 for spec in specs], np.float64)
+    opacity = codes[np.isfinite(codes[:, 3]), 3]
+    whole = not any("." in word or "e" in word for spec in specs for word in spec[:3])
     # An opacity of 1 beside whole numbers up to 1 says that they are fractions.
-    fractions = codes.max(initial=0) <= 1 and (not whole or (len(opacities) > 0 and opacities.max() <= 1))
-    most = 1.0 if fractions else 255.0
-    if (opacities < most).any():
-        near.omissions.add(OPACITY)
-    made[numbered] = linear_colours(codes, near, most)
-    return made
+    small = np.nanmax(codes[:, :3], initial=0) <= 1 and (not whole or 0 < opacity.max(initial=0) <= 1)
+    return linear_colours(codes[:, :3], near, 1.0 if small else 255.0, opacity)
 
 
 def check_kind(kind: str, data: bytes, max_faces: int, where: str) -> None:

@@ -246,6 +246,12 @@ def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
     )
 
 
+def forget_pools() -> None:
+    """List the folders anew when they are next used: what they hold may have changed since another run."""
+    _object_pool.cache_clear()
+    _texture_pool.cache_clear()
+
+
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
 _texture_pool = lru_cache(maxsize=4)(texture_pool)
 

@@ -15,7 +15,7 @@ import numpy as np
 from blinkgl.scene.importing.gltf_file import embedded, image_file, index_of, item
 from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE
-from blinkgl.scene.reading import contents
+from blinkgl.scene.reading import RECENT, contents
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
 from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
 
@@ -197,8 +197,10 @@ class Materials:
             decode = {"colour": partial(decode_image, gamma=False), "numbers": decode_numbers, "alpha": decode_alpha}[
                 kind
             ]
-            pixels = decode(data, self.max_texture, f"{self.where} (image '{name}')")
-            self._textures[source, kind] = None if pixels is None else Texture(pixels, name, content_hash(data))
+            key = content_hash(data), kind, self.max_texture
+            decoded = partial(decode, data, self.max_texture, f"{self.where} (image '{name}')")
+            pixels = RECENT.get(key, decoded, lambda pixels: 0 if pixels is None else pixels.nbytes)
+            self._textures[source, kind] = None if pixels is None else Texture(pixels, name, key[0])
         return self._textures[source, kind]
 
 

@@ -27,7 +27,7 @@ from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.obj import files_of_obj, read_obj
 from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.importing.ply import checked_ply, files_of_ply, read_ply
-from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, limit_faces, reading
+from blinkgl.scene.reading import MAX_BYTES, RECENT, Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
@@ -99,29 +99,48 @@ def load_asset(
     ``play`` does not find its clip.
     """
     path = Path(path)
-    where = str(path)
-    with reading("mesh", where):
+    options = {"max_faces": max_faces, "keep_materials": keep_materials, "max_texture": max_texture}
+    options |= {"uv_size": uv_size, "up": up, "border": border}
+    with reading("mesh", str(path)):
         data = contents(path, "mesh", max_bytes=max_bytes)
         digest = source_hash or identity_of(path, data, border, keep_materials).whole
-        found = _found(
-            data, Neighbours(path, border, Omissions(path.name)), max_faces, keep_materials, max_texture, up, play
-        )
-        limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, where)
-        has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
-        common = {"name": path.stem, "where": where, "source_hash": digest, "log": found.log}
-        parts = tuple(
-            part_of(raw, **common, materials=has_materials, uv_size=uv_size, deformer=deformer)
-            for raw, deformer in zip(found.raws, found.deformers, strict=True)
-            if len(raw.faces) or len(found.raws) == 1
-        )
+        make = partial(_asset, path, data, digest, play, **options)
+        # A pool keeps its own, and clips differ.
+        remembered = source_hash is None and play is None
+        asset = RECENT.get((path, digest, *options.values()), make, bytes_of) if remembered else make()
+    again = partial(load_asset, path, **options, max_bytes=max_bytes, source_hash=source_hash)
+    return replace(asset, replay=lambda config: again(play=clip_of(config))) if asset.clips else asset
+
+
+def _asset(
+    path: Path,
+    data: bytes,
+    digest: str,
+    play: ClipOf | None,
+    *,
+    max_faces: int,
+    keep_materials: bool,
+    max_texture: int,
+    uv_size: float | None,
+    up: str,
+    border: Path | None,
+) -> Asset:
+    """Return the asset of a file with the content ``data``; the arguments are those of :func:`load_asset`."""
+    near = Neighbours(path, border, Omissions(path.name))
+    found = _found(data, near, max_faces, keep_materials, max_texture, up, play)
+    limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, str(path))
+    has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
+    common = {"name": path.stem, "where": str(path), "source_hash": digest, "log": found.log}
+    parts = tuple(
+        part_of(raw, **common, materials=has_materials, uv_size=uv_size, deformer=deformer)
+        for raw, deformer in zip(found.raws, found.deformers, strict=True)
+        if len(raw.faces) or len(found.raws) == 1
+    )
     if not parts:
         found.omissions.add(WHOLE)
     parts = parts if has_materials else _white(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
-    asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
-    given = {"max_faces": max_faces, "max_bytes": max_bytes, "keep_materials": keep_materials, "uv_size": uv_size}
-    again = partial(load_asset, path, **given, max_texture=max_texture, source_hash=source_hash, up=up, border=border)
-    return replace(asset, replay=lambda config: again(play=clip_of(config))) if asset.clips else asset
+    return Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
 
 
 def clip_of(config: AnimationConfig, base: Path | str = ".", where: str = "animation") -> ClipOf:

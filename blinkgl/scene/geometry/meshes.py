@@ -55,11 +55,11 @@ def make_mesh(
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
-    vertices, faces, used = _checked(np.array(vertices, dtype=np.float64), np.asarray(faces), where)
+    vertices, faces, used = _checked(np.asarray(vertices, np.float64), np.asarray(faces), where)
     origin = np.flatnonzero(used)
-    normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
+    normals = None if normals is None or len(normals) != len(used) else _rows(np.asarray(normals, np.float64), used)
     uvs_given = uvs is not None
-    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
+    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else _rows(np.asarray(uvs, np.float64), used)
 
     faces = faces[_worth_drawing(vertices, faces, where, label, log)]
     if normals is not None and not _usable_normals(normals, vertices, faces):
@@ -104,7 +104,12 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
             accepted="finite coordinates",
         )
     # The running count less 1 is the new number of each vertex that is used.
-    return vertices[used], (np.cumsum(used) - 1)[faces], used
+    return _rows(vertices, used), faces if used.all() else (np.cumsum(used) - 1)[faces], used
+
+
+def _rows(array: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return the ``used`` rows of an array, without a copy where they are all of it."""
+    return array if used.all() else array[used]
 
 
 def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray | None, degenerate: bool) -> str:
@@ -239,9 +244,12 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> bool:
 
 def corner_angles(corners: np.ndarray) -> np.ndarray:
     """Return the (F, 3) angles at the corners, (F, 3, 3), of triangles, rad."""
-    to_next = np.roll(corners, -1, axis=1) - corners
-    to_previous = np.roll(corners, 1, axis=1) - corners
-    return np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
+    angles = np.empty(corners.shape[:2])
+    for k in range(3):  # one after the other: all at once take three times the memory
+        to_next, to_previous = (corners[:, (k + step) % 3] - corners[:, k] for step in (1, 2))
+        length = np.linalg.norm(np.cross(to_next, to_previous), axis=1)
+        angles[:, k] = np.arctan2(length, (to_next * to_previous).sum(axis=1))
+    return angles
 
 
 def crease_normals(
@@ -278,9 +286,9 @@ def crease_normals(
     left = np.concatenate([first, f_next])
     right = np.concatenate([np.where(direct, second, s_next), np.where(direct, s_next, second)])
     _, fan = _components(left, right, 3 * count)
-    weighted = (unit[:, None, :] * angle[:, :, None]).reshape(-1, 3)
     # Sums over the corners of each fan, given back to every corner of it.
-    total = np.stack([np.bincount(fan, weights=weighted[:, i], minlength=fan.max() + 1) for i in range(3)], axis=1)
+    weighted = ((unit[:, i, None] * angle).ravel() for i in range(3))
+    total = np.stack([np.bincount(fan, weights=w, minlength=fan.max() + 1) for w in weighted], axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     made = (total / np.maximum(length, 1e-300))[fan]
     flat = np.flatnonzero(~(length[fan, 0] > 1e-9))

@@ -7,6 +7,7 @@ vertices, what MeshLab and Blender write.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from array import array
@@ -91,17 +92,20 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
         if len(wrong := np.flatnonzero(index[:, k] >= len(table) - 1)):
             line = np.repeat(lines, sizes)[wrong[0]]
             raise _beyond(index[wrong[0], k] + 1, len(table) - 1, f"{where}, line {line}")
-    vertices, uvs, normals = tables
-    uvs, materials, colours = uvs[index[:, 1]], [None], None
+    vertices, coordinates, directions = tables
+    uvs, normals = (None if len(table) == 1 else table[index[:, k]] for k, table in ((1, coordinates), (2, directions)))
+    at, materials, colours = index[:, 0].copy(), [None], None
+    del index
     if max_texture is not None:
         worn = _materials(data, near, said.materials, max_texture)
         materials = [material for material, _, _ in worn]
-        scale, offset = (np.array([one[k] for one in worn])[np.repeat(surfaces, sizes)] for k in (1, 2))
-        uvs = uvs * scale + offset
+        if uvs is not None:
+            scale, offset = (np.array([one[k] for one in worn])[np.repeat(surfaces, sizes)] for k in (1, 2))
+            uvs = uvs * scale + offset
         colours = _colours(vertices[:-1], np.array(said.tables["v"][1]), near)
-        colours = None if colours is None else colours[index[:, 0]]
+        colours = None if colours is None else colours[at]
     surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
-    given = Polygons(vertices[:-1, :3], index[:, 0], sizes, uvs, normals[index[:, 2]], colours, surfaces, groups, lines)
+    given = Polygons(vertices[:-1, :3], at, sizes, uvs, normals, colours, surfaces, groups, lines)
     return raw_meshes(given, materials, max_faces, where, log)
 
 
@@ -118,15 +122,16 @@ def _rows(values: array, counts: array, width: int) -> np.ndarray:
 
 def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
     """Return (number, key, rest) of each line; a line that ends with a backslash goes on in the next one."""
+    encoding = "utf-8-sig"
     try:
-        text = data.decode("utf-8-sig")
+        data.decode(encoding)
     except UnicodeDecodeError:
-        # Older exporters write no UTF-8; Latin-1 decodes any byte.
-        text = data.decode("latin-1")
+        encoding = "latin-1"  # older exporters write no UTF-8; Latin-1 decodes any byte
     begun = ""
-    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
-        if line.endswith("\\"):
-            begun += line[:-1] + " "
+    # Line by line, since the lines of a large file take several times its size.
+    for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), encoding), 1):
+        if line.endswith(("\\\n", "\\")):
+            begun += line.rstrip("\n")[:-1] + " "
             continue
         words = (begun + line if begun else line).split(None, 1)
         begun = ""
@@ -148,12 +153,10 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
             # ``fo`` is an older form of ``f``.
             words = (_COMMENT.split(rest)[0] if "#" in rest else rest).split()
             for word in words:
-                if (number := known.get(word)) is None:
-                    number = len(said.distinct) // 3
+                if word not in known or "-" in word:  # what a relative index means depends on its line
+                    known[word] = len(said.distinct) // 3
                     said.distinct.extend(_corner(word, said.tables, f"{where}, line {line}"))
-                    if "-" not in word:  # what a relative index means depends on its line
-                        known[word] = number
-                said.used.append(number)
+                said.used.append(known[word])
             surface = said.materials.setdefault(material, len(said.materials))
             said.faces.extend((line, len(words), surface, smoothing))
         elif key == "usemtl":
@@ -193,7 +196,7 @@ def _corner(word: str, tables: dict[str, tuple[array, array]], where: str) -> li
     for k, (part, (_, table)) in enumerate(zip(word.split("/"), tables.values(), strict=False)):
         if not part and k > 0:
             continue
-        if not re.fullmatch(r"-?\d+", part):
+        if not part.removeprefix("-").isdecimal():
             raise AssetError("a face is corrupt", where=where, value=word[:40], accepted="v, v/vt, v//vn, v/vt/vn")
         # A word of so many digits may exceed int64; 0 is no index and is refused below.
         index = int(part) if len(part) < 18 else 0
@@ -241,8 +244,11 @@ def _libraries(
     """Yield the names and files of an OBJ's MTL files, whose materials go into ``entries``."""
     if b"\\\n" in data or b"\\\r" in data:
         data = re.sub(rb"\\(?:\r\n|\r|\n)", b" ", data)
-    for line in dict.fromkeys(re.findall(rb"(?:^|[\r\n])[ \t]*mtllib[ \t]+([^\r\n]+)", data)):
-        ((_, _, given),) = _lines(b"mtllib " + line)
+    statements = re.finditer(rb"mtllib[ \t]+[^\r\n]+", data)
+    # Those that begin their line: no other statement or comment stands before them.
+    begun = [m for m in statements if not re.split(rb"[\r\n]", data[max(m.start() - 99, 0) : m.start()])[-1].strip()]
+    for line in dict.fromkeys(match[0] for match in begun):
+        ((_, _, given),) = _lines(line)
         # A name may have blanks, and a line may have several names.
         plain = _COMMENT.split(given)[0].rstrip()
         whole = Neighbours(near.path, near.border, log=near.log).optional((given, plain))

@@ -59,24 +59,25 @@ def raw_meshes(
     if repeated or lost:
         log.append(f"{Path(where).stem}: {repeated} repeated corners and {lost} faces of fewer than three left out")
     at = given.places[triangles]
-    normals = np.full((len(triangles), 3, 3), np.nan) if given.normals is None else given.normals[triangles]
+    normals = np.zeros((len(triangles), 3, 3)) if given.normals is None else given.normals[triangles]
     missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false
     if missing.any():
         groups = None if given.smoothing is None else given.smoothing[owner]
         used, inner = np.unique(at, return_inverse=True)  # a point that no face has may lie anywhere
         points, inner = given.points[used], inner.reshape(at.shape)
         welded = weld(points, inner)[1] if groups is None else inner
-        made = crease_normals(points, inner, welded, groups=groups)
-        normals[missing] = made[missing]
+        normals = np.where(missing[..., None], crease_normals(points, inner, welded, groups=groups), normals)
+        del inner, welded, points
     # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
     a, b, c = (given.points[at[:, k]] for k in range(3))
     behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0
     for array in (triangles, at, normals):
         array[behind] = array[behind, ::-1]
     # v upwards becomes v downwards.
-    uvs = np.full((len(given.places), 2), np.nan) if given.uvs is None else given.uvs * [1, -1] + [0, 1]
+    uvs = None if given.uvs is None else given.uvs * [1, -1] + [0, 1]
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
-    kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
+    mapped = 0 if uvs is None else np.isfinite(uvs).all(axis=1)[triangles].all(axis=1)
+    kind = np.asarray(2 * surfaces + 1 - mapped)  # odd: without coordinates
     # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
     # One raw mesh for each material and for each of the two kinds of coordinates; faces keep the file's order.
     order, raws = np.argsort(kind, kind="stable"), []
@@ -89,7 +90,7 @@ def raw_meshes(
             drawn, tint = tinted(drawn, given.colours[corners])
         faces = np.arange(len(corners)).reshape(-1, 3)
         shape = given.points[at[chosen]].reshape(-1, 3), faces, normals[chosen].reshape(-1, 3)
-        raws.append(RawMesh(*shape, None if bare else uvs[corners], drawn, colours=tint))
+        raws.append(RawMesh(*shape, None if bare or uvs is None else uvs[corners], drawn, colours=tint))
     return raws
 
 

@@ -6,6 +6,8 @@ import io
 import logging
 import re
 import zipfile
+from array import array
+from collections.abc import Sequence
 from itertools import islice, takewhile
 
 import numpy as np
@@ -106,29 +108,29 @@ def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[Ra
     # The numbers of a vertex: x y z, normal, colour, texture coordinates. A colour may lack its opacity.
     first, width = (6 if "N" in kind else 3), 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
     tints = 0 if "C" not in kind else 3 if len(text.lstrip().split("\n")[0].split()) == width + 3 else 4
-    stream = iter(re.findall(r"\n|[^\s]+", text + "\n"))
+    stream = (match[0] for match in re.finditer(r"\n|[^\s]+", text + "\n"))
     words = (word for word in stream if word != "\n")
     rows = [list(islice(words, width + tints)) for _ in range(number)]
-    faces, specs = [], []
-    for size in (next(words, "-1") for _ in range(count)):
-        faces.append([size, *islice(words, max(int(size), 0))])
-        specs.append(list(takewhile(lambda word: word != "\n", stream)))
-    sizes = np.array([len(face) - 1 for face in faces], np.int64)
-    if any(len(row) < width + tints for row in rows[-1:]) or any(int(f[0]) != len(f) - 1 for f in faces):
+    sizes, places, specs = array("q"), array("q"), []
+    for _ in range(count):
+        sizes.append(int(next(words, "-1")))
+        places.extend(map(int, islice(words, max(sizes[-1], 0))))
+        specs.append(tuple(takewhile(lambda word: word != "\n", stream)))
+    if any(len(row) < width + tints for row in rows[-1:]) or sum(map(abs, sizes)) != len(places):
         raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
     points = np.array(rows, np.float64).reshape(number, width + tints)
-    given = Polygons(points[:, :3], np.array([place for f in faces for place in f[1:]], np.int64), sizes)
+    given = Polygons(points[:, :3], np.array(places, np.int64), np.array(sizes, np.int64))
     corner = given.places.clip(0, max(number - 1, 0))
     given.normals = points[corner, 3:6] if "N" in kind else None
     given.uvs = points[corner, -2:] if "ST" in kind else None
     if wanted and tints:
         given.colours = _off_colours([row[first : first + tints] for row in rows], near)[corner]
     elif wanted and any(specs):
-        given.colours = np.repeat(_off_colours(specs, near), sizes, axis=0)
+        given.colours = np.repeat(_off_colours(specs, near), given.sizes, axis=0)
     return raw_meshes(given, [None], max_faces, where, near.log)
 
 
-def _off_colours(specs: list[list[str]], near: Neighbours) -> np.ndarray:
+def _off_colours(specs: Sequence[Sequence[str]], near: Neighbours) -> np.ndarray:
     """Return (n, 3) linear colours of words: three or four numbers, whole ones of 255, or fractions; none is white."""
     if any(len(spec) in (1, 2) for spec in specs):
         near.omissions.add("colours by their number in a colour map (drawn white)")

@@ -14,7 +14,8 @@ _SPEC = importlib.util.spec_from_file_location("rates", _FILE)
 rates = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(rates)
 
-TEXT = '#usda 1.0\n(\n    defaultPrim = "W"\n    {}\n    upAxis = "Z"\n)\n\ndef Xform "W"\n{{\n    custom double {} = 7\n}}\n'
+TEXT = '#usda 1.0\n(\n    defaultPrim = "W"\n    {}\n    upAxis = "Z"\n)\n\n'
+TEXT += 'def Xform "W"\n{{\n    custom double {} = 7\n}}\n'
 
 
 @pytest.mark.parametrize(

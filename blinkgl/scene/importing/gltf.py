@@ -84,8 +84,8 @@ class Document:
         """Return the lights of the scene's nodes by node index, in the form of KHR_lights_punctual, checked, with
         defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
-        gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights)
-        table, found = gltf_schema.PunctualLights.model_validate(extension).lights, {}
+        table = gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights).lights
+        found: dict[int, dict[str, Any]] = {}
         for index in (index for index, node in self.nodes.items() if node.visible):
             if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
                 number = reference.get("light")
@@ -443,11 +443,12 @@ def read(
     where = str(path)
     with reading("scene", where):
         data = contents(path, "scene") if data is None else data
-        tree, binary = parse(data, where)
+        tree, binary, unknown = parse(data, where)
         for name in tree.get("extensionsRequired", []):
             if name not in DRAWN | _LIGHT_ONLY | INVISIBLE_EXTENSIONS:
                 raise needs(name, where)
         near = Neighbours(path, border, Omissions(path.name))
+        near.omissions.unknown("properties", unknown)
         buffers = buffers_of(tree, binary, near)
         made = Materials(tree, buffers, near, max_texture, materials)
         document = Document(path, tree, buffers, made, near.omissions, log=near.log)

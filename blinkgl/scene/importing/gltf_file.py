@@ -25,8 +25,9 @@ from blinkgl.scene.reading import contents, reading
 from blinkgl.types.poses import pose_of
 
 
-def parse(data: bytes, where: str) -> tuple[dict, bytes]:
-    """Return (the JSON, checked by gltf_schema; the bytes in a GLB). Raises AssetError."""
+def parse(data: bytes, where: str) -> tuple[dict, bytes, list[str]]:
+    """Return (the JSON, checked by gltf_schema; the bytes in a GLB; the properties that glTF does not have). Raises
+    AssetError."""
     binary = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
@@ -54,7 +55,7 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
         tree = json.loads(text.decode("utf-8-sig"), parse_float=_number)
     except (ValueError, RecursionError):
         raise AssetError("the file is no valid glTF (its JSON cannot be read)", where=where) from None
-    gltf_schema.check(tree, where)
+    unknown = list(dict.fromkeys(gltf_schema.unknown(gltf_schema.check(tree, where))))
     version, least = tree["asset"]["version"], tree["asset"].get("minVersion", "2.0")
     if not version.startswith("2") or least not in ("2", "2.0"):
         raise AssetError(
@@ -63,7 +64,7 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
             value=version if not version.startswith("2") else f"minVersion {least}",
             accepted="version 2.0",
         )
-    return tree, binary
+    return tree, binary, unknown
 
 
 def _number(text: str) -> float:
@@ -112,7 +113,7 @@ def files_of_gltf(data: bytes, near: Neighbours, key: str) -> Iterator[tuple[str
     """Yield the names of the files beside a glTF file that are its "buffers" or "images" (``key``), and what is there.
     Raises AssetError: a broken file, a buffer that is missing or beyond the border."""
     with reading("scene", str(near.path)):
-        tree, _ = parse(data, str(near.path))
+        tree, _, _ = parse(data, str(near.path))
         for uri in (entry.get("uri") or "data:" for entry in tree.get(key, [])):
             if not uri.startswith("data:"):
                 yield uri, image_file(uri, near) if key == "images" else near.find(unquote(uri))

@@ -76,7 +76,7 @@ def raw_meshes(
     # v upwards becomes v downwards.
     uvs = None if given.uvs is None else given.uvs * [1, -1] + [0, 1]
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
-    mapped = 0 if uvs is None else np.isfinite(uvs).all(axis=1)[triangles].all(axis=1)
+    mapped = 0 if uvs is None else np.isfinite(uvs[triangles]).all(axis=(1, 2))
     kind = np.asarray(2 * surfaces + 1 - mapped)  # odd: without coordinates
     # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
     # One raw mesh for each material and for each of the two kinds of coordinates; faces keep the file's order.

@@ -34,7 +34,7 @@ class Neighbours:
                 why = why if within or "://" in plain else "lies outside the folder of the pool or recipe"
                 if within and (base / plain).is_file():
                     return base / plain
-                alike = [file for file in base.glob(either) if file.is_file()] if within and plain[0] != "/" else []
+                alike = [file for file in base.glob(either) if file.is_file()] if within and plain[:1] != "/" else []
                 if len(alike) == 1 and self._within(alike[0]):
                     self.log.append(f"{self.path.stem}: '{name}' is taken from {alike[0].name}")
                     return alike[0]

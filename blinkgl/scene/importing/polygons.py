@@ -142,9 +142,8 @@ def linear_colours(
     codes of what is not drawn, 1 without."""
     unknown = ~np.isfinite(codes).all(axis=1)
     if unknown.any():
-        near.log.append(
-            f"{near.path.stem}: {unknown.sum()} of {len(codes)} have no colour, or no number: they are white"
-        )
+        missing = f"{unknown.sum()} of {len(codes)} colours are missing or NaN"
+        near.log.append(f"{near.path.stem}: {missing}: they are white")
     largest = float(codes[~unknown].max(initial=0))
     if most is None:
         whole = largest > 2 or bool((codes[~unknown] % 1 == 0).all())

@@ -88,13 +88,7 @@ class Document:
         found: dict[int, dict[str, Any]] = {}
         for index in (index for index, node in self.nodes.items() if node.visible):
             if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
-                number = reference.get("light")
-                if type(number) is not int or not 0 <= number < len(table):
-                    raise AssetError(
-                        "the file is no valid glTF (a reference to lights that does not exist)",
-                        where=self.where,
-                        value=number,
-                    )
+                number = index_of(reference.get("light"), len(table), "lights", self.where)
                 found[index] = table[number].model_dump()
         return found
 

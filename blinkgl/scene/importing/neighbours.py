@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from blinkgl.errors import AssetError
@@ -51,5 +52,9 @@ class Neighbours:
         self.omissions.add(problem)
         return None
 
+    @cached_property
+    def _root(self) -> Path:
+        return (self.border or self.path.parent).resolve()
+
     def _within(self, file: Path) -> bool:
-        return file.resolve().is_relative_to((self.border or self.path.parent).resolve())
+        return file.resolve().is_relative_to(self._root)

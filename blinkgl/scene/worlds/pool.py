@@ -283,10 +283,10 @@ def _walk(folder: Path, hidden: list[str]) -> Iterator[Path]:
     seen, waiting = set(), [folder]
     while waiting:
         for here, folders, names in os.walk(waiting.pop(0), onerror=_raise):
-            if (real := os.path.realpath(here)) in seen:
+            if (number := (os.stat(here).st_dev, os.stat(here).st_ino)) in seen:
                 folders.clear()
                 continue
-            seen.add(real)
+            seen.add(number)
             hidden += [name for name in (*folders, *names) if name.startswith(".")]
             folders[:] = sorted(name for name in folders if not name.startswith("."))
             waiting += [Path(here, name) for name in folders if os.path.islink(os.path.join(here, name))]

@@ -18,8 +18,8 @@ from rates import rate_of
 
 MOST_FRAMES = 100_000
 CONSTANT = 1e-7
-ROUNDS = 3
-"""How often a scene is exported at most."""
+ROUNDS = 3  # how often a scene is exported at most
+# What the exporter takes for a material that is missing.
 NO_MATERIAL = (
     None,
     {
@@ -28,7 +28,6 @@ NO_MATERIAL = (
         "vc_info": dict.fromkeys(("color", "alpha", "color_type", "alpha_type")) | {"alpha_mode": "OPAQUE"},
     },
 )
-"""What the exporter takes for a material that is missing."""
 UNKNOWN = {
     "VOLUME": "volumes", "POINTCLOUD": "point clouds", "CURVES": "hair", "GREASEPENCIL": "grease pencil",
 }  # fmt: skip

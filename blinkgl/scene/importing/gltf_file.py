@@ -116,12 +116,7 @@ def files_of_gltf(data: bytes, near: Neighbours, key: str) -> Iterator[tuple[str
         tree, _, _ = parse(data, str(near.path))
         for uri in (entry.get("uri") or "data:" for entry in tree.get(key, [])):
             if not uri.startswith("data:"):
-                yield uri, image_file(uri, near) if key == "images" else near.find(unquote(uri))
-
-
-def image_file(uri: str, near: Neighbours) -> Path | None:
-    """Return the file of an image's URI; None: it is missing, which is noted."""
-    return near.optional((unquote(uri), uri))
+                yield uri, near.optional((unquote(uri), uri)) if key == "images" else near.find(unquote(uri))
 
 
 def needs(extension: str, where: str) -> AssetError:

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 
-from blinkgl.scene.importing.gltf_file import embedded, image_file, index_of, item
+from blinkgl.scene.importing.gltf_file import embedded, index_of, item
 from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE
 from blinkgl.scene.reading import RECENT, contents
@@ -28,8 +29,8 @@ DRAWN = {
     "KHR_materials_variants",
     "EXT_texture_webp",
 }
+# Extensions without visible effect.
 INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
-"""Extensions without visible effect."""
 # OpenGL's codes: GL_CLAMP_TO_EDGE, GL_MIRRORED_REPEAT, and below GL_NEAREST.
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
@@ -188,7 +189,7 @@ class Materials:
             elif (uri := image.get("uri") or "").startswith("data:"):
                 data = embedded(uri, "image", self.where)
             else:
-                file = image_file(uri, self.near)
+                file = self.near.optional((unquote(uri), uri))
                 if file is None:
                     self._textures[source, kind] = None
                     return None

@@ -49,14 +49,13 @@ def _part(name: str, effectless: str = "", **fields: Any) -> Any:
 # they are drawn (gltf.py, gltf_materials.py).
 Asset = _part("Asset", "copyright generator extensions", version=(str, ...), minVersion=(str, None))
 Buffer = _part("Buffer", uri=(str, None), byteLength=(Size, 0), extensions=(Extensions, {}))
-_Stride = Annotated[int, Field(ge=0, le=65536)]
 BufferView = _part(
     "BufferView",
     "target extensions",
     buffer=(Index, ...),
     byteOffset=(Size, 0),
     byteLength=(Size, 0),
-    byteStride=(_Stride, 0),
+    byteStride=(Annotated[int, Field(ge=0, le=65536)], 0),
 )
 SparseValues = _part("SparseValues", "extensions", bufferView=(Index, ...), byteOffset=(Size, 0))
 SparseIndices = _part(
@@ -101,8 +100,8 @@ Pbr = _part(
     roughnessFactor=(Factor, 1.0),
     metallicRoughnessTexture=(TextureInfo, None),
 )
-EmissiveStrength = _part("KHR_materials_emissive_strength", emissiveStrength=(Factor, 1.0))
-MaterialExtensions = _part("MaterialExtensions", KHR_materials_emissive_strength=(EmissiveStrength, None))
+_Strength = _part("KHR_materials_emissive_strength", emissiveStrength=(Factor, 1.0))
+MaterialExtensions = _part("MaterialExtensions", KHR_materials_emissive_strength=(_Strength, None))
 Material = _part(
     "Material",
     pbrMetallicRoughness=(Pbr, Pbr()),
@@ -138,15 +137,23 @@ Node = _part(
     weights=(list[Number], None),
     extensions=(Extensions, {}),
 )
-_Joints = Annotated[list[Index], Field(min_length=1)]
-Skin = _part("Skin", "skeleton extensions", joints=(_Joints, ...), inverseBindMatrices=(Index, None))
+Skin = _part(
+    "Skin",
+    "skeleton extensions",
+    joints=(Annotated[list[Index], Field(min_length=1)], ...),
+    inverseBindMatrices=(Index, None),
+)
 Scene = _part("Scene", "extensions", nodes=(list[Index], []))
 Texture = _part("Texture", source=(Index, None), sampler=(Index, None), extensions=(Extensions, {}))
 Image = _part("Image", "mimeType extensions", uri=(str, None), bufferView=(Index, None))
 # OpenGL's codes; 10497 is GL_REPEAT, the default of the specification.
 Sampler = _part("Sampler", "minFilter extensions", magFilter=(int, None), wrapS=(int, 10497), wrapT=(int, 10497))
-_Angle = Annotated[float, Field(gt=1e-4, lt=3.1415)]
-Perspective = _part("Perspective", "aspectRatio zfar extensions", yfov=(_Angle, ...), znear=(Factor, None))
+Perspective = _part(
+    "Perspective",
+    "aspectRatio zfar extensions",
+    yfov=(Annotated[float, Field(gt=1e-4, lt=3.1415)], ...),
+    znear=(Factor, None),
+)
 Camera = _part(
     "Camera",
     "orthographic extensions",
@@ -155,9 +162,12 @@ Camera = _part(
 )
 Target = _part("Target", node=(Index, None), path=(str, ...), extensions=(Extensions, {}))
 Channel = _part("Channel", "extensions", sampler=(Index, ...), target=(Target, ...))
-_Between = Literal["LINEAR", "STEP", "CUBICSPLINE"]
 AnimationSampler = _part(
-    "AnimationSampler", "extensions", input=(Index, ...), output=(Index, ...), interpolation=(_Between, "LINEAR")
+    "AnimationSampler",
+    "extensions",
+    input=(Index, ...),
+    output=(Index, ...),
+    interpolation=(Literal["LINEAR", "STEP", "CUBICSPLINE"], "LINEAR"),
 )
 Animation = _part("Animation", "extensions", channels=(list[Channel], ...), samplers=(list[AnimationSampler], ...))
 # KHR_lights_punctual: candela and lux.

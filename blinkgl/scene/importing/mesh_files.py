@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -174,16 +175,17 @@ def _found(data: bytes, near: Neighbours, max_faces: int, materials: bool, max_t
     if play is not None:
         accepted = "a gltf or glb file, or no animation"
         raise AssetError("only glTF files have animations", where=str(near.path), accepted=accepted)
-    raws = (_KINDS[suffix].read or _others())(data, near, max_faces, max_texture if materials else None)
+    raws = (_KINDS[suffix].read or _by_trimesh("read_meshes"))(
+        data, near, max_faces, max_texture if materials else None
+    )
     raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
     return _Found(raws, [None] * len(raws), near.log, near.omissions, [])
 
 
-def _others() -> Callable[..., list[RawMesh]]:
-    # Here: trimesh takes half as long to import as everything else that a worker needs, and most scenes do not use it.
-    from blinkgl.scene.importing.trimesh_files import read_meshes
-
-    return read_meshes
+def _by_trimesh(name: str) -> Callable[..., Any]:
+    """Return a function of the module that imports trimesh, which takes half as long as everything else that a worker
+    needs, and which most scenes do not use."""
+    return getattr(import_module("blinkgl.scene.importing.trimesh_files"), name)
 
 
 def border_of(path: Path, base: Path) -> Path:
@@ -229,12 +231,6 @@ def _check_obj(data: bytes, max_faces: int, where: str) -> None:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
 
 
-def _check_other(data: bytes, max_faces: int, where: str) -> None:
-    from blinkgl.scene.importing.trimesh_files import check_kind
-
-    check_kind(Path(where).suffix.lower()[1:], data, max_faces, where)
-
-
 class _Kind(NamedTuple):
     """A kind of file. check : raises AssetError for a broken header.   beside : names and files of its look.   read :
     returns its meshes; None: by another way."""
@@ -246,7 +242,10 @@ class _Kind(NamedTuple):
 
 _GLTF = _Kind(lambda data, max_faces, where: parse(data, where), partial(files_of_gltf, key="images"))
 _KINDS = {".obj": _Kind(_check_obj, files_of_obj, read_obj), ".ply": _Kind(checked_ply, files_of_ply, read_ply)}
-_KINDS |= dict.fromkeys((".stl", ".off", ".3mf"), _Kind(_check_other)) | dict.fromkeys((".glb", ".gltf"), _GLTF)
+_KINDS |= dict.fromkeys(
+    (".stl", ".off", ".3mf"),
+    _Kind(lambda *given: _by_trimesh("check_kind")(*given)),  # noqa: PLW0108 - imports it when it is called
+) | dict.fromkeys((".glb", ".gltf"), _GLTF)
 MESH_SUFFIXES = tuple(_KINDS)
 
 

@@ -41,12 +41,12 @@ _STRENGTHS = dict.fromkeys(("ks", "pm", "ps", "pc"), _SHINE) | {"ke": _EMISSIVE}
 # A '#' begins a comment only at the start of a line or after a blank, since names of files may contain one.
 _COMMENT = re.compile(r"(?:^|\s)#")
 _FLOAT = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+# An option beside the name of a texture, with its values.
 _OPTION = re.compile(
     r"(?:-(?:blendu|blendv|cc|boost|texres|clamp|bm|imfchan|type|colorspace)\s+\S+|-mm\s+\S+\s+\S+"
     rf"|-[ost](?:\s+{_FLOAT}(?=\s)){{1,3}})\s+",
     re.IGNORECASE,
 )
-"""An option beside the name of a texture, with its values."""
 _BEHIND = re.compile(
     r"\s+(?=-(?:blend[uv]|cc|boost|texres|clamp|bm|imfchan|type|colorspace|mm|[ost])\s)", re.IGNORECASE
 )
@@ -222,10 +222,10 @@ def _colours(rows: np.ndarray, given: np.ndarray, near: Neighbours) -> np.ndarra
 
 
 # ---- MTL
+# The rest of a line of an MTL file, the file and the line.
 _Entry = tuple[str, str, int]
-"""The rest of a line of an MTL file, the file and the line."""
+# A material, and the scale and offset of its texture coordinates.
 _Surface = tuple[Material | None, np.ndarray, np.ndarray]
-"""A material, and the scale and offset of its texture coordinates."""
 _PLAIN: _Surface = None, np.ones(2), np.zeros(2)
 
 

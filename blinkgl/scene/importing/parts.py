@@ -17,8 +17,8 @@ from blinkgl.scene.types import Deformer, Material, Mesh, Part
 # ---------------------------------------------------------------------------------------------------------------------
 # Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
 
+# The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere.
 INVISIBLE = Material()
-"""The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere."""
 WHOLE = "the whole file: all of it is hidden, transparent or without area"
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -69,8 +69,8 @@ def transformed(raw: RawMesh, matrix: np.ndarray) -> RawMesh:
     return replace(raw, vertices=vertices, normals=normals, faces=raw.faces if determinant >= 0 else raw.faces[:, ::-1])
 
 
+# Returns the deformer of the mesh made from a raw one; (W,) index of the raw vertex of each of the mesh's.
 DeformerOf = Callable[[RawMesh, np.ndarray], "Deformer | None"]
-"""Returns the deformer of the mesh made from a raw one; (W,) index of the raw vertex of each of the mesh's."""
 
 
 def part_of(

@@ -34,8 +34,8 @@ _KNOWN = {
     _PART[0]: {"tx", "u", "v"},
     _PART[1]: {"tx", "tn", "texture_vertex_indices"},
 }
+# Values of a property, (n,); of a list (n,) lengths and all values, one list after the other.
 Column = np.ndarray | tuple[np.ndarray, np.ndarray]
-"""Values of a property, (n,); of a list (n,) lengths and all values, one list after the other."""
 
 
 def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | None) -> list[RawMesh]:
@@ -102,8 +102,7 @@ def files_of_ply(data: bytes, near: Neighbours) -> list[tuple[str, Path | None]]
     """Return the names of the textures in a PLY file's header, and what is there."""
     head = _HEADER.match(data)
     names = re.findall(rb"comment[ \t]+TextureFile[ \t]+([^\r\n]+)", head[1] if head else b"", re.IGNORECASE)
-    texts = [name.decode("utf-8", "replace").strip() for name in names]
-    return [(name, near.optional((name,))) for name in texts]
+    return [(name, near.optional((name,))) for name in (n.decode("utf-8", "replace").strip() for n in names)]
 
 
 def _columns_of(element: dict, names) -> np.ndarray:

@@ -20,8 +20,8 @@ from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb
 
 OPACITY = "opacity of vertex colours (left out)"
+# Most corners of a polygon: ear clipping may take a time that grows with their square.
 MAX_CORNERS = 50_000
-"""Most corners of a polygon: ear clipping may take a time that grows with their square."""
 
 
 @dataclass(eq=False)

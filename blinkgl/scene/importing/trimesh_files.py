@@ -27,9 +27,9 @@ def read_meshes(data: bytes, near: Neighbours, max_faces: int, max_texture: int 
 
     max_texture : None leaves colours out. Raises AssetError: truncated, corrupt, no faces, more than ``max_faces``."""
     where, kind = str(near.path), near.path.suffix.lower()[1:]
+    check_kind(data, max_faces, where)
     if kind == "off":
         return _off(data, max_faces, max_texture is not None, near)
-    check_kind(kind, data, max_faces, where)
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     raws = []
     for node in loaded.graph.nodes_geometry:
@@ -104,7 +104,6 @@ def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[Ra
     Numbers stand in free form; only the end of a line ends the colour of a face."""
     where = str(near.path)
     kind, number, count, text = off_counts(data, where)
-    limit_faces(count, max_faces, where)
     # The numbers of a vertex: x y z, normal, colour, texture coordinates. A colour may lack its opacity.
     first, width = (6 if "N" in kind else 3), 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
     tints = 0 if "C" not in kind else 3 if len(text.lstrip().split("\n")[0].split()) == width + 3 else 4
@@ -142,12 +141,13 @@ def _off_colours(specs: Sequence[Sequence[str]], near: Neighbours) -> np.ndarray
     return linear_colours(codes[:, :3], near, 1.0 if small else 255.0, opacity)
 
 
-def check_kind(kind: str, data: bytes, max_faces: int, where: str) -> None:
+def check_kind(data: bytes, max_faces: int, where: str) -> None:
     """Check what an stl, off or 3mf file says about its size. Raises AssetError: truncated, or too many faces."""
-    if kind == "off":
-        limit_faces(off_counts(data, where)[2], max_faces, where)
-    else:
-        {"stl": _check_stl, "3mf": _check_3mf}[kind](data, max_faces, where)
+    {"stl": _check_stl, "3mf": _check_3mf, "off": _check_off}[where.lower()[-3:]](data, max_faces, where)
+
+
+def _check_off(data: bytes, max_faces: int, where: str) -> None:
+    limit_faces(off_counts(data, where)[2], max_faces, where)
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:

@@ -73,11 +73,6 @@ class Entry:
     shape: str = ""
     beside: tuple[tuple[str, str], ...] = ()
 
-    @property
-    def order(self) -> tuple[str, str]:
-        """Return what it is sorted by in its source."""
-        return self.shape or self.source_hash, self.source_hash
-
 
 @dataclass
 class Pool:
@@ -106,7 +101,7 @@ class Pool:
             raise ConfigError("unknown split", value=split, accepted="train or test")
         sides: dict[str, list[Entry]] = {}
         for entry in self.entries:
-            if split_of(entry.order[0], self.test_fraction) == split:
+            if split_of(entry.shape or entry.source_hash, self.test_fraction) == split:
                 sides.setdefault(entry.source, []).append(entry)
         if not sides:
             if not self.entries:
@@ -333,4 +328,8 @@ def _listed(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     sources: dict[str, dict[str, Entry]] = {}
     for entry in entries:
         sources.setdefault(entry.source, {}).setdefault(entry.source_hash, entry)
-    return tuple(entry for listed in sources.values() for entry in sorted(listed.values(), key=lambda e: e.order))
+    return tuple(
+        entry
+        for listed in sources.values()
+        for entry in sorted(listed.values(), key=lambda e: (e.shape, e.source_hash))
+    )

@@ -225,11 +225,10 @@ def left_out(objs: list[Any], clock: Clock) -> list[str]:
 
 def shines(world: Any) -> bool:
     """Return whether a world is not black."""
-    nodes = [node for node in world.node_tree.nodes if node.type == "BACKGROUND"] if world.use_nodes else []
-    if not nodes:
+    if not world.use_nodes:
         return any(world.color)
-    colour, strength = nodes[0].inputs["Color"], nodes[0].inputs["Strength"]
-    return bool(colour.links or strength.links or (strength.default_value and any(colour.default_value[:3])))
+    inputs = [node.inputs for node in world.node_tree.nodes if node.type == "BACKGROUND"]
+    return any(c.links or s.links or (s.default_value and any(c.default_value[:3])) for c, s, *_ in inputs)
 
 
 def has_plain_colour(material: Any) -> bool:

@@ -102,8 +102,11 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
         if uvs is not None:
             scale, offset = (np.array([one[k] for one in worn])[np.repeat(surfaces, sizes)] for k in (1, 2))
             uvs = uvs * scale + offset
-        colours = _colours(vertices[:-1], np.array(said.tables["v"][1]), near)
-        colours = None if colours is None else colours[at]
+        # Colours, and their opacity, stand behind x, y and z.
+        have = np.array(said.tables["v"][1])
+        if (have >= 6).any():
+            codes = np.where((have >= 6)[:, None], vertices[:-1, 3:6], np.nan)
+            colours = linear_colours(codes, near, None, vertices[:-1][have >= 7, 6])[at]
     surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
     given = Polygons(vertices[:-1, :3], at, sizes, uvs, normals, colours, surfaces, groups, lines)
     return raw_meshes(given, materials, max_faces, where, log)
@@ -211,14 +214,6 @@ def _beyond(given: object, count: int, where: str) -> AssetError:
     accepted = f"1 to {count}, or -1 to -{count}" if count else "a file with such vertices"
     problem = "a face refers to a vertex that does not exist"
     return AssetError(problem, where=where, value=str(given)[:20], accepted=accepted)
-
-
-def _colours(rows: np.ndarray, given: np.ndarray, near: Neighbours) -> np.ndarray | None:
-    """Return (n, 3) linear colours of ``rows`` x, y, z, r, g, b, a of vertices that have ``given`` many numbers: at
-    least six where there is a colour; None: without colours."""
-    if not (coloured := given >= 6).any():
-        return None
-    return linear_colours(np.where(coloured[:, None], rows[:, 3:6], np.nan), near, None, rows[given >= 7, 6])
 
 
 # ---- MTL

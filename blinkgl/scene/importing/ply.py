@@ -44,7 +44,9 @@ def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
     max_texture : None leaves materials and colours out. Raises AssetError: truncated, corrupt, no faces, too many
     faces."""
     where = str(near.path)
-    elements = _elements(data, max_faces, where)
+    # Counts are checked before anything is allocated.
+    declared, body = checked_ply(data, max_faces, where)
+    elements = {name: body.columns(count, properties, name, where) for name, count, properties in declared}
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     indices = face.get("vertex_indices", face.get("vertex_index"))
     if not isinstance(indices, tuple) or not {"x", "y", "z"} <= set(vertex) or not len(indices[0]):
@@ -122,12 +124,6 @@ def _colours(element: dict[str, Column], near: Neighbours) -> np.ndarray | None:
 
 # Lines may also end as on old Macs.
 _HEADER = re.compile(rb"ply\s*[\r\n](.{0,65536}?)end_header(?:\r\n|[^\n\r]*\n|\r)", re.DOTALL)
-
-
-def _elements(data: bytes, max_faces: int, where: str) -> dict[str, dict[str, Column]]:
-    """Return the columns of each element. Counts are checked before anything is allocated."""
-    declared, body = checked_ply(data, max_faces, where)
-    return {name: body.columns(count, properties, name, where) for name, count, properties in declared}
 
 
 def checked_ply(data: bytes, max_faces: int, where: str) -> tuple[list, _Body]:

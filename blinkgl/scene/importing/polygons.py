@@ -55,7 +55,7 @@ def raw_meshes(
     triangles, owner, repeated = triangulate(given.points, given.places, given.sizes)
     if not len(triangles):
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    lost = len(given.sizes) - len(np.unique(owner))
+    lost = len(given.sizes) - int(np.count_nonzero(np.bincount(owner)))
     if repeated or lost:
         log.append(f"{Path(where).stem}: {repeated} repeated corners and {lost} faces of fewer than three left out")
     at = given.places[triangles]
@@ -63,8 +63,9 @@ def raw_meshes(
     missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false
     if missing.any():
         groups = None if given.smoothing is None else given.smoothing[owner]
-        used, inner = np.unique(at, return_inverse=True)  # a point that no face has may lie anywhere
-        points, inner = given.points[used], inner.reshape(at.shape)
+        used = np.zeros(len(given.points), bool)  # a point that no face has may lie anywhere
+        used[at] = True
+        points, inner = given.points[used], (np.cumsum(used) - 1)[at]
         welded = weld(points, inner)[1] if groups is None else inner
         normals = np.where(missing[..., None], crease_normals(points, inner, welded, groups=groups), normals)
         del inner, welded, points

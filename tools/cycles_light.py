@@ -87,18 +87,18 @@ def main() -> int:
     parser.add_argument("--only", default="")
     parser.add_argument("--panoramas", type=Path)
     parser.add_argument("--paths", type=int, default=4096)
-    given = parser.parse_args()
+    options = parser.parse_args()
     made: dict[str, Any] = {}
-    for case in cases(given.panoramas):
-        if given.only in case.name:
+    for case in cases(options.panoramas):
+        if options.only in case.name:
             images = None if case.images is None else ImagesConfig(**case.images, times=(0.0,))
             # A microsecond is an instant.
             open_ns = 0 if images is None or images.exposure_us <= 1 else int(1e3 * images.exposure_us)
             lens = None if images is None else images.lens
-            settings = CyclesSettings(given.paths, shadows=case.shadows, lens=lens, exposure_ns=open_ns)
+            settings = CyclesSettings(options.paths, shadows=case.shadows, lens=lens, exposure_ns=open_ns)
             made[case.name] = colours(case.scene, [0], settings)[0].astype(np.float16)
             print(case.name, flush=True)
-    np.savez_compressed(given.out, **made)
+    np.savez_compressed(options.out, **made)
     return 0
 
 
@@ -141,9 +141,9 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     camera, arrays = scene.camera, {}
     meshes, materials, textures = _Numbered(), _Numbered(), _Numbered()
     bodies, paints = [], []
-    for thing in scene.objects:
+    for body in scene.objects:
         parts = []
-        for part in thing.parts:
+        for part in body.parts:
             mesh, paint = part.mesh, part.material
             culled = part.culled
             k, new = meshes.number((id(mesh), paint.uv_scale))
@@ -158,7 +158,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
             if new:
                 paints.append(_paint(paint, culled, mesh.colours is not None, textures, arrays))
             parts.append([k, m])
-        bodies.append({"name": thing.name, "picture_only": thing.category == "sky", "parts": parts})
+        bodies.append({"name": body.name, "picture_only": body.category == "sky", "parts": parts})
 
     origin = scene.camera_path.pose(int(times_ns[0]))[:3, 3] if len(times_ns) else np.zeros(3)
 
@@ -167,13 +167,13 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
         stack[:, :3, 3] -= origin
         return stack
 
-    arrays["poses"] = np.array([poses(thing.path) for thing in scene.objects]).reshape(-1, len(times_ns), 4, 4)
+    arrays["poses"] = np.array([poses(body.path) for body in scene.objects]).reshape(-1, len(times_ns), 4, 4)
     arrays["camera_poses"] = poses(scene.camera_path) @ CV_FROM_BLENDER
     light = scene.light
     if settings.exposure_ns:
         spread = np.linspace(0, settings.exposure_ns, KEYS).astype(np.int64)
         open_ns = (times_ns[:, None] + spread).ravel()
-        things = [*(thing.path for thing in scene.objects), scene.camera_path]
+        things = [*(body.path for body in scene.objects), scene.camera_path]
         exposed = np.array([path.poses(open_ns) for path in things])
         exposed[..., :3, 3] -= origin
         exposed[-1] = exposed[-1] @ CV_FROM_BLENDER

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+Blender = Any  # bpy has no types
 FAR = 1e8  # far plane, world units: where Blender's picture ends, which BlinkGL's does not
 
 
@@ -60,24 +61,24 @@ def main(folder: Path) -> int:
     return 0
 
 
-def expose(scene: Any, things: list, poses: np.ndarray) -> None:
-    """The shutter is open, evenly, from the first to the last of (things, M, 4, 4) poses, which are evenly spaced in
+def expose(scene: Blender, movers: list, poses: np.ndarray) -> None:
+    """The shutter is open, evenly, from the first to the last of (movers, M, 4, 4) poses, which are evenly spaced in
     time; in between Blender's own interpolation."""
     count = poses.shape[1]
-    for thing, its in zip(things, poses):
-        thing.animation_data_clear()
+    for body_part, its in zip(movers, poses):
+        body_part.animation_data_clear()
         last = None
         for i, pose in enumerate(its):
-            place(thing, pose)
-            if last is not None and np.dot(last, thing.rotation_quaternion) < 0:
-                thing.rotation_quaternion = [-q for q in thing.rotation_quaternion]
-            last = np.array(thing.rotation_quaternion)
+            place(body_part, pose)
+            if last is not None and np.dot(last, body_part.rotation_quaternion) < 0:
+                body_part.rotation_quaternion = [-q for q in body_part.rotation_quaternion]
+            last = np.array(body_part.rotation_quaternion)
             for path in ("location", "rotation_quaternion"):
-                thing.keyframe_insert(path, frame=i)
-        for curve in thing.animation_data.action.fcurves:
+                body_part.keyframe_insert(path, frame=i)
+        for curve in body_part.animation_data.action.fcurves:
             for key in curve.keyframe_points:
                 key.interpolation = "LINEAR"
-        for one in (thing, *thing.children):
+        for one in (body_part, *body_part.children):
             one.cycles.use_motion_blur, one.cycles.motion_steps = True, 4
     scene.frame_start, scene.frame_end = 0, count - 1
     scene.frame_set(0)
@@ -88,10 +89,10 @@ def expose(scene: Any, things: list, poses: np.ndarray) -> None:
     render.motion_blur_shutter_curve.update()
 
 
-def place(thing: Any, pose: np.ndarray) -> None:
+def place(body_part: Blender, pose: np.ndarray) -> None:
     """Through a quaternion made here in float64: Blender takes float32."""
-    thing.location = pose[:3, 3]
-    thing.rotation_quaternion = quaternion(pose[:3, :3])
+    body_part.location = pose[:3, 3]
+    body_part.rotation_quaternion = quaternion(pose[:3, :3])
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:
@@ -112,7 +113,7 @@ def quaternion(R: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q)
 
 
-def read_exr(bpy: Any, path: Path, width: int, height: int) -> np.ndarray:
+def read_exr(bpy: Blender, path: Path, width: int, height: int) -> np.ndarray:
     """(H, W, 3) float32 linear radiance, row 0 at the top."""
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
@@ -125,7 +126,7 @@ def read_exr(bpy: Any, path: Path, width: int, height: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------------- scene
 
 
-def build(bpy: Any, job: dict, arrays: dict) -> Any:
+def build(bpy: Blender, job: dict, arrays: dict) -> Blender:
     """(scene, objects in the order of the job's bodies, lamps in its order, camera)."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -136,7 +137,7 @@ def build(bpy: Any, job: dict, arrays: dict) -> Any:
     formula = open_ and "panorama" not in arrays and all(paint["gloss"] is None for paint in job["materials"])
     even_sky = [light["sky"] * c if formula else 0.0 for c in light["sky_color"]]
     materials = [make_material(bpy, m, k, images, arrays, even_sky) for k, m in enumerate(job["materials"])]
-    meshes: dict[tuple[int, int], Any] = {}
+    meshes: dict[tuple[int, int], Blender] = {}
     bodies = []
     for body in job["bodies"]:
         root = bpy.data.objects.new(body["name"], None)
@@ -147,13 +148,13 @@ def build(bpy: Any, job: dict, arrays: dict) -> Any:
             if (mesh, material) not in meshes:
                 meshes[mesh, material] = make_mesh(bpy, mesh, arrays)
                 meshes[mesh, material].materials.append(materials[material])
-            thing = bpy.data.objects.new(body["name"], meshes[mesh, material])
-            thing.parent = root
+            body_part = bpy.data.objects.new(body["name"], meshes[mesh, material])
+            body_part.parent = root
             solid = not body["picture_only"]
-            thing.visible_shadow = solid and job["settings"]["shadows"]
-            thing.visible_diffuse = solid and not open_  # what a ray to the dome meets
-            thing.visible_glossy = thing.visible_transmission = False
-            scene.collection.objects.link(thing)
+            body_part.visible_shadow = solid and job["settings"]["shadows"]
+            body_part.visible_diffuse = solid and not open_  # what a ray to the dome meets
+            body_part.visible_glossy = body_part.visible_transmission = False
+            scene.collection.objects.link(body_part)
     make_light(bpy, scene, job, arrays.get("panorama"), 0.0 if formula else light["sky"])
     camera = make_camera(bpy, scene, job)
     adjust(scene, job["settings"])
@@ -163,7 +164,7 @@ def build(bpy: Any, job: dict, arrays: dict) -> Any:
     return scene, bodies, lamps, camera
 
 
-def make_mesh(bpy: Any, k: int, arrays: dict) -> Any:
+def make_mesh(bpy: Blender, k: int, arrays: dict) -> Blender:
     """Mesh ``k`` with its normals, texture coordinates and colours."""
     mesh = bpy.data.meshes.new(f"mesh {k}")
     faces = arrays[f"faces{k}"]
@@ -181,7 +182,7 @@ def make_mesh(bpy: Any, k: int, arrays: dict) -> Any:
     return mesh
 
 
-def make_material(bpy: Any, paint: dict, k: int, images: dict, arrays: dict, even_sky: list[float]) -> Any:
+def make_material(bpy: Blender, paint: dict, k: int, images: dict, arrays: dict, even_sky: list[float]) -> Blender:
     """Unlit: emission that only the camera sees. Lit: a diffuse BSDF, and albedo * even_sky * (0.5 + 0.5 n_z) as
     emission, or a principled one. Culled: nothing where the camera sees a back face."""
     material = bpy.data.materials.new(f"material {k}")
@@ -280,7 +281,7 @@ def make_material(bpy: Any, paint: dict, k: int, images: dict, arrays: dict, eve
     return material
 
 
-def picture_of(bpy: Any, tree: Any, k: int, images: dict, arrays: dict) -> Any:
+def picture_of(bpy: Blender, tree: Blender, k: int, images: dict, arrays: dict) -> Blender:
     """A node that looks texture k up, bilinear, repeated."""
     picture = tree.nodes.new("ShaderNodeTexImage")
     picture.image = images.get(k) or images.setdefault(k, make_image(bpy, f"texture{k}", arrays))
@@ -288,7 +289,7 @@ def picture_of(bpy: Any, tree: Any, k: int, images: dict, arrays: dict) -> Any:
     return picture
 
 
-def make_image(bpy: Any, name: str, arrays: dict) -> Any:
+def make_image(bpy: Blender, name: str, arrays: dict) -> Blender:
     """Linear float texels, used as they are; Blender's row 0 is the bottom one."""
     texels = arrays[name][::-1]
     height, width, _ = texels.shape
@@ -300,7 +301,7 @@ def make_image(bpy: Any, name: str, arrays: dict) -> Any:
     return image
 
 
-def make_light(bpy: Any, scene: Any, job: dict, panorama: np.ndarray | None, sky: float) -> None:
+def make_light(bpy: Blender, scene: Blender, job: dict, panorama: np.ndarray | None, sky: float) -> None:
     """Sun without extent, and a dome that is of one colour above the horizon and black below: without anything in
     between it gives an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky; or a panorama. The camera sees
     the background instead of the dome.
@@ -355,7 +356,7 @@ def make_light(bpy: Any, scene: Any, job: dict, panorama: np.ndarray | None, sky
         link(fog_nodes(tree, *job["fog"]).outputs[0], out.inputs["Volume"])
 
 
-def fog_nodes(tree: Any, density: float, radiance: float) -> Any:
+def fog_nodes(tree: Blender, density: float, radiance: float) -> Blender:
     """What swallows and sends light between the camera and what it sees, and is not there for rays to lamps: from the
     camera L becomes L e^(-density d) + radiance (1 - e^(-density d))."""
     add, link = tree.nodes.new, tree.links.new
@@ -373,7 +374,7 @@ def fog_nodes(tree: Any, density: float, radiance: float) -> Any:
     return both
 
 
-def make_lamp(bpy: Any, scene: Any, lamp: dict, shadows: bool) -> Any:
+def make_lamp(bpy: Blender, scene: Blender, lamp: dict, shadows: bool) -> Blender:
     """A strength is the radiance of a white surface that faces it, of a point or spot light 1 unit away: an irradiance
     of pi times that, and a power of 4 pi² times that, which Blender sends to all sides, whatever the cone."""
     light = bpy.data.lights.new(lamp["kind"], lamp["kind"].upper())
@@ -387,10 +388,10 @@ def make_lamp(bpy: Any, scene: Any, lamp: dict, shadows: bool) -> Any:
         light.shadow_soft_size = lamp["size"] / 2
     if lamp["kind"] == "spot":
         light.spot_size, light.spot_blend = 2 * lamp["outer"], lamp["blend"]
-    thing = bpy.data.objects.new(lamp["kind"], light)
-    thing.rotation_mode = "QUATERNION"
-    scene.collection.objects.link(thing)
-    return thing
+    body_part = bpy.data.objects.new(lamp["kind"], light)
+    body_part.rotation_mode = "QUATERNION"
+    scene.collection.objects.link(body_part)
+    return body_part
 
 
 def turn_z_to(axis: np.ndarray) -> np.ndarray:
@@ -401,7 +402,7 @@ def turn_z_to(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def make_camera(bpy: Any, scene: Any, job: dict) -> Any:
+def make_camera(bpy: Blender, scene: Blender, job: dict) -> Blender:
     """The scene's camera, with its lens."""
     lens = bpy.data.cameras.new("camera")
     for name, value in job["blender_camera"].items():
@@ -419,7 +420,7 @@ def make_camera(bpy: Any, scene: Any, job: dict) -> Any:
     return camera
 
 
-def adjust(scene: Any, settings: dict) -> None:
+def adjust(scene: Blender, settings: dict) -> None:
     """Plain radiance in 32-bit floats: no view transform, no denoiser, no clamping, no
     adaptive sampling; a box of one pixel."""
     render = scene.render

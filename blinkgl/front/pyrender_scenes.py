@@ -17,6 +17,7 @@ from blinkgl.scene.geometry.meshes import make_mesh, transform_mesh
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.worlds.from_file import CV_FROM_GL, split_rigid
 
+Theirs = Any  # an object of pyrender, which is not imported
 _TRIANGLES, _REPEAT = 4, 10497  # OpenGL's codes
 
 
@@ -32,7 +33,7 @@ class Taken(NamedTuple):
     notes: tuple[str, ...]
 
 
-def taken(source: Any, height: int, width: int) -> Taken:
+def taken(source: Theirs, height: int, width: int) -> Taken:
     """Return what is taken of a ``pyrender.Scene`` that is drawn in width x height px. Raises ConfigError: no
     perspective camera, no triangles."""
     notes: list[str] = []
@@ -54,24 +55,24 @@ def taken(source: Any, height: int, width: int) -> Taken:
     return Taken(lens, place, bodies, lights, float(grey.mean()), tuple(notes))
 
 
-def _camera(source: Any, height: int, width: int) -> tuple[dict[str, float], Pose]:
+def _camera(source: Theirs, height: int, width: int) -> tuple[dict[str, float], Pose]:
     node = source.main_camera_node
     if node is None or type(node.camera).__name__ not in ("PerspectiveCamera", "IntrinsicsCamera"):
         kind = None if node is None else type(node.camera).__name__
         accepted = "a scene with a PerspectiveCamera or an IntrinsicsCamera"
         raise ConfigError("no such camera", where="Scene.from_pyrender.scene", value=kind, accepted=accepted)
-    given = node.camera
-    if hasattr(given, "fx"):
+    lens_of = node.camera
+    if hasattr(lens_of, "fx"):
         # Its principal point counts from the picture's corner, ours from the first pixel's centre.
-        lens = {"fx": given.fx, "fy": given.fy, "cx": given.cx - 0.5, "cy": given.cy - 0.5}
+        lens = {"fx": lens_of.fx, "fy": lens_of.fy, "cx": lens_of.cx - 0.5, "cy": lens_of.cy - 0.5}
     else:
-        fy = height / 2 / math.tan(given.yfov / 2)
-        lens = {"fx": fy * width / height / (given.aspectRatio or width / height), "fy": fy}
-    lens = {key: float(number) for key, number in {**lens, "near": given.znear or 0.05}.items()}
+        fy = height / 2 / math.tan(lens_of.yfov / 2)
+        lens = {"fx": fy * width / height / (lens_of.aspectRatio or width / height), "fy": fy}
+    lens = {key: float(number) for key, number in {**lens, "near": lens_of.znear or 0.05}.items()}
     return lens, Pose.from_matrix(split_rigid(source.get_pose(node))[0] @ CV_FROM_GL)
 
 
-def _bodies(source: Any, node: Any, notes: list[str]) -> Iterator[tuple[data.Mesh, Material, Pose, str]]:
+def _bodies(source: Theirs, node: Theirs, notes: list[str]) -> Iterator[tuple[data.Mesh, Material, Pose, str]]:
     """Yield a body for each primitive of a node, and for each of its instances."""
     for primitive in node.mesh.primitives:
         if primitive.mode != _TRIANGLES:
@@ -94,32 +95,32 @@ def _bodies(source: Any, node: Any, notes: list[str]) -> Iterator[tuple[data.Mes
             yield transform_mesh(raw, shape), material, Pose.from_matrix(rigid), named
 
 
-def _material(primitive: Any, notes: list[str]) -> Material:
-    given = primitive.material
-    if not hasattr(given, "baseColorFactor"):
-        notes.append(f"a {type(given).__name__} (drawn grey)")
-        return Material(color=(0.5, 0.5, 0.5), both_sides=bool(given.doubleSided))
+def _material(primitive: Theirs, notes: list[str]) -> Material:
+    paint = primitive.material
+    if not hasattr(paint, "baseColorFactor"):
+        notes.append(f"a {type(paint).__name__} (drawn grey)")
+        return Material(color=(0.5, 0.5, 0.5), both_sides=bool(paint.doubleSided))
     for key, words in (("occlusionTexture", "occlusion maps"), ("wireframe", "wire frames")):
-        if getattr(given, key, None):
+        if getattr(paint, key, None):
             notes.append(words)
     colours = primitive.color_0
-    clear = given.baseColorFactor[3] < 1 or (colours is not None and np.min(colours[:, 3:], initial=1) < 1)
-    if given.alphaMode != "OPAQUE" and clear:
-        notes.append(f"opacity of {given.alphaMode} (drawn opaque)")
+    clear = paint.baseColorFactor[3] < 1 or (colours is not None and np.min(colours[:, 3:], initial=1) < 1)
+    if paint.alphaMode != "OPAQUE" and clear:
+        notes.append(f"opacity of {paint.alphaMode} (drawn opaque)")
     textures = ("baseColorTexture", "metallicRoughnessTexture", "normalTexture", "emissiveTexture")
     keys = dict(zip(textures, ("image", "metallic_roughness_map", "normal_map", "emission_map"), strict=True))
-    maps = {name: _pixels(getattr(given, key), notes) for key, name in keys.items() if getattr(given, key) is not None}
+    maps = {name: _pixels(getattr(paint, key), notes) for key, name in keys.items() if getattr(paint, key) is not None}
     return Material(
         **maps,
-        color=tuple(float(c) for c in given.baseColorFactor[:3]),
-        metallic=float(given.metallicFactor),
-        roughness=float(given.roughnessFactor),
-        emission=tuple(float(c) for c in given.emissiveFactor[:3]),
-        both_sides=bool(given.doubleSided),
+        color=tuple(float(c) for c in paint.baseColorFactor[:3]),
+        metallic=float(paint.metallicFactor),
+        roughness=float(paint.roughnessFactor),
+        emission=tuple(float(c) for c in paint.emissiveFactor[:3]),
+        both_sides=bool(paint.doubleSided),
     )
 
 
-def _pixels(texture: Any, notes: list[str]) -> np.ndarray:
+def _pixels(texture: Theirs, notes: list[str]) -> np.ndarray:
     """Return (h, w, 3) uint8 of a texture."""
     if texture.sampler is not None and {texture.sampler.wrapS, texture.sampler.wrapT} != {_REPEAT}:
         notes.append("textures that do not repeat (drawn repeating)")
@@ -129,7 +130,7 @@ def _pixels(texture: Any, notes: list[str]) -> np.ndarray:
     return np.ascontiguousarray(pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2))
 
 
-def _lamp(light: Any, pose: np.ndarray) -> dict[str, Any]:
+def _lamp(light: Theirs, pose: np.ndarray) -> dict[str, Any]:
     """Return the table of a light, which shines along its -z: lux and candela over pi are the radiance of a white
     surface."""
     back, place = pose[:3, 2] / np.linalg.norm(pose[:3, 2]), pose[:3, 3].tolist()

@@ -368,14 +368,14 @@ class Scene(Piece):
         the lights; what is not is named as ``not_drawn`` of reports and manifests. Its axes stay. Without lights it is
         unlit.   keys : other arguments of a Scene, such as ``duration``; ``light`` replaces the file's. Raises
         ConfigError: no perspective camera, no triangles."""
-        found = taken(scene, height, width)
-        camera = Camera(width, height, pose=found.place, **cast(Any, found.lens))
+        theirs = taken(scene, height, width)
+        camera = Camera(width, height, pose=theirs.place, **cast(Any, theirs.lens))
         bodies = []
-        for mesh, material, pose, name in found.bodies:
+        for mesh, material, pose, name in theirs.bodies:
             bodies.append(Mesh(vertices=mesh.vertices, faces=mesh.faces, material=material, pose=pose, name=name))
-            bodies[-1].triangles, bodies[-1].notes = mesh, found.notes
-        keys.setdefault("light", Light(0.0, 0.0, lights=found.lights) if found.lights else Light(unlit=True))
-        keys.setdefault("background", found.background)
+            bodies[-1].triangles, bodies[-1].notes = mesh, theirs.notes
+        keys.setdefault("light", Light(0.0, 0.0, lights=theirs.lights) if theirs.lights else Light(unlit=True))
+        keys.setdefault("background", theirs.background)
         return cls(camera, bodies, **keys)
 
     def _listed(self, falls: bool) -> dict[str, Any]:

@@ -145,6 +145,16 @@ def test_names_as_people_write_them(folder, name, mtl, use, expected, words):
     assert words in said(asset) and (words or not asset.omissions)
 
 
+def test_libraries_are_statements_not_words(folder):
+    """A byte order mark before ``mtllib``, a comment that has the word, a line that goes on in the next."""
+    (folder / "m.mtl").write_text("newmtl m\nmap_Kd tex.png\n")
+    face = SQUARE + "vt 0 0\nusemtl m\nf 1/1 2/1 3/1 4/1\n"
+    for head, found in (("\ufeffmtllib m.mtl\n", True), ("# mtllib m.mtl\n", False), ("mtllib \\\n m.mtl\n", True)):
+        asset = load(folder, "a.obj", (head + face).encode())
+        assert (asset.parts[0].material.texture is not None) == found
+        assert ("'m', which no MTL file has" in said(asset)) != found
+
+
 @pytest.mark.parametrize(
     "rows, expected, words",
     [

@@ -229,8 +229,8 @@ def files_of_obj(data: bytes, near: Neighbours) -> Iterator[tuple[str, Path | No
     entries: dict[str, dict[str, _Entry]] = {}
     yield from _libraries(data, near, entries)
     for own in entries.values():
-        if (given := own.get("map_kd", own.get("map_ka"))) is not None:
-            yield given[0], _picture(given, near)[0]
+        if (entry := own.get("map_kd", own.get("map_ka"))) is not None:
+            yield entry[0], _picture(entry, near)[0]
 
 
 def _libraries(
@@ -241,12 +241,12 @@ def _libraries(
         data = re.sub(rb"\\(?:\r\n|\r|\n)", b" ", data)
     statements = re.finditer(rb"mtllib[ \t]+[^\r\n]+", data)
     # Those that begin their line: no other statement or comment stands before them.
-    begun = [m for m in statements if not re.split(rb"[\r\n]", data[max(m.start() - 99, 0) : m.start()])[-1].strip()]
-    for line in dict.fromkeys(match[0] for match in begun):
-        ((_, _, given),) = _lines(line)
+    ahead = lambda m: re.split(rb"[\r\n]", data[max(m.start() - 99, 0) : m.start()])[-1]
+    for line in dict.fromkeys(m[0] for m in statements if not ahead(m).strip(b"\xef\xbb\xbf \t")):
+        ((_, _, rest),) = _lines(line)
         # A name may have blanks, and a line may have several names.
-        plain = _COMMENT.split(given)[0].rstrip()
-        whole = Neighbours(near.path, near.border, log=near.log).optional((given, plain))
+        plain = _COMMENT.split(rest)[0].rstrip()
+        whole = Neighbours(near.path, near.border, log=near.log).optional((rest, plain))
         parts = [part.replace("\\ ", " ") for part in re.split(r"(?<!\\)\s+", plain)]
         for name, file in [(plain, whole)] if whole else [(part, near.optional((part,))) for part in parts]:
             own: dict[str, _Entry] = {}
@@ -314,8 +314,8 @@ def _surface(
     if opacity <= 0:
         return INVISIBLE, scale, offset
     material = Material(base_color=_colour(*entries.get("kd", ("1", "", 0)), near.omissions))
-    if (given := entries.get("map_kd", entries.get("map_ka"))) is not None:
-        image, settings = _picture(given, near)
+    if (entry := entries.get("map_kd", entries.get("map_ka"))) is not None:
+        image, settings = _picture(entry, near)
         # -s is the scale and -o the offset; what they leave out keeps its default.
         for key, values in (("-s", scale), ("-o", offset)):
             values[:] = [*map(float, settings.pop(key, ())), *values][:2]

@@ -178,10 +178,10 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
             part = Part(random_primitive(entry.kind, entry.index), material)
             return Asset(entry.name, entry.source_hash, (part,), wears).normalised()
         limits = {"max_faces": config.max_faces, "max_bytes": limit, "max_texture": max_texture, "up": config.up}
-        given = {"source_hash": entry.source_hash, "border": entry.border}
-        asset = load_asset(entry.file, keep_materials=dressed, **limits, **given)
+        known = {"source_hash": entry.source_hash, "border": entry.border}
+        asset = load_asset(entry.file, keep_materials=dressed, **limits, **known)
         if config.keep_materials == "auto" and not asset.has_looks:
-            asset = load_asset(entry.file, keep_materials=False, **limits, **given)
+            asset = load_asset(entry.file, keep_materials=False, **limits, **known)
         if config.keep_materials == "auto":
             worn = "its own" if asset.has_materials else "one of the world, since it has none of its own"
             looks = f"{asset.name}: its look is {worn} (scene.pool.keep_materials: auto)"
@@ -219,8 +219,8 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
         return Identity({}, digest, digest)
 
     for i, folder in enumerate(config.folders):
-        given = resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, "images"
-        entries += _folder_entries(*given, config.bad_assets, identity, notes)
+        listed = resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, "images"
+        entries += _folder_entries(*listed, config.bad_assets, identity, notes)
 
     def load(entry: Entry) -> Texture:
         if entry.file is None:
@@ -307,15 +307,15 @@ def _folder_entries(
         # A linked folder is its own border: a user has put it there, and nothing leads further.
         border = next(p for p in file.parents if p == folder or p.is_symlink())
         try:
-            found = identity(file, border)
+            identified = identity(file, border)
         except AssetError as error:
             if bad_assets == "error":
                 raise
             unusable.append(f"{file.name}: {error.problem}")
             continue
         name = str(file.relative_to(folder))
-        beside = tuple(found.files.items())
-        entries.append(Entry(found.whole, name, given, file, border=border, shape=found.shape, beside=beside))
+        beside = tuple(identified.files.items())
+        entries.append(Entry(identified.whole, name, given, file, border=border, shape=identified.shape, beside=beside))
     if unusable:
         names = "; ".join(unusable[:3]) + ("; …" if len(unusable) > 3 else "")
         notes.append(f"{where}: {len(unusable)} unusable files are left out ({names})")

@@ -338,7 +338,7 @@ def import_(
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option("--fps", help="Frames per second (default: the file's; 24 for USD, Collada and Alembic)."),
+        typer.Option("--fps", help="Frames per second (default: the file's; 24 for binary USD and Collada)."),
     ] = None,
     keys_per_frame: Annotated[
         int,

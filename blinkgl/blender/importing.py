@@ -81,7 +81,8 @@ def import_scene(
     """Write the GLB ``out``, complete or not at all.
 
     scene : name of the file's scene; None: the one it was saved in.   frames : (first, last); None: the scene's.
-    fps : frames per second; None: the file's, 24 if its format does not contain it (USD, Collada, Alembic).
+    fps : frames per second; None: the file's; 24 where it has none that can be read (binary USD, Collada), which a
+    line says of USD.
     keys_per_frame : least key frames written per frame; between them glTF interpolates linearly.
     clips : an animation per action instead of one for the whole scene; nothing is compared or baked.
     bake_mb : largest size of all baked shapes, MB.

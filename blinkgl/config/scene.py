@@ -83,7 +83,11 @@ class PoolConfig(Config):
     max_file_mb: ClassVar[Any] = 512.0
     fixed: ClassVar[Any] = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
-    keep_materials: bool = Field(False, description="use the meshes' own colours and textures, if any")
+    keep_materials: Literal["auto"] | bool = Field(
+        "auto",
+        description="auto: files with textures or colours of their own keep them, others and primitives get the "
+        "world's; true: figures, flags, fish and plain grey files keep theirs, too; false: none does",
+    )
     animation: Literal["random", "rest"] = Field(
         "random", description="files with animations: random plays one of them, repeated; rest keeps the rest shape"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import posixpath
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -16,12 +17,12 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import check_assets as check_scene, panorama_of
-from blinkgl.scene.importing.mesh_files import dependencies
+from blinkgl.scene.importing.mesh_files import border_of, identity_of
 from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.reading import resolve
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below
-from blinkgl.scene.worlds.random_world import pools
+from blinkgl.scene.worlds.random_world import forget_pools, pools
 from blinkgl.sequence.recorded import matching_folders, used_images
 
 
@@ -30,6 +31,7 @@ def check_assets(plan: Plan) -> dict[str, str]:
 
     Raises ConfigError and AssetError: missing folders, empty pools, pools too small for the split, too few frame
     folders."""
+    forget_pools()
     hashes: dict[str, str] = {}
     for group in plan.used:
         with placed(str, said=f"in group '{group.name}': " if group.name else ""):
@@ -113,11 +115,16 @@ def _note(hashes: dict[str, str], name: str, value: str) -> None:
 def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
     def file(path: Path, name: str) -> None:
         data = path.read_bytes()
-        _note(hashes, without_places(name), content_hash(data, *dependencies(path, data)))
+        _note(hashes, without_places(name), content_hash(data))
+        for beside, digest in identity_of(path, data, border_of(path, base)).files.items():
+            _note(hashes, without_places((Path(name).parent / beside).as_posix()), digest)
 
     if isinstance(scene, RandomSceneConfig):
         for entry in (entry for pool in pools(scene, base) for entry in pool.entries if entry.file is not None):
-            _note(hashes, f"{without_places(entry.source)}/{entry.name}", entry.source_hash)
+            folder = without_places(entry.source)
+            _note(hashes, f"{folder}/{entry.name}", entry.shape)
+            for beside, digest in entry.beside:
+                _note(hashes, posixpath.normpath(f"{folder}/{Path(entry.name).parent.as_posix()}/{beside}"), digest)
         for name in scene.sky.panoramas if scene.sky else ():
             path = resolve(name, base)
             for found in (

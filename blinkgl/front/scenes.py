@@ -16,7 +16,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.poses import Keyframes, Piece, Pose, Trajectory, Vector, motion_tree, signed_by
+from blinkgl.front.pyrender_scenes import taken
 from blinkgl.front.surfaces import Light, Material
 from blinkgl.scene import types as data
 from blinkgl.scene.geometry.meshes import make_mesh
@@ -152,6 +153,7 @@ class _Object(Piece):
 
     mesh: dict[str, Any]
     triangles: data.Mesh | None = None
+    notes: tuple[str, ...] = ()  # what was not taken from another program's scene
 
     def _placed(
         self,
@@ -358,6 +360,24 @@ class Scene(Piece):
         if self.objects:  # a scene without bodies is refused at its use, because `scene + body` begins with one
             self._checked(ExplicitSceneConfig, self.tree)
 
+    @classmethod
+    def from_pyrender(cls, scene: Any, width: int, height: int, **keys: Any) -> Scene:
+        """Return the scene of a ``pyrender.Scene``, drawn in width x height px as its ``OffscreenRenderer`` does.
+
+        Taken: meshes of triangles with their materials, the poses and scales of nodes, instances, the main camera and
+        the lights; what is not is named as ``not_drawn`` of reports and manifests. Its axes stay. Without lights it is
+        unlit.   keys : other arguments of a Scene, such as ``duration``; ``light`` replaces the file's. Raises
+        ConfigError: no perspective camera, no triangles."""
+        theirs = taken(scene, height, width)
+        camera = Camera(width, height, pose=theirs.place, **cast(Any, theirs.lens))
+        bodies = []
+        for mesh, material, pose, name in theirs.bodies:
+            bodies.append(Mesh(vertices=mesh.vertices, faces=mesh.faces, material=material, pose=pose, name=name))
+            bodies[-1].triangles, bodies[-1].notes = mesh, theirs.notes
+        keys.setdefault("light", Light(0.0, 0.0, lights=theirs.lights) if theirs.lights else Light(unlit=True))
+        keys.setdefault("background", theirs.background)
+        return cls(camera, bodies, **keys)
+
     def _listed(self, falls: bool) -> dict[str, Any]:
         """Return meshes, materials and objects by name; those made of arrays are kept in memory. falls : a body is
         dynamic."""
@@ -418,4 +438,6 @@ class Scene(Piece):
 
         span_ns = config.time.t0_ns, config.time.t1_ns
         made = explicit_scene(config.scene, seen_by(config).model, *span_ns, Path.cwd(), self._memory)
+        if notes := dict.fromkeys(note for body in self.objects for note in body.notes):
+            made = replace(made, omissions=(*made.omissions, f"pyrender's scene is drawn without: {'; '.join(notes)}"))
         return equipped(in_fog(made, config.scene), config)

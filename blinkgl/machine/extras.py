@@ -17,6 +17,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, purpose)
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "tensors": (("torch",), "events as tensors: TensorEsim, TensorV2e, events.device: cuda"),
     "cluster": (("ray",), "many machines"),
+    "pyrender": (("pyrender",), "scenes of pyrender: Scene.from_pyrender; tests compare with its renderer"),
     "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (("rosbags", "dv-processing"), "ROS bags and MCAP; writing AEDAT4"),
     "view": (("viser",), "sequences in the browser: blinkgl view, generate --view"),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 
@@ -71,6 +73,36 @@ def contents(path: Path, what: str, where: str | None = None, max_bytes: int = M
         raise AssetError(f"cannot read the {what}: {getattr(error, 'strerror', None) or error}", where=where) from None
 
 
+class Cache:
+    """What was loaded last, ``limit`` bytes in all: a process that makes sequences of many groups for days uses no more
+    memory than one that makes a few."""
+
+    def __init__(self, limit: int):
+        self.limit, self.held = limit, 0
+        self._kept: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def get(self, key: Hashable, load: Callable[[], Any], size_of: Callable[[Any], int]) -> Any:
+        """Return the stored content of this key, or ``load()``, which is not changed afterwards.
+        size_of : its bytes."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key][0]
+        loaded = load()
+        size = size_of(loaded)
+        self._kept[key] = loaded, size
+        self.held += size
+        # The last one stays whatever its size, since the caller uses it next.
+        while self.held > self.limit and len(self._kept) > 1:
+            self.held -= self._kept.popitem(last=False)[1][1]
+        return loaded
+
+
+RECENT = Cache(256_000_000)
+"""The process's meshes and textures that were used last."""
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Features that a file uses and BlinkGL does not draw: collected by a loader, reported by a run in one line per file.
 
@@ -90,6 +122,12 @@ class Omissions:
         """Add a feature. ``what``: a few words in the file's terms, with what is done instead: "alpha BLEND (drawn
         opaque)"."""
         self.found[what] = None
+
+    def unknown(self, what: str, names: Iterable[str]) -> None:
+        """Add the first five ``names`` that a format's closed list does not have, as those of a ``what``; nothing for
+        none."""
+        if ordered := sorted(names):
+            self.add(f"unknown {what} ({', '.join(ordered[:5])}{', …' if len(ordered) > 5 else ''})")
 
     def lines(self) -> tuple[str, ...]:
         """Return the one line, or nothing."""

@@ -64,8 +64,10 @@ def _recipe(target: str, came: Any) -> str:
     recipe: dict[str, Any] = {"scene": scene}
     if came.duration_s:
         # Labels need an interval before the first and one after the last.
-        rate = max(10, math.ceil(4 / came.duration_s))
-        recipe["time"] = {"duration": math.floor(1e6 * (came.duration_s - 2 / rate)) / 1e6, "label_rate": rate}
+        rate = next(k * 10**n for n in range(1, 9) for k in (1, 2, 5) if k * 10**n * came.duration_s >= 4)
+        # Rounded first: 0.3 s at 10 Hz are three intervals. A duration is a whole number of them.
+        intervals = math.floor(round(came.duration_s * rate, 6)) - 2
+        recipe["time"] = {"duration": intervals / rate, "label_rate": rate}
     if came.cameras:
         less = max(max(came.size) / _LONGER_SIDE, 1)
         recipe = {"camera": {"width": round(came.size[0] / less), "height": round(came.size[1] / less)}, **recipe}

@@ -420,6 +420,43 @@ def evil() -> None:
         mark.unlink(missing_ok=True)
 
 
+def rates() -> None:
+    """A box at x = 2 t, by clocks of 60 and 30 frames a second, in formats whose rate Blender does not read."""
+    for rate in (60, 30):
+        fresh(1 + rate, rate)
+        box = cube("Box")
+        keyed(box, "location", (0, 0, 0), (2, 0, 0), frames=(1, 1 + rate))
+        for curve in box.animation_data.action.fcurves:
+            for key in curve.keyframe_points:
+                key.interpolation = "LINEAR"
+        for ending in ("usda", "usdc"):
+            bpy.ops.wm.usd_export(filepath=str(FOLDER / f"rate{rate}.{ending}"), export_animation=True)
+        bpy.ops.wm.alembic_export(filepath=str(FOLDER / f"rate{rate}.abc"), as_background_job=False)
+
+
+def doors() -> None:
+    """What the door of scenes does not draw: an orthographic camera, a world, pixels of two to one, a Non-Color base
+    colour; and a spot of blend 0, which it does."""
+    scene = fresh()
+    painted = cube("Painted")
+    made, tree = material("Data")
+    node = tree.nodes.new("ShaderNodeTexImage")
+    node.image = bpy.data.images.new("grey", 4, 4)
+    node.image.colorspace_settings.name = "Non-Color"
+    tree.links.new(node.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
+    painted.data.materials.append(made)
+    for name, kind in (("Eye", "PERSP"), ("Plan", "ORTHO")):
+        camera = linked(bpy.data.objects.new(name, bpy.data.cameras.new(name)))
+        camera.data.type, camera.location = kind, (0, 0, 5)
+        scene.camera = camera
+    lamp = linked(bpy.data.objects.new("Spot", bpy.data.lights.new("Spot", "SPOT")))
+    lamp.data.spot_blend, lamp.location = 0.0, (0, 0, 4)
+    scene.render.pixel_aspect_x = 2.0
+    scene.world = bpy.data.worlds.new("Evening")
+    scene.world.use_nodes = True
+    save("doors")
+
+
 def odd() -> None:
     """Files that are refused."""
     fresh()
@@ -436,5 +473,5 @@ def odd() -> None:
 
 
 if __name__ == "__main__":
-    for build in (dancer, mixamo, formats, world, left_out, unsaid, named, paints, evil, odd):
+    for build in (dancer, mixamo, formats, world, left_out, unsaid, named, paints, evil, rates, doors, odd):
         build()

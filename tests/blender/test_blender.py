@@ -168,6 +168,44 @@ def test_a_character_of_mixamo(imported):
     assert {"mixamorig:lower", "mixamorig:upper"} <= names and came.report.fps == 30
 
 
+@pytest.mark.parametrize("rate", [60, 30])
+@pytest.mark.parametrize("ending", ["usda", "usdc", "abc"])
+def test_the_clock_of_a_format(imported, rate, ending):
+    """The box is at x = 2 t by the file's own clock; a rate that cannot be read is said, and can be declared."""
+    came = imported(f"rate{rate}.{ending}")
+    unread = "its time codes per second cannot be read: 24 are assumed (--fps declares others)"
+    assert (unread in came.report.left_out) == (ending == "usdc")
+    if ending == "usdc":
+        assert came.report.fps == 24
+        came = imported(f"rate{rate}.{ending}", fps=rate)
+        assert unread not in came.report.left_out
+    document = gltf.read(came.path)
+    made = from_document(document, PinHole.centred(8, 6, 6.0), 0, NS, camera_path=StaticPath(None, 0, NS))
+    (box,) = made.objects
+    for t in (0.0, 0.3, 0.5, 0.9):
+        assert box.path.pose(int(t * NS))[0, 3] == pytest.approx(2 * t, abs=2e-3)
+    assert came.report.fps == rate and came.report.duration_s == pytest.approx(1.0)
+
+
+def test_what_the_door_does_not_draw_is_named(imported):
+    came = imported("doors.blend")
+    lines = "; ".join(came.report.left_out)
+    for words in (
+        "orthographic and panoramic cameras are not drawn; left out: 'Plan'",
+        "the light of the world 'Evening' is left out",
+        "pixels are square: their aspect of 2 : 1 is left out",
+        "materials without a plain colour or image look different (bake them in Blender): 'Data'",
+    ):
+        assert words in lines
+    assert came.report.cameras == ("Eye",) and came.report.camera is None
+    document = gltf.read(came.path, lights=True)
+    scene = from_document(document, PinHole.centred(8, 6, 6.0), 0, NS, camera_name="Eye", lights_gain=1.0)
+    (lamp,) = scene.light.lamps  # hard: inner and outer cone are one
+    assert lamp.kind == "spot" and lamp.inner == pytest.approx(lamp.outer)
+    scale, offset = lamp.cone
+    assert scale * np.cos(lamp.outer + 0.01) + offset < 0 and scale * np.cos(lamp.outer - 0.01) + offset > 1
+
+
 @pytest.mark.parametrize("name", ["formats.usdc", "formats.abc"])
 def test_other_formats(imported, name):
     """Vertices at every frame, of a skinned column (Alembic: a cache of vertices) and of a moving box."""

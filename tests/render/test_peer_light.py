@@ -1,8 +1,7 @@
 """Light and surfaces beside Blender's Cycles at path depth 1, each effect by itself.
 
 ``golden/cycles_light.npz`` holds what Cycles of Blender 4.5.15 made of each case: (H, W, 3) float16 linear radiance,
-512 to 4,096 paths a pixel. It was made once, by commit bec9ca8f, which could run Cycles: one picture a case by
-``blinkgl.tools.trade.cycles.colours(case.scene, [0], CyclesSettings(samples, occlusion=False, bounces=0, …))``.
+512 to 4,096 paths a pixel. ``tools/cycles_light.py`` makes it where Blender is installed.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def test_every_place_of_a_gltf_may_hold_anything(tmp_path):
     [
         (lambda t: t["nodes"][0].update(translation=[0, 0]), "nodes.0.translation: list should have at least 3 items"),
         (lambda t: t["nodes"][0].update(matrix=[1] * 15), "nodes.0.matrix: list should have at least 16 items"),
-        (lambda t: t["nodes"][0].update(rotation=[0, 0, 0, 0]), "nodes.0: a node's rotation is zero"),
+        (lambda t: t["nodes"][0].update(rotation=[0, 0, 0, 0]), "nodes.0.rotation: a node's rotation is zero"),
         (lambda t: t["nodes"][0].update(mesh=True), "nodes.0.mesh: input should be a valid integer) (got True)"),
         (lambda t: t["nodes"][1].update(camera=9), "a reference to cameras that does not exist) (got 9)"),
         (lambda t: t["cameras"][0].update(perspective=[]), "cameras.0.perspective"),
@@ -155,13 +155,11 @@ def test_every_place_of_a_gltf_may_hold_anything(tmp_path):
             ),
             "nested more than 256 deep",
         ),
-        (lambda t: t["images"][0].update(uri="x" * 5000), "refers to a file that is missing"),
         (
             lambda t: t["images"][0].update(uri="data:image/png;base64,AAAA"),
             "the image is corrupt or of an unknown format",
         ),
         (lambda t: t["images"][0].update(uri="data:image/png;base64,A%"), "the embedded image is corrupt"),
-        (lambda t: t["images"][0].update(uri="https://host/a.png"), "the image is on a network"),
     ],
 )
 def test_wrong_shapes_are_named(tmp_path, change, problem):

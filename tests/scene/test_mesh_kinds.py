@@ -146,17 +146,23 @@ def test_materials_of_an_obj(tmp_path):
 @pytest.mark.parametrize(
     "mtl, problem",
     [
-        ("newmtl a\nmap_Kd ../../t.png\n", "m.mtl, line 2: refers to a file outside its folder (got '../../t.png')"),
-        ("newmtl a\nmap_Kd C:\\t.png\n", ""),
-        ("newmtl a\nmap_Kd /t.png\n", "m.mtl, line 2: refers to a file outside its folder (got '/t.png')"),
+        ("newmtl a\nmap_Kd ../../t.png\n", "'../../t.png', which lies outside the folder of the pool or recipe"),
+        ("newmtl a\nmap_Kd C:\\t.png\n", "'C:\\t.png', which is missing"),
+        ("newmtl a\nmap_Kd /t.png\n", "'/t.png', which lies outside the folder of the pool or recipe"),
+        ("newmtl a\nmap_Kd https://host/t.png\n", "'https://host/t.png', which is on a network"),
+        ("newmtl a\nmap_Kd \0.png\n", "'\0.png', which is missing"),
+        (f"newmtl a\nmap_Kd {'x' * 5000}.png\n", "x.png', which is missing"),
+        ("newmtl a\nmap_Kd loop.png\n", "'loop.png', which is missing"),
         ("newmtl a\nKd\n", "m.mtl, line 2: numbers are missing, or are none (got '')"),
     ],
 )
 def test_bad_material_files(tmp_path, mtl, problem):
     (tmp_path / "m.mtl").write_text(mtl)
+    (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
     text = SQUARE + "vt 0 0\nmtllib m.mtl\nusemtl a\nf 1/1 2/1 3/1\n"
-    if not problem:
-        assert "'C:/t.png', which is missing" in asset(tmp_path, text).omissions[0]
+    if "which" in problem:  # the mesh without its texture
+        found = asset(tmp_path, text)
+        assert problem in found.omissions[0] and found.parts[0].material.texture is None
         return
     with pytest.raises(AssetError) as error:
         asset(tmp_path, text)

@@ -219,7 +219,8 @@ def test_obj_materials(tmp_path):
     (tmp_path / "a.obj").write_text(
         "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
     )
-    assert said(tmp_path / "a.obj") == ["normal maps", "emissive light", "transparency (drawn opaque)"]
+    drawn_without = ["shine (drawn matt)", "normal maps", "emissive light", "transparency (drawn opaque)"]
+    assert said(tmp_path / "a.obj") == drawn_without
     assert said(tmp_path / "a.obj", keep_materials=False) == []
     (tmp_path / "t.png").unlink()
     assert "'t.png', which is missing" in said(tmp_path / "a.obj")

@@ -14,11 +14,12 @@ import bpy
 import numpy as np
 from baking import FURTHEST, SEEN, Clock, Track, bake, keep_out, sample, write_keys
 from glb import read, write
+from rates import rate_of
 
 MOST_FRAMES = 100_000
 CONSTANT = 1e-7
-ROUNDS = 3
-"""How often a scene is exported at most."""
+ROUNDS = 3  # how often a scene is exported at most
+# What the exporter takes for a material that is missing.
 NO_MATERIAL = (
     None,
     {
@@ -27,7 +28,6 @@ NO_MATERIAL = (
         "vc_info": dict.fromkeys(("color", "alpha", "color_type", "alpha_type")) | {"alpha_mode": "OPAQUE"},
     },
 )
-"""What the exporter takes for a material that is missing."""
 UNKNOWN = {
     "VOLUME": "volumes", "POINTCLOUD": "point clouds", "CURVES": "hair", "GREASEPENCIL": "grease pencil",
 }  # fmt: skip
@@ -77,7 +77,8 @@ def open_file(source: Path, fps: float | None) -> None:
         if ending == ".blend":
             operators.open_mainfile(filepath=str(source), load_ui=False, use_scripts=False)
         else:
-            set_rate(bpy.context.scene, fps or 24.0)  # Alembic's seconds become frames when it is read
+            # Alembic's seconds become frames when it is read, and USD's codes are taken as frames.
+            set_rate(bpy.context.scene, fps or rate_of(source) or 24.0)
             if "FINISHED" not in openers.get(ending, usd)(str(source)):
                 raise Refused(f"Blender cannot read it as {ending[1:].upper()}", "a whole file of that kind")
     except RuntimeError as problem:  # errors of operators
@@ -177,7 +178,8 @@ def left_out(objs: list[Any], clock: Clock) -> list[str]:
     say("glTF has no area lights; left out", (obj for obj in lamps if obj.data.type == "AREA"))
     say("lights with key frames shine as at their brightest", (lamp for lamp in lamps if lamp.data.animation_data))
     cameras = [obj for obj in objs if obj.type == "CAMERA"]
-    say("glTF has no panoramic cameras; left out", (obj for obj in cameras if obj.data.type == "PANO"))
+    others = (obj for obj in cameras if obj.data.type != "PERSP")
+    say("orthographic and panoramic cameras are not drawn; left out", others)
     say("cameras with a keyed lens keep that of the first frame", (one for one in cameras if one.data.animation_data))
     say("the shift of the lens is left out", (one for one in cameras if one.data.shift_x or one.data.shift_y))
     cuts = sorted((m.frame, m.camera.name) for m in scene.timeline_markers if m.camera is not None)
@@ -204,6 +206,14 @@ def left_out(objs: list[Any], clock: Clock) -> list[str]:
     say("missing images", (i for i in pictures if not os.path.isfile(bpy.path.abspath(i.filepath))))
     missing = (one for one in bpy.data.libraries if not os.path.isfile(bpy.path.abspath(one.filepath)))
     say("missing linked libraries", (one.filepath for one in missing))
+    render, world = scene.render, scene.world
+    if render.pixel_aspect_x != render.pixel_aspect_y:
+        aspect = f"{render.pixel_aspect_x:g} : {render.pixel_aspect_y:g}"
+        lines.append(f"pixels are square: their aspect of {aspect} is left out")
+    if world is not None and shines(world):
+        lines.append(
+            f"the light of the world '{world.name}' is left out (declare scene.light.sky or light.environment)"
+        )
     if scene.unit_settings.scale_length != 1:
         lines.append(
             f"a unit of the scene is {scene.unit_settings.scale_length:g} m, in the GLB it is 1 m (scale it in Blender)"
@@ -211,6 +221,14 @@ def left_out(objs: list[Any], clock: Clock) -> list[str]:
     if clock.simulated:
         lines.append("simulations are computed at whole frames: between them motion is straight")
     return lines
+
+
+def shines(world: Any) -> bool:
+    """Return whether a world is not black."""
+    if not world.use_nodes:
+        return any(world.color)
+    inputs = [node.inputs for node in world.node_tree.nodes if node.type == "BACKGROUND"]
+    return any(c.links or s.links or (s.default_value and any(c.default_value[:3])) for c, s, *_ in inputs)
 
 
 def has_plain_colour(material: Any) -> bool:
@@ -233,7 +251,9 @@ def has_plain_colour(material: Any) -> bool:
     # Mappings become KHR_texture_transform.
     while where and where[0].from_node.type == "MAPPING":
         where = where[0].from_node.inputs["Vector"].links
-    still = paint.image is None or paint.image.source in ("FILE", "GENERATED")
+    # The exporter writes a picture's numbers, which glTF takes as sRGB.
+    image = paint.image
+    still = image is None or (image.source in ("FILE", "GENERATED") and image.colorspace_settings.name == "sRGB")
     return still and (not where or where[0].from_socket.name == "UV")
 
 
@@ -373,6 +393,12 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
         bpy.context.window.scene = bpy.data.scenes[job["scene"]]
     scene = bpy.context.scene
     objs, lines = rendered()
+    if (
+        job["fps"] is None
+        and job["source"].lower().endswith((".usd", ".usdc", ".usdz"))
+        and not rate_of(Path(job["source"]))
+    ):
+        lines.append("its time codes per second cannot be read: 24 are assumed (--fps declares others)")
     realize(objs)
     clock = clock_of(job["frames"], job["keys_per_frame"])
     say(doing="evaluating the scene")
@@ -390,7 +416,7 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     figures = any(obj.type == "ARMATURE" for obj in objs)
     found, tracks, reasons = written(job, out, say, clock, set(broken), owners, figures)
     lines += [f"'{name}' cannot be exported, it is left out or plain ({why})" for name, why in sorted(failed.items())]
-    cameras = [obj for obj in objs if obj.type == "CAMERA" and obj.data.type != "PANO"]
+    cameras = [obj for obj in objs if obj.type == "CAMERA" and obj.data.type == "PERSP"]
     scene.frame_set(scene.frame_start)
     active = scene.camera if scene.camera in cameras else None
     return {

@@ -55,11 +55,11 @@ def make_mesh(
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
-    vertices, faces, used = _checked(np.array(vertices, dtype=np.float64), np.asarray(faces), where)
+    vertices, faces, used = _checked(np.asarray(vertices, np.float64), np.asarray(faces), where)
     origin = np.flatnonzero(used)
-    normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
+    normals = None if normals is None or len(normals) != len(used) else _rows(np.asarray(normals, np.float64), used)
     uvs_given = uvs is not None
-    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
+    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else _rows(np.asarray(uvs, np.float64), used)
 
     faces = faces[_worth_drawing(vertices, faces, where, label, log)]
     if normals is not None and not _usable_normals(normals, vertices, faces):
@@ -104,7 +104,12 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, where: str) -> tuple[np.nd
             accepted="finite coordinates",
         )
     # The running count less 1 is the new number of each vertex that is used.
-    return vertices[used], (np.cumsum(used) - 1)[faces], used
+    return _rows(vertices, used), faces if used.all() else (np.cumsum(used) - 1)[faces], used
+
+
+def _rows(array: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return the ``used`` rows of an array, without a copy where they are all of it."""
+    return array if used.all() else array[used]
 
 
 def _wrong_coordinates(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray | None, degenerate: bool) -> str:
@@ -239,9 +244,12 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> bool:
 
 def corner_angles(corners: np.ndarray) -> np.ndarray:
     """Return the (F, 3) angles at the corners, (F, 3, 3), of triangles, rad."""
-    to_next = np.roll(corners, -1, axis=1) - corners
-    to_previous = np.roll(corners, 1, axis=1) - corners
-    return np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
+    angles = np.empty(corners.shape[:2])
+    for k in range(3):  # one after the other: all at once take three times the memory
+        to_next, to_previous = (corners[:, (k + step) % 3] - corners[:, k] for step in (1, 2))
+        length = np.linalg.norm(np.cross(to_next, to_previous), axis=1)
+        angles[:, k] = np.arctan2(length, (to_next * to_previous).sum(axis=1))
+    return angles
 
 
 def crease_normals(
@@ -261,10 +269,10 @@ def crease_normals(
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
     count = len(faces)
     a, b = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
-    low, high = np.minimum(a, b), np.maximum(a, b)
+    edge = np.minimum(a, b) * (welded.max() + 1) + np.maximum(a, b)
     # The sort makes equal edges neighbours; of more than two at one edge each is paired with the next.
-    order = np.lexsort((high, low))
-    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
+    order = np.argsort(edge, kind="stable")
+    same = edge[order][1:] == edge[order][:-1]
     first, second = order[:-1][same], order[1:][same]  # edge numbers 3*face + k
     if groups is None:
         smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
@@ -278,12 +286,14 @@ def crease_normals(
     left = np.concatenate([first, f_next])
     right = np.concatenate([np.where(direct, second, s_next), np.where(direct, s_next, second)])
     _, fan = _components(left, right, 3 * count)
-    weighted = (unit[:, None, :] * angle[:, :, None]).reshape(-1, 3)
     # Sums over the corners of each fan, given back to every corner of it.
-    total = np.stack([np.bincount(fan, weights=weighted[:, i], minlength=fan.max() + 1) for i in range(3)], axis=1)[fan]
+    weighted = ((unit[:, i, None] * angle).ravel() for i in range(3))
+    total = np.stack([np.bincount(fan, weights=w, minlength=fan.max() + 1) for w in weighted], axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    flat = np.repeat(unit, 3, axis=0)
-    return np.where(length > 1e-9, total / np.maximum(length, 1e-300), flat).reshape(count, 3, 3)
+    made = (total / np.maximum(length, 1e-300))[fan]
+    flat = np.flatnonzero(~(length[fan, 0] > 1e-9))
+    made[flat] = unit[flat // 3]
+    return made.reshape(count, 3, 3)
 
 
 # Seen from outside, with z (for ±z: y) up: (axis, sign) -> the axis and sign that point right, the axis that points up.
@@ -335,18 +345,13 @@ def _from_corners(
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     uvs = uvs.reshape(-1, 2).astype(np.float32)
     # Adding 0.0 turns -0.0 into 0.0, which would otherwise split vertices. Normals are compared to 1e-5: float noise.
-    rows = np.concatenate(
-        [
-            (positions + 0.0).view(np.int64),
-            np.round(normals * 1e5).astype(np.int64),
-            (uvs + 0.0).view(np.int32).astype(np.int64),
-            *([] if origin is None else [origin.reshape(-1, 1).astype(np.int64)]),
-        ],
-        axis=1,
-    )
-    # One structured value for each row, so that np.unique compares whole rows.
-    whole = [("", np.int64)] * rows.shape[1]
-    _, first, index = np.unique(np.ascontiguousarray(rows).view(whole).ravel(), return_index=True, return_inverse=True)
+    columns = [
+        *(positions + 0.0).view(np.int64).T,
+        *np.round(normals * 1e5).astype(np.int32).T,
+        *(uvs + 0.0).view(np.int32).T,
+        *([] if origin is None else [origin.ravel()]),
+    ]
+    first, index = _equal_rows(columns)
     # Vertices in order of first use: good for the vertex cache, and independent of np.unique's sort order.
     order = np.argsort(first, kind="stable")
     rank = np.empty_like(order)
@@ -354,12 +359,27 @@ def _from_corners(
     first = first[order]
     mesh = Mesh(
         vertices=positions[first],
-        faces=rank[index.reshape(-1)].reshape(-1, 3).astype(np.int32),
+        faces=rank[index].reshape(-1, 3).astype(np.int32),
         normals=normals[first],
         uvs=uvs[first],
         **fields,
     )
     return mesh, first
+
+
+def _equal_rows(columns: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return ((k,) row in which each distinct row of whole-number ``columns``, (n,) each, comes first; (n,) which of
+    those each row equals)."""
+    mixed = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
+        # A multiply and a shift per column (Fibonacci hashing, 2^64 over the golden ratio) mix all bits of a row.
+        mixed ^= column.astype(np.int64).view(np.uint64)
+        mixed *= np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    _, first, index = np.unique(mixed, return_index=True, return_inverse=True)
+    if not all((column == column[first][index]).all() for column in columns):  # two rows of one hash, in 1e-7 of meshes
+        _, first, index = np.unique(np.stack(columns, axis=1), axis=0, return_index=True, return_inverse=True)
+    return first, index.ravel()
 
 
 def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:

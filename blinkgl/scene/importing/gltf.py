@@ -12,6 +12,8 @@ Features that are not drawn are collected in :attr:`Document.omissions`.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +25,9 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.importing.gltf_file import MAX_NODES, Node, buffers_of, index_of, item, needs, nodes_of, parse
 from blinkgl.scene.importing.gltf_materials import DRAWN, INVISIBLE_EXTENSIONS, Materials
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
+from blinkgl.scene.importing.polygons import OPACITY
 from blinkgl.scene.reading import Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
@@ -46,6 +50,9 @@ _LIGHT_ONLY = {
 # componentType is OpenGL's code of a type, from GL_BYTE to GL_FLOAT.
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+# The attributes that are read; texture coordinates count where a texture uses them, tangents follow from them, and
+# what begins with "_" is the application's own.
+_ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|COLOR_0|TEXCOORD_\d+|JOINTS_[0-3]|WEIGHTS_[0-3]|_.*")
 _MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer (all zeros): the file's size does not limit them
 _MAX_TIME = 1e7  # s, of an animation's keys
 _MAX_SETS = 4  # of four joints per vertex
@@ -77,17 +84,11 @@ class Document:
         """Return the lights of the scene's nodes by node index, in the form of KHR_lights_punctual, checked, with
         defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
-        gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights)
-        table, found = gltf_schema.PunctualLights.model_validate(extension).lights, {}
+        table = gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights).lights
+        found: dict[int, dict[str, Any]] = {}
         for index in (index for index, node in self.nodes.items() if node.visible):
             if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
-                number = reference.get("light")
-                if type(number) is not int or not 0 <= number < len(table):
-                    raise AssetError(
-                        "the file is no valid glTF (a reference to lights that does not exist)",
-                        where=self.where,
-                        value=number,
-                    )
+                number = index_of(reference.get("light"), len(table), "lights", self.where)
                 found[index] = table[number].model_dump()
         return found
 
@@ -131,8 +132,13 @@ class Document:
         if uvs is not None and uv_matrix is not None:
             uvs = uvs @ uv_matrix[:2, :2].T + uv_matrix[:2, 2]
         colours = None
+        self.omissions.unknown("attributes", [name for name in attributes if not _ATTRIBUTE.fullmatch(name)])
+        moved = {name for target in primitive.get("targets", []) for name in target}
+        self.omissions.unknown("attributes of morph targets", moved - {"POSITION", "NORMAL", "TANGENT"})
         if self.materials.wanted:
             material, colours = self._coloured(primitive, material, len(vertices))
+            if material is INVISIBLE:
+                return None
             material = self._without_coordinates(material) if uvs is None else material
         binding, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
         both = material is not None and bool(material.both_sides)
@@ -295,10 +301,14 @@ class Document:
         index = primitive["attributes"]["COLOR_0"]
         width = _WIDTHS[item(self.tree, "accessors", index, self.where)["type"]]
         given = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)
-        colours = np.clip(np.nan_to_num(given[:, :3]), 0, 1)
-        if width == 4 and material is not None and material.mask is not None and (given[:, 3] < 1).any():
-            self.omissions.add("opacity of vertex colours (left out)")
-        return tinted(material, colours)
+        known = np.isfinite(given).all(axis=1)
+        if not known.all() or given.min(initial=0) < 0 or given.max(initial=0) > 1:
+            self.omissions.add("colours beyond 0 to 1 (white where they are no numbers, else the nearest)")
+        if width == 4 and (given[:, 3] < 1).any() and self.materials.mode(primitive.get("material")) != "OPAQUE":
+            self.omissions.add(OPACITY)
+            if not given[:, 3].any():
+                return INVISIBLE, None
+        return tinted(material, np.where(known[:, None], given[:, :3], 1.0).clip(0, 1))
 
     def _without_coordinates(self, material: Material | None) -> Material | None:
         """Return the material of a mesh without texture coordinates, without normal map, whose direction is then
@@ -419,23 +429,26 @@ def read(
     max_texture: int = 2048,
     materials: bool = True,
     lights: bool = False,
+    border: Path | None = None,
 ) -> Document:
-    """Parse a file, check its form and its counts. lights : whether the file's lights are used
-    (:meth:`Document.lights`). Raises AssetError naming it."""
+    """Parse a file, check its form and its counts. border : folder that its files lie below; None: its own.   lights :
+    whether the file's lights are used (:meth:`Document.lights`). Raises AssetError naming it."""
     path = Path(path)
     where = str(path)
     with reading("scene", where):
         data = contents(path, "scene") if data is None else data
-        tree, binary = parse(data, where)
+        tree, binary, unknown = parse(data, where)
         for name in tree.get("extensionsRequired", []):
             if name not in DRAWN | _LIGHT_ONLY | INVISIBLE_EXTENSIONS:
                 raise needs(name, where)
-        buffers, omissions = buffers_of(tree, binary, path), Omissions(path.name)
-        made = Materials(tree, buffers, path, max_texture, materials, omissions)
-        document = Document(path, tree, buffers, made, omissions)
+        near = Neighbours(path, border, Omissions(path.name))
+        near.omissions.unknown("properties", unknown)
+        buffers = buffers_of(tree, binary, near)
+        made = Materials(tree, buffers, near, max_texture, materials)
+        document = Document(path, tree, buffers, made, near.omissions, log=near.log)
         document.nodes = nodes_of(tree, where)
         _check_faces(document, max_faces)
-        for name in tree.get("extensionsUsed", []):
+        for name in dict.fromkeys([*tree.get("extensionsUsed", []), *_extensions(tree)]):
             # Extensions of materials and textures are reported where one is used, and lights by kind.
             said_there = name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"))
             if name not in DRAWN | _LIGHT_ONLY | INVISIBLE_EXTENSIONS and not said_there:
@@ -445,6 +458,15 @@ def read(
         if not lights and any(_LIGHTS in tree["nodes"][i].get("extensions", {}) for i in document.nodes):
             document.omissions.add("lights (the configuration's sun and sky shine)")
     return document
+
+
+def _extensions(tree: Any) -> Iterator[str]:
+    """Yield the names of extensions that anything in a file has."""
+    for key, value in tree.items() if isinstance(tree, dict) else ((None, value) for value in tree):
+        if key == "extensions" and isinstance(value, dict):
+            yield from value
+        if isinstance(value, dict) or (isinstance(value, list) and value and isinstance(value[0], (dict, list))):
+            yield from _extensions(value)
 
 
 def _check_faces(document: Document, max_faces: int) -> None:

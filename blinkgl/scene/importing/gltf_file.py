@@ -1,4 +1,4 @@
-"""A glTF 2.0 file's JSON and bytes, parsed and checked; only files in its own folder are read.
+"""A glTF 2.0 file's JSON and bytes, parsed and checked.
 
 Reference: Khronos glTF 2.0 specification, sections 3.6 (buffers) and 4 (the GLB container).
 """
@@ -9,6 +9,7 @@ import base64
 import binascii
 import json
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.reading import contents, reading
 from blinkgl.types.poses import pose_of
 
 
-def parse(data: bytes, where: str) -> tuple[dict, bytes]:
-    """Return (the JSON, checked by gltf_schema; the bytes in a GLB). Raises AssetError."""
+def parse(data: bytes, where: str) -> tuple[dict, bytes, list[str]]:
+    """Return (the JSON, checked by gltf_schema; the bytes in a GLB; the properties that glTF does not have). Raises
+    AssetError."""
     binary = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
@@ -49,10 +52,10 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
     else:
         text = data
     try:
-        tree = json.loads(text.decode("utf-8-sig"))
+        tree = json.loads(text.decode("utf-8-sig"), parse_float=_number)
     except (ValueError, RecursionError):
         raise AssetError("the file is no valid glTF (its JSON cannot be read)", where=where) from None
-    gltf_schema.check(tree, where)
+    unknown = list(dict.fromkeys(gltf_schema.unknown(gltf_schema.check(tree, where))))
     version, least = tree["asset"]["version"], tree["asset"].get("minVersion", "2.0")
     if not version.startswith("2") or least not in ("2", "2.0"):
         raise AssetError(
@@ -61,23 +64,32 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes]:
             value=version if not version.startswith("2") else f"minVersion {least}",
             accepted="version 2.0",
         )
-    return tree, binary
+    return tree, binary, unknown
 
 
-def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
+def _number(text: str) -> float:
+    """Return a number of JSON, in which 36.0 is a whole one."""
+    number = float(text)
+    return int(number) if abs(number) < 2**53 and number == int(number) else number
+
+
+def buffers_of(tree: dict, binary: bytes, near: Neighbours) -> list[bytes]:
     """Return the contents of all buffers, with the declared lengths. Raises AssetError."""
-    buffers = []
+    buffers, where = [], str(near.path)
     for number, buffer in enumerate(tree.get("buffers", [])):
         # EXT_meshopt_compression leaves a buffer without content as its fallback.
         compressed = next((e for e in buffer.get("extensions", {}) if e.endswith("_meshopt_compression")), None)
         if compressed and "uri" not in buffer:
-            raise needs(compressed, str(path))
+            raise needs(compressed, where)
         # Only the first buffer of a GLB may lack a URI: its content is the binary chunk.
-        data = fetch(buffer["uri"] or "", path, "buffer") if "uri" in buffer else binary if number == 0 else b""
+        data, uri = binary if number == 0 else b"", buffer.get("uri")
+        if uri is not None:
+            beside = not uri.startswith("data:")
+            data = contents(near.find(unquote(uri)), "buffer") if beside else embedded(uri, "buffer", where)
         if len(data) < buffer.get("byteLength", 0):
             raise AssetError(
                 f"buffer {number} is truncated",
-                where=str(path),
+                where=where,
                 value=len(data),
                 accepted=f"{buffer.get('byteLength')} bytes",
             )
@@ -85,51 +97,26 @@ def buffers_of(tree: dict, binary: bytes, path: Path) -> list[bytes]:
     return buffers
 
 
-def fetch(uri: str, path: Path, what: str) -> bytes:
-    """Return the content of a URI of the file at ``path``: embedded, or a file beside it. Raises AssetError."""
-    if uri.startswith("data:"):
-        head, _, body = uri.partition(",")
-        try:
-            return (
-                base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode("latin-1")
-            )
-        except (binascii.Error, ValueError):
-            raise AssetError(f"the embedded {what} is corrupt", where=str(path)) from None
-    if "://" in uri:
-        raise AssetError(f"the {what} is on a network", where=str(path), value=uri, accepted="a file beside it")
-    return contents(inside(path.parent, unquote(uri), str(path)), what, str(path))
-
-
-def buffer_contents(path: Path, data: bytes) -> list[bytes]:
-    """Return the external buffers of a .gltf file, in order."""
-    with reading("scene", str(path)):
-        tree, _ = parse(data, str(path))
-        uris = [b.get("uri") or "" for b in tree.get("buffers", [])]
-        return [fetch(uri, path, "buffer") for uri in uris if uri and not uri.startswith("data:")]
-
-
-def inside(folder: Path, name: str, where: str) -> Path:
-    """Return the file ``name`` below ``folder``. Raises AssetError when it is absolute, leads out by ``..`` or by a
-    link, or is missing."""
-    target = Path(folder) / name
+def embedded(uri: str, what: str, where: str) -> bytes:
+    """Return the content of a data URI, whose base64 may have line breaks. Raises AssetError."""
+    head, _, body = uri.partition(",")
     try:
-        within = (
-            name
-            and "\0" not in name
-            and not Path(name).is_absolute()
-            and "\\" not in name
-            and target.resolve().is_relative_to(Path(folder).resolve())
-        )
-        found = within and target.is_file()
-    except (OSError, ValueError, RuntimeError):  # a name too long for the file system, or a link to itself
-        within, found = True, False
-    if not within:
-        raise AssetError(
-            "refers to a file outside its folder", where=where, value=name, accepted="a relative path below it"
-        )
-    if not found:
-        raise AssetError("refers to a file that is missing", where=where, value=name)
-    return target
+        plain = unquote(body)
+        if not head.endswith(";base64"):
+            return plain.encode("latin-1")
+        return base64.b64decode("".join(plain.split()), validate=True)
+    except (binascii.Error, ValueError):
+        raise AssetError(f"the embedded {what} is corrupt", where=where) from None
+
+
+def files_of_gltf(data: bytes, near: Neighbours, key: str) -> Iterator[tuple[str, Path | None]]:
+    """Yield the names of the files beside a glTF file that are its "buffers" or "images" (``key``), and what is there.
+    Raises AssetError: a broken file, a buffer that is missing or beyond the border."""
+    with reading("scene", str(near.path)):
+        tree, _, _ = parse(data, str(near.path))
+        for uri in (entry.get("uri") or "data:" for entry in tree.get(key, [])):
+            if not uri.startswith("data:"):
+                yield uri, near.optional((unquote(uri), uri)) if key == "images" else near.find(unquote(uri))
 
 
 def needs(extension: str, where: str) -> AssetError:

@@ -7,14 +7,16 @@ KHR_materials_emissive_strength, KHR_texture_transform.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 
-from blinkgl.scene.importing.gltf_file import fetch, index_of, item
+from blinkgl.scene.importing.gltf_file import embedded, index_of, item
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE
-from blinkgl.scene.reading import Omissions
+from blinkgl.scene.reading import RECENT, contents
 from blinkgl.scene.surfaces.images import content_hash, decode_alpha, decode_image, decode_numbers
 from blinkgl.scene.types import REPEAT, Gloss, Map, Mask, Material, Texture, Wrap
 
@@ -27,8 +29,8 @@ DRAWN = {
     "KHR_materials_variants",
     "EXT_texture_webp",
 }
+# Extensions without visible effect.
 INVISIBLE_EXTENSIONS = {"KHR_xmp_json_ld", "KHR_xmp"}
-"""Extensions without visible effect."""
 # OpenGL's codes: GL_CLAMP_TO_EDGE, GL_MIRRORED_REPEAT, and below GL_NEAREST.
 _WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
@@ -50,11 +52,9 @@ class Materials:
     """The materials of one file, each made once. wanted : False leaves out all but the base colour, and does not report
     undrawn features."""
 
-    def __init__(
-        self, tree: dict, buffers: list[bytes], path: Path, max_texture: int, wanted: bool, omissions: Omissions
-    ):
-        self.tree, self.buffers, self.path, self.max_texture = tree, buffers, path, max_texture
-        self.wanted, self.omissions, self.where = wanted, omissions, str(path)
+    def __init__(self, tree: dict, buffers: list[bytes], near: Neighbours, max_texture: int, wanted: bool):
+        self.tree, self.buffers, self.near, self.max_texture = tree, buffers, near, max_texture
+        self.wanted, self.omissions, self.where = wanted, near.omissions, str(near.path)
         self._materials: dict = {}
         self._textures: dict = {}
 
@@ -77,6 +77,10 @@ class Materials:
                 material, base = self._surface(material, m, pbr, base)
             self._materials[index] = (material, base.coordinates, base.matrix)
         return self._materials[index]
+
+    def mode(self, index: int | None) -> str:
+        """Return what a material does with opacity: OPAQUE, MASK or BLEND."""
+        return "OPAQUE" if index is None else item(self.tree, "materials", index, self.where).get("alphaMode", "OPAQUE")
 
     def _surface(self, material: Material, m: dict, pbr: dict, base: _Place) -> tuple[Material, _Place]:
         """Return ``material`` with everything besides its base colour, and its texture coordinates: those of the first
@@ -182,12 +186,22 @@ class Materials:
                 buffer = self.buffers[index_of(v["buffer"], len(self.buffers), "buffer", self.where)]
                 begin = v.get("byteOffset", 0)
                 data = buffer[begin : begin + v.get("byteLength", 0)]
+            elif (uri := image.get("uri") or "").startswith("data:"):
+                data = embedded(uri, "image", self.where)
             else:
-                data = fetch(image.get("uri", ""), self.path, "image")
+                file = self.near.optional((unquote(uri), uri))
+                if file is None:
+                    self._textures[source, kind] = None
+                    return None
+                data = contents(file, "image")
             name = str(image.get("name") or f"image-{source}")
-            decode = {"colour": decode_image, "numbers": decode_numbers, "alpha": decode_alpha}[kind]
-            pixels = decode(data, self.max_texture, f"{self.where} (image '{name}')")
-            self._textures[source, kind] = None if pixels is None else Texture(pixels, name, content_hash(data))
+            decode = {"colour": partial(decode_image, gamma=False), "numbers": decode_numbers, "alpha": decode_alpha}[
+                kind
+            ]
+            key = content_hash(data), kind, self.max_texture
+            decoded = partial(decode, data, self.max_texture, f"{self.where} (image '{name}')")
+            pixels = RECENT.get(key, decoded, lambda pixels: 0 if pixels is None else pixels.nbytes)
+            self._textures[source, kind] = None if pixels is None else Texture(pixels, name, key[0])
         return self._textures[source, kind]
 
 

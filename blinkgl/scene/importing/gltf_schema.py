@@ -2,14 +2,15 @@
 
 The reader (:mod:`blinkgl.scene.importing.gltf`) works on the plain dictionaries; :func:`check` guarantees their form.
 References from one list into another are checked where they are used. Names are those of the specification. Properties
-that are not read are not checked.
+that are not read are not checked; those that the specification does not have are found by :func:`unknown`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from blinkgl.errors import AssetError
 
@@ -28,243 +29,194 @@ Extensions = dict[str, dict[str, Any]]
 
 class _Part(BaseModel):
     # A default of None means "not there"; the specification does not allow JSON's null, so it is refused.
-    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
-
-
-class Asset(_Part):
-    version: str
-    minVersion: str = None
-
-
-class Buffer(_Part):
-    uri: str = None
-    byteLength: Size = 0
-    extensions: Extensions = {}
-
-
-class BufferView(_Part):
-    buffer: Index
-    byteOffset: Size = 0
-    byteLength: Size = 0
-    byteStride: Annotated[int, Field(ge=0, le=65536)] = 0
-
-
-class SparseValues(_Part):
-    bufferView: Index
-    byteOffset: Size = 0
-
-
-class SparseIndices(SparseValues):
-    componentType: Literal[5121, 5123, 5125]
-
-
-class Sparse(_Part):
-    count: Size
-    indices: SparseIndices
-    values: SparseValues
-
-
-class Accessor(_Part):
-    bufferView: Index = None
-    byteOffset: Size = 0
-    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
-    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
-    count: Size
-    normalized: bool = False
-    sparse: Sparse = None
-
-
-class Transform(_Part):
-    offset: Vector2 = [0, 0]
-    scale: Vector2 = [1, 1]
-    rotation: Number = 0.0
-    texCoord: Annotated[int, Field(ge=0, le=255)] = None
-
-
-class TextureExtensions(_Part):
-    KHR_texture_transform: Transform = None
-
-
-class TextureInfo(_Part):
-    index: Index
-    texCoord: Annotated[int, Field(ge=0, le=255)] = 0
-    extensions: TextureExtensions = TextureExtensions()
-
-
-class NormalTextureInfo(TextureInfo):
-    scale: Number = 1.0
-
-
-class Pbr(_Part):
-    baseColorFactor: Annotated[list[Factor], Field(min_length=4, max_length=4)] = [1, 1, 1, 1]
-    baseColorTexture: TextureInfo = None
-    metallicFactor: Factor = 1.0
-    roughnessFactor: Factor = 1.0
-    metallicRoughnessTexture: TextureInfo = None
-
-
-class EmissiveStrength(_Part):
-    emissiveStrength: Factor = 1.0
-
-
-class MaterialExtensions(_Part):
-    KHR_materials_emissive_strength: EmissiveStrength = None
-
-
-class Material(_Part):
-    pbrMetallicRoughness: Pbr = Pbr()
-    normalTexture: NormalTextureInfo = None
-    occlusionTexture: TextureInfo = None
-    emissiveTexture: TextureInfo = None
-    emissiveFactor: Annotated[list[Factor], Field(min_length=3, max_length=3)] = [0, 0, 0]
-    alphaMode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
-    alphaCutoff: Factor = 0.5
-    doubleSided: bool = False
-    extensions: MaterialExtensions = MaterialExtensions()
-
-
-class Primitive(_Part):
-    attributes: dict[str, Index]
-    indices: Index = None
-    material: Index = None
-    # 4: separate triangles.
-    mode: Annotated[int, Field(ge=0, le=6)] = 4
-    targets: list[dict[str, Index]] = []
-    extensions: Extensions = {}
-
-
-class Mesh(_Part):
-    primitives: list[Primitive]
-    weights: list[Number] = []
-
-
-class Node(_Part):
-    children: list[Index] = []
-    mesh: Index = None
-    camera: Index = None
-    skin: Index = None
-    matrix: Matrix4 = None
-    translation: Vector3 = [0, 0, 0]
-    rotation: Vector4 = [0, 0, 0, 1]
-    scale: Vector3 = [1, 1, 1]
-    weights: list[Number] = None
-    extensions: Extensions = {}
-
-    @model_validator(mode="after")
-    def _turned(self):
-        if sum(q * q for q in self.rotation) < 1e-18:
-            raise ValueError("a node's rotation is zero")
-        return self
-
-
-class Skin(_Part):
-    joints: Annotated[list[Index], Field(min_length=1)]
-    inverseBindMatrices: Index = None
-
-
-class Scene(_Part):
-    nodes: list[Index] = []
-
-
-class Texture(_Part):
-    source: Index = None
-    sampler: Index = None
-    extensions: Extensions = {}
-
-
-class Image(_Part):
-    uri: str = None
-    bufferView: Index = None
-
-
-class Sampler(_Part):
-    magFilter: int = None
-    # OpenGL's codes; 10497 is GL_REPEAT, the default of the specification.
-    wrapS: int = 10497
-    wrapT: int = 10497
-
-
-class Perspective(_Part):
-    yfov: Annotated[float, Field(gt=1e-4, lt=3.1415)]
-    znear: Factor = None
-
-
-class Camera(_Part):
-    type: Literal["perspective", "orthographic"]
-    perspective: Perspective = None
-
-
-class Target(_Part):
-    node: Index = None
-    path: str
-
-
-class Channel(_Part):
-    sampler: Index
-    target: Target
-
-
-class AnimationSampler(_Part):
-    input: Index
-    output: Index
-    interpolation: Literal["LINEAR", "STEP", "CUBICSPLINE"] = "LINEAR"
-
-
-class Animation(_Part):
-    channels: list[Channel]
-    samplers: list[AnimationSampler]
-
-
-class Spot(_Part):
-    innerConeAngle: Annotated[float, Field(ge=0, lt=1.5708)] = 0.0
-    outerConeAngle: Annotated[float, Field(gt=0, le=1.5708)] = 0.7853981633974483
-
-    @model_validator(mode="after")
-    def _inside(self):
-        if self.innerConeAngle >= self.outerConeAngle:
-            raise ValueError("a spot light's inner cone is not inside its outer cone")
-        return self
-
-
-class PunctualLight(_Part):
-    """A light of KHR_lights_punctual: candela and lux."""
-
-    type: Literal["directional", "point", "spot"]
-    color: Annotated[list[Factor], Field(min_length=3, max_length=3)] = [1, 1, 1]
-    intensity: Factor = 1.0
-    range: Annotated[float, Field(gt=0, le=1e9)] = None
-    spot: Spot = Spot()
-
-
-class PunctualLights(_Part):
-    lights: list[PunctualLight] = []
-
-
-class File(_Part):
-    asset: Asset
-    extensionsUsed: list[str] = []
-    extensionsRequired: list[str] = []
-    buffers: list[Buffer] = []
-    bufferViews: list[BufferView] = []
-    accessors: list[Accessor] = []
-    images: list[Image] = []
-    samplers: list[Sampler] = []
-    textures: list[Texture] = []
-    materials: list[Material] = []
-    meshes: list[Mesh] = []
-    cameras: list[Camera] = []
-    nodes: list[Node] = []
-    skins: list[Skin] = []
-    scenes: list[Scene] = []
-    scene: Index = 0
-    animations: list[Animation] = []
-
-
-def check(tree: Any, where: str, model: type[_Part] = File) -> None:
-    """Raise AssetError naming the first property that violates the specification, and its value.
-    model : the schema; an extension has its own."""
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+
+def _turned(rotation: list[float]) -> list[float]:
+    if sum(q * q for q in rotation) < 1e-18:
+        raise ValueError("a node's rotation is zero")
+    return rotation
+
+
+def _part(name: str, effectless: str = "", **fields: Any) -> Any:
+    """Return the schema of a part of a file: type and default of each property, ... for one that must be there.
+    effectless : names of properties that change nothing of what is drawn."""
+    plain = {"name": (Any, None), "extras": (Any, None)} | dict.fromkeys(effectless.split(), (Any, None))
+    return create_model(name, __base__=_Part, **plain, **fields)
+
+
+# The closed list of glTF 2.0: every property of the specification, its type, its default. `extensions` are listed where
+# they are drawn (gltf.py, gltf_materials.py).
+Asset = _part("Asset", "copyright generator extensions", version=(str, ...), minVersion=(str, None))
+Buffer = _part("Buffer", uri=(str, None), byteLength=(Size, 0), extensions=(Extensions, {}))
+BufferView = _part(
+    "BufferView",
+    "target extensions",
+    buffer=(Index, ...),
+    byteOffset=(Size, 0),
+    byteLength=(Size, 0),
+    byteStride=(Annotated[int, Field(ge=0, le=65536)], 0),
+)
+SparseValues = _part("SparseValues", "extensions", bufferView=(Index, ...), byteOffset=(Size, 0))
+SparseIndices = _part(
+    "SparseIndices",
+    "extensions",
+    bufferView=(Index, ...),
+    byteOffset=(Size, 0),
+    componentType=(Literal[5121, 5123, 5125], ...),
+)
+Sparse = _part("Sparse", "extensions", count=(Size, ...), indices=(SparseIndices, ...), values=(SparseValues, ...))
+Accessor = _part(
+    "Accessor",
+    "min max extensions",
+    bufferView=(Index, None),
+    byteOffset=(Size, 0),
+    componentType=(Literal[5120, 5121, 5122, 5123, 5125, 5126], ...),
+    type=(Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"], ...),
+    count=(Size, ...),
+    normalized=(bool, False),
+    sparse=(Sparse, None),
+)
+_Set = Annotated[int, Field(ge=0, le=255)]
+Transform = _part(
+    "KHR_texture_transform",
+    offset=(Vector2, [0, 0]),
+    scale=(Vector2, [1, 1]),
+    rotation=(Number, 0.0),
+    texCoord=(_Set, None),
+)
+TextureExtensions = _part("TextureExtensions", KHR_texture_transform=(Transform, None))
+_PLACED = {"index": (Index, ...), "texCoord": (_Set, 0), "extensions": (TextureExtensions, TextureExtensions())}
+TextureInfo = _part("TextureInfo", **_PLACED)
+NormalTextureInfo = _part("NormalTextureInfo", scale=(Number, 1.0), **_PLACED)
+OcclusionTextureInfo = _part("OcclusionTextureInfo", "strength", **_PLACED)
+Colour = Annotated[list[Factor], Field(min_length=3, max_length=3)]
+Pbr = _part(
+    "Pbr",
+    "extensions",
+    baseColorFactor=(Annotated[list[Factor], Field(min_length=4, max_length=4)], [1, 1, 1, 1]),
+    baseColorTexture=(TextureInfo, None),
+    metallicFactor=(Factor, 1.0),
+    roughnessFactor=(Factor, 1.0),
+    metallicRoughnessTexture=(TextureInfo, None),
+)
+_Strength = _part("KHR_materials_emissive_strength", emissiveStrength=(Factor, 1.0))
+MaterialExtensions = _part("MaterialExtensions", KHR_materials_emissive_strength=(_Strength, None))
+Material = _part(
+    "Material",
+    pbrMetallicRoughness=(Pbr, Pbr()),
+    normalTexture=(NormalTextureInfo, None),
+    occlusionTexture=(OcclusionTextureInfo, None),
+    emissiveTexture=(TextureInfo, None),
+    emissiveFactor=(Colour, [0, 0, 0]),
+    alphaMode=(Literal["OPAQUE", "MASK", "BLEND"], "OPAQUE"),
+    alphaCutoff=(Factor, 0.5),
+    doubleSided=(bool, False),
+    extensions=(MaterialExtensions, MaterialExtensions()),
+)
+Primitive = _part(
+    "Primitive",
+    attributes=(dict[str, Index], ...),
+    indices=(Index, None),
+    material=(Index, None),
+    mode=(Annotated[int, Field(ge=0, le=6)], 4),  # 4: separate triangles
+    targets=(list[dict[str, Index]], []),
+    extensions=(Extensions, {}),
+)
+Mesh = _part("Mesh", "extensions", primitives=(list[Primitive], ...), weights=(list[Number], []))
+Node = _part(
+    "Node",
+    children=(list[Index], []),
+    mesh=(Index, None),
+    camera=(Index, None),
+    skin=(Index, None),
+    matrix=(Matrix4, None),
+    translation=(Vector3, [0, 0, 0]),
+    rotation=(Annotated[Vector4, AfterValidator(_turned)], [0, 0, 0, 1]),
+    scale=(Vector3, [1, 1, 1]),
+    weights=(list[Number], None),
+    extensions=(Extensions, {}),
+)
+Skin = _part(
+    "Skin",
+    "skeleton extensions",
+    joints=(Annotated[list[Index], Field(min_length=1)], ...),
+    inverseBindMatrices=(Index, None),
+)
+Scene = _part("Scene", "extensions", nodes=(list[Index], []))
+Texture = _part("Texture", source=(Index, None), sampler=(Index, None), extensions=(Extensions, {}))
+Image = _part("Image", "mimeType extensions", uri=(str, None), bufferView=(Index, None))
+# OpenGL's codes; 10497 is GL_REPEAT, the default of the specification.
+Sampler = _part("Sampler", "minFilter extensions", magFilter=(int, None), wrapS=(int, 10497), wrapT=(int, 10497))
+Perspective = _part(
+    "Perspective",
+    "aspectRatio zfar extensions",
+    yfov=(Annotated[float, Field(gt=1e-4, lt=3.1415)], ...),
+    znear=(Factor, None),
+)
+Camera = _part(
+    "Camera",
+    "orthographic extensions",
+    type=(Literal["perspective", "orthographic"], ...),
+    perspective=(Perspective, None),
+)
+Target = _part("Target", node=(Index, None), path=(str, ...), extensions=(Extensions, {}))
+Channel = _part("Channel", "extensions", sampler=(Index, ...), target=(Target, ...))
+AnimationSampler = _part(
+    "AnimationSampler",
+    "extensions",
+    input=(Index, ...),
+    output=(Index, ...),
+    interpolation=(Literal["LINEAR", "STEP", "CUBICSPLINE"], "LINEAR"),
+)
+Animation = _part("Animation", "extensions", channels=(list[Channel], ...), samplers=(list[AnimationSampler], ...))
+# KHR_lights_punctual: candela and lux.
+Spot = _part(
+    "Spot",
+    innerConeAngle=(Annotated[float, Field(ge=0, le=1.5708)], 0.0),
+    outerConeAngle=(Annotated[float, Field(gt=0, le=1.5708)], 0.7853981633974483),
+)
+PunctualLight = _part(
+    "PunctualLight",
+    type=(Literal["directional", "point", "spot"], ...),
+    color=(Colour, [1, 1, 1]),
+    intensity=(Factor, 1.0),
+    range=(Annotated[float, Field(gt=0, le=1e9)], None),
+    spot=(Spot, Spot()),
+)
+PunctualLights = _part("PunctualLights", lights=(list[PunctualLight], []))
+_LISTS = {
+    "buffers": Buffer, "bufferViews": BufferView, "accessors": Accessor, "images": Image, "samplers": Sampler,
+    "textures": Texture, "materials": Material, "meshes": Mesh, "cameras": Camera, "nodes": Node, "skins": Skin,
+    "scenes": Scene, "animations": Animation,
+}  # fmt: skip
+File = _part(
+    "File",
+    "extensions",
+    asset=(Asset, ...),
+    extensionsUsed=(list[str], []),
+    extensionsRequired=(list[str], []),
+    scene=(Index, 0),
+    **{key: (list[part], []) for key, part in _LISTS.items()},
+)
+
+
+def unknown(part: Any, path: str = "") -> Iterator[str]:
+    """Yield the properties in a checked part that the closed list does not have, as in "materials.iridescence"."""
+    for key in part.model_extra or ():
+        yield f"{path}{key}"
+    for key in part.model_fields_set & type(part).model_fields.keys():
+        value = None if key == "extensions" else getattr(part, key)
+        for inner in value if isinstance(value, list) else (value,):
+            if isinstance(inner, _Part):
+                yield from unknown(inner, f"{key}.")
+
+
+def check(tree: Any, where: str, model: Any = File) -> Any:
+    """Return the checked part. Raise AssetError naming the first property that violates the specification, and its
+    value.   model : the schema; an extension has its own."""
     try:
-        model.model_validate(tree)
+        return model.model_validate(tree)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         path = ".".join(str(step) for step in first["loc"]) or "its JSON"

@@ -1,17 +1,20 @@
 """Mesh files (obj, ply, each by a reader of its own; stl, off, 3mf by :mod:`blinkgl.scene.importing.trimesh_files`;
 glb, gltf by :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
-Sizes that a file declares are checked against limits before memory is allocated, and only files in the file's own
-folder are read.
+Sizes that a file declares are checked against limits before memory is allocated, and only files below a border are
+read (:mod:`blinkgl.scene.importing.neighbours`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,16 +23,16 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import concatenate, normalise
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, play as play_clip, shown
-from blinkgl.scene.importing.gltf_file import buffer_contents
-from blinkgl.scene.importing.obj import read_obj
+from blinkgl.scene.importing.gltf_file import files_of_gltf, parse
+from blinkgl.scene.importing.neighbours import Neighbours
+from blinkgl.scene.importing.obj import files_of_obj, read_obj
 from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
-from blinkgl.scene.importing.ply import read_ply
-from blinkgl.scene.reading import MAX_BYTES, Omissions, contents, limit_faces, reading
+from blinkgl.scene.importing.ply import checked_ply, files_of_ply, read_ply
+from blinkgl.scene.reading import MAX_BYTES, RECENT, Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Material, Mesh, Part
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".3mf", ".glb", ".gltf")
 ClipOf = Callable[[gltf.Document], Animation]
 
 
@@ -51,6 +54,15 @@ class Asset:
     clips: tuple[str, ...] = ()
     replay: Callable[[AnimationConfig], Asset] | None = None
 
+    @property
+    def has_looks(self) -> bool:
+        """Return whether its file chose its looks: textures, light of its own, colours of vertices, or anything but one
+        plain grey, which exporters write where no one chose."""
+        worn = [part.material for part in self.parts]
+        pictured = any(m.texture is not None or m.bumps is not None or any(m.emission) for m in worn)
+        own = pictured or any(part.mesh.colours is not None for part in self.parts)
+        return self.has_materials and (own or len({c for m in worn for c in m.base_color}) > 1)
+
     def normalised(self) -> Asset:
         """Return it with the bounding box centred on the origin and bounding radius 1; a deforming one by its whole
         region. Raises AssetError where nothing of it is visible."""
@@ -71,8 +83,11 @@ def load_asset(
     uv_size: float | None = None,
     up: str = "auto",
     play: ClipOf | None = None,
+    border: Path | None = None,
 ) -> Asset:
     """Return one object from a file.
+
+    border : folder that the files which it names must lie below; None: its own.
 
     play : for a glTF file, returns the clip that it plays (:func:`clip_of`); None: it is at rest.
     up : the file's upward axis, which becomes z, "y" or "z"; "auto" is y for glb and gltf, by their standard, and z for
@@ -81,29 +96,52 @@ def load_asset(
         texture (projected where the file has none or degenerate ones).
     uv_size : edge of one repeat of projected texture coordinates.
     Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or
-    ``max_bytes`` bytes, references outside its folder, a required extension that is not supported; ConfigError:
+    ``max_bytes`` bytes, buffers beyond the border, a required extension that is not supported; ConfigError:
     ``play`` does not find its clip.
     """
     path = Path(path)
-    where = str(path)
-    with reading("mesh", where):
-        found, digest = _found(path, max_faces, max_bytes, keep_materials, max_texture, source_hash, up, play)
-        limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, where)
-        has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
-        common = {"name": path.stem, "where": where, "source_hash": digest, "log": found.log}
-        parts = tuple(
-            part_of(raw, **common, materials=has_materials, uv_size=uv_size, deformer=deformer)
-            for raw, deformer in zip(found.raws, found.deformers, strict=True)
-            if len(raw.faces) or len(found.raws) == 1
-        )
+    options = {"max_faces": max_faces, "keep_materials": keep_materials, "max_texture": max_texture}
+    options |= {"uv_size": uv_size, "up": up, "border": border}
+    with reading("mesh", str(path)):
+        data = contents(path, "mesh", max_bytes=max_bytes)
+        digest = source_hash or identity_of(path, data, border, keep_materials).whole
+        make = partial(_asset, path, data, digest, play, **options)
+        # A pool keeps its own, and clips differ.
+        remembered = source_hash is None and play is None
+        asset = RECENT.get((path, digest, *options.values()), make, bytes_of) if remembered else make()
+    again = partial(load_asset, path, **options, max_bytes=max_bytes, source_hash=source_hash)
+    return replace(asset, replay=lambda config: again(play=clip_of(config))) if asset.clips else asset
+
+
+def _asset(
+    path: Path,
+    data: bytes,
+    digest: str,
+    play: ClipOf | None,
+    *,
+    max_faces: int,
+    keep_materials: bool,
+    max_texture: int,
+    uv_size: float | None,
+    up: str,
+    border: Path | None,
+) -> Asset:
+    """Return the asset of a file with the content ``data``; the arguments are those of :func:`load_asset`."""
+    near = Neighbours(path, border, Omissions(path.name))
+    found = _found(data, near, max_faces, keep_materials, max_texture, up, play)
+    limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, str(path))
+    has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
+    common = {"name": path.stem, "where": str(path), "source_hash": digest, "log": found.log}
+    parts = tuple(
+        part_of(raw, **common, materials=has_materials, uv_size=uv_size, deformer=deformer)
+        for raw, deformer in zip(found.raws, found.deformers, strict=True)
+        if len(raw.faces) or len(found.raws) == 1
+    )
     if not parts:
         found.omissions.add(WHOLE)
     parts = parts if has_materials else _white(parts, path.stem, digest)
     said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
-    asset = Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
-    given = {"max_faces": max_faces, "max_bytes": max_bytes, "keep_materials": keep_materials, "uv_size": uv_size}
-    again = partial(load_asset, path, **given, max_texture=max_texture, source_hash=source_hash, up=up)
-    return replace(asset, replay=lambda config: again(play=clip_of(config))) if asset.clips else asset
+    return Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
 
 
 def clip_of(config: AnimationConfig, base: Path | str = ".", where: str = "animation") -> ClipOf:
@@ -122,38 +160,93 @@ class _Found(NamedTuple):
     clips: list[str]
 
 
-def _found(path, max_faces, max_bytes, materials, max_texture, source_hash, up, play) -> tuple[_Found, str]:
-    """Return the meshes of the file, and the hash of its content."""
-    where, suffix = str(path), path.suffix.lower()
-    if suffix not in MESH_SUFFIXES:
-        raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
-    data = contents(path, "mesh", max_bytes=max_bytes)
-    # A .gltf file is only its JSON: the buffers beside it decide about the mesh, too.
-    digest = source_hash or content_hash(data, *dependencies(path, data))
+def _found(data: bytes, near: Neighbours, max_faces: int, materials: bool, max_texture: int, up, play) -> _Found:
+    """Return the meshes of the file."""
+    suffix = near.path.suffix.lower()
+    if suffix not in _KINDS:
+        accepted = " ".join(MESH_SUFFIXES)
+        raise AssetError("unknown kind of mesh file", where=str(near.path), value=suffix, accepted=accepted)
     is_gltf = suffix in (".glb", ".gltf")
     # Only glTF's standard says which axis is up.
     turn = Z_UP if up == "y" or (up == "auto" and is_gltf) else None
     if is_gltf:
-        document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=materials)
-        return _of_document(document, play, turn), digest
+        limits = {"max_faces": max_faces, "max_texture": max_texture}
+        return _of_document(gltf.read(near.path, data, **limits, materials=materials, border=near.border), play, turn)
     if play is not None:
-        raise AssetError("only glTF files have animations", where=where, accepted="a gltf or glb file, or no animation")
-    omissions, log = Omissions(path.name), []
-    raws = _reader(suffix)(path, data, max_faces, max_texture if materials else None, omissions, log)
+        accepted = "a gltf or glb file, or no animation"
+        raise AssetError("only glTF files have animations", where=str(near.path), accepted=accepted)
+    raws = (_KINDS[suffix].read or _by_trimesh("read_meshes"))(
+        data, near, max_faces, max_texture if materials else None
+    )
     raws = raws if turn is None else [transformed(raw, turn) for raw in raws]
-    return _Found(raws, [None] * len(raws), log, omissions, []), digest
+    return _Found(raws, [None] * len(raws), near.log, near.omissions, [])
 
 
-def _reader(suffix: str) -> Callable[..., list[RawMesh]]:
-    """Return the function that reads a kind of file other than glTF."""
-    if suffix == ".obj":
-        return read_obj
-    if suffix == ".ply":
-        return read_ply
-    # Here: trimesh takes half as long to import as everything else that a worker needs, and most scenes do not use it.
-    from blinkgl.scene.importing.trimesh_files import read_meshes
+def _by_trimesh(name: str) -> Callable[..., Any]:
+    """Return a function of the module that imports trimesh, which takes half as long as everything else that a worker
+    needs, and which most scenes do not use."""
+    return getattr(import_module("blinkgl.scene.importing.trimesh_files"), name)
 
-    return read_meshes
+
+def border_of(path: Path, base: Path) -> Path:
+    """Return the folder that the files of a recipe's mesh lie below: the recipe's, or the mesh's own outside of it."""
+    return base if path.resolve().is_relative_to(base.resolve()) else path.parent
+
+
+class Identity(NamedTuple):
+    """What decides how an asset looks. files : hash of each file beside the mesh that is read for it, by its name from
+    the mesh's folder; "missing" where none is there.   shape : one hash of the mesh and its buffers.   whole : of
+    all."""
+
+    files: dict[str, str]
+    shape: str
+    whole: str
+
+
+def identity_of(path: Path, data: bytes, border: Path | None = None, materials: bool = True) -> Identity:
+    """Return the identity of a file with the content ``data``: of a mesh's buffers, and with ``materials`` of its MTL
+    files and images, too. Raises AssetError: a file that cannot be read, a buffer that is missing or beyond the
+    border."""
+    near, kind = Neighbours(path, border), _KINDS.get(path.suffix.lower())
+    shape, files, looks = [data], {}, {}
+    for name, file in files_of_gltf(data, near, "buffers") if path.suffix.lower() == ".gltf" else ():
+        assert file is not None
+        shape.append(contents(file, "buffer"))
+        files[name] = content_hash(shape[-1])
+    for name, file in kind.beside(data, near) if kind and materials else ():
+        key = name if file is None else Path(os.path.relpath(file, path.parent)).as_posix()
+        looks[key] = "missing" if file is None else looks.get(key) or content_hash(contents(file, "file"))
+    rows = [f"{name} {digest}".encode() for name, digest in looks.items()]
+    return Identity(files | looks, content_hash(*shape), content_hash(*shape, *rows))
+
+
+def check_header(path: Path, data: bytes, max_faces: int) -> None:
+    """Raise AssetError for a mesh file that its first lines, or what they say about its size, show to be unusable."""
+    with reading("mesh", str(path)):
+        _KINDS[path.suffix.lower()].check(data, max_faces, str(path))
+
+
+def _check_obj(data: bytes, max_faces: int, where: str) -> None:
+    if re.search(rb"(?:^|[\r\n])[ \t]*fo?[ \t]", data) is None:
+        raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
+
+
+class _Kind(NamedTuple):
+    """A kind of file. check : raises AssetError for a broken header.   beside : names and files of its look.   read :
+    returns its meshes; None: by another way."""
+
+    check: Callable[[bytes, int, str], Any]
+    beside: Callable[[bytes, Neighbours], Iterable[tuple[str, Path | None]]] = lambda data, near: ()
+    read: Callable[..., list[RawMesh]] | None = None
+
+
+_GLTF = _Kind(lambda data, max_faces, where: parse(data, where), partial(files_of_gltf, key="images"))
+_KINDS = {".obj": _Kind(_check_obj, files_of_obj, read_obj), ".ply": _Kind(checked_ply, files_of_ply, read_ply)}
+_KINDS |= dict.fromkeys(
+    (".stl", ".off", ".3mf"),
+    _Kind(lambda *given: _by_trimesh("check_kind")(*given)),  # noqa: PLW0108 - imports it when it is called
+) | dict.fromkeys((".glb", ".gltf"), _GLTF)
+MESH_SUFFIXES = tuple(_KINDS)
 
 
 def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray | None) -> _Found:
@@ -203,8 +296,9 @@ def sides_of(material: Material, wanted: bool | None) -> bool | None:
     return material.both_sides if material.both_sides is None or wanted is None else wanted
 
 
-def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
-    """Return contents of the buffer files that a .gltf refers to (they are part of its content); [] for other files."""
-    if path.suffix.lower() != ".gltf":
-        return []
-    return buffer_contents(path, contents(path, "mesh") if data is None else data)
+def bytes_of(asset: Asset) -> int:
+    """Return the bytes of an asset's meshes and textures."""
+    meshes = [part.mesh for part in asset.parts]
+    own = sum(a.nbytes for m in meshes for a in (m.vertices, m.faces, m.normals, m.uvs))
+    worn = {id(part.material.texture): part.material.texture for part in asset.parts}
+    return own + sum(texture.image.nbytes for texture in worn.values() if texture is not None)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from blinkgl.scene.geometry.meshes import CREASE_DEGREES, make_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
-from blinkgl.scene.types import Deformer, Material, Part
+from blinkgl.scene.reading import RECENT
+from blinkgl.scene.surfaces.images import content_hash
+from blinkgl.scene.types import Deformer, Material, Mesh, Part
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
 
+# The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere.
 INVISIBLE = Material()
-"""The material of a surface of which nothing is drawn: fully transparent, or cut off everywhere."""
 WHOLE = "the whole file: all of it is hidden, transparent or without area"
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -66,8 +69,8 @@ def transformed(raw: RawMesh, matrix: np.ndarray) -> RawMesh:
     return replace(raw, vertices=vertices, normals=normals, faces=raw.faces if determinant >= 0 else raw.faces[:, ::-1])
 
 
+# Returns the deformer of the mesh made from a raw one; (W,) index of the raw vertex of each of the mesh's.
 DeformerOf = Callable[[RawMesh, np.ndarray], "Deformer | None"]
-"""Returns the deformer of the mesh made from a raw one; (W,) index of the raw vertex of each of the mesh's."""
 
 
 def part_of(
@@ -90,25 +93,29 @@ def part_of(
     colours = raw.colours if materials else None
     bumped = material.bumps is not None
     # Only per-vertex data of the file needs the indices of the mesh's vertices.
-    source: list[np.ndarray] | None = [] if deformer is not None or colours is not None or bumped else None
-    mesh = make_mesh(
-        raw.vertices,
-        raw.faces,
-        normals=raw.normals,
-        uvs=raw.uvs,
-        name=name,
-        where=where,
-        uv_size=uv_size,
+    indexed = deformer is not None or colours is not None or bumped
+    options: dict[str, Any] = {
+        "name": name,
+        "where": where,
+        "uv_size": uv_size,
         # Degenerate coordinates that select from a palette work with the file's own texture, but with no other.
-        project_degenerate=material.texture is None,
-        log=log,
-        source=source,
-        crease_degrees=0.0 if raw.flat else CREASE_DEGREES,
-    )
+        "project_degenerate": material.texture is None,
+        "crease_degrees": 0.0 if raw.flat else CREASE_DEGREES,
+    }
+
+    def make() -> tuple[Mesh, np.ndarray | None, list[str]]:
+        lines: list[str] = []
+        origin: list[np.ndarray] | None = [] if indexed else None
+        mesh = make_mesh(raw.vertices, raw.faces, normals=raw.normals, uvs=raw.uvs, log=lines, source=origin, **options)
+        return mesh, origin[0] if origin else None, lines
+
+    arrays = (np.zeros(0) if a is None else a for a in (raw.vertices, raw.faces, raw.normals, raw.uvs))
+    key = content_hash(*(np.ascontiguousarray(a).tobytes() for a in arrays)), indexed, *options.values()
+    mesh, index, lines = RECENT.get(key, make, lambda made: 2 * made[0].vertices.nbytes)
+    log += lines
     mesh = replace(mesh, source_hash=source_hash)
-    if source is None:
+    if index is None:
         return Part(mesh, material)
-    index = source[0]
     if colours is not None:
         mesh = replace(mesh, colours=colours[index].astype(np.float32))
     if bumped:

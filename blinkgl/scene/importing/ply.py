@@ -12,89 +12,132 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import RawMesh
-from blinkgl.scene.importing.polygons import Polygons, beside, raw_meshes, texture_of
-from blinkgl.scene.reading import Omissions
+from blinkgl.scene.importing.polygons import Polygons, linear_colours, raw_meshes, texture_beside
 from blinkgl.scene.types import Material
-from blinkgl.srgb import linear_from_srgb
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
 _TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"}
 _TYPES |= {"double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8"}
 _COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_OPACITIES = ("alpha", "diffuse_alpha", "a")
+_OF_CORNERS = ("texcoord", "t", "st", "uv")  # lists of faces: u and v of each corner
+_PART = ("multi_texture_vertex", "multi_texture_face")
+# The closed list of what is understood, by element. Flags and measures of scanners change nothing that is drawn.
+_EFFECTLESS = set("flags quality confidence curvature radius".split())
+_KNOWN = {
+    "vertex": {"x", "y", "z", "nx", "ny", "nz", *_OPACITIES, *sum(_COORDINATES + _COLOURS, ())} | _EFFECTLESS,
+    "face": {"vertex_indices", "vertex_index", "texnumber", "nx", "ny", "nz", *_OPACITIES, *sum(_COLOURS, ())}
+    | {*_OF_CORNERS, *_EFFECTLESS},
+    _PART[0]: {"tx", "u", "v"},
+    _PART[1]: {"tx", "tn", "texture_vertex_indices"},
+}
+# Values of a property, (n,); of a list (n,) lengths and all values, one list after the other.
 Column = np.ndarray | tuple[np.ndarray, np.ndarray]
-"""Values of a property, (n,); of a list (n,) lengths and all values, one list after the other."""
 
 
-def read_ply(
-    path: Path, data: bytes, max_faces: int, max_texture: int | None, omissions: Omissions, log: list[str]
-) -> list[RawMesh]:
-    """Return raw meshes, one for each texture.
+def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | None) -> list[RawMesh]:
+    """Return raw meshes, one for each texture. ``near`` gets what is not drawn, and what was decided.
 
-    max_texture : None leaves materials and colours out.   omissions, log : get what is not drawn, and what was decided.
-    Raises AssetError: truncated, corrupt, no faces, too many faces, a texture outside the file's folder."""
-    where = str(path)
-    elements, textures = _elements(data, max_faces, where)
+    max_texture : None leaves materials and colours out. Raises AssetError: truncated, corrupt, no faces, too many
+    faces."""
+    where = str(near.path)
+    # Counts are checked before anything is allocated.
+    declared, body = checked_ply(data, max_faces, where)
+    elements = {name: body.columns(count, properties, name, where) for name, count, properties in declared}
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     indices = face.get("vertex_indices", face.get("vertex_index"))
     if not isinstance(indices, tuple) or not {"x", "y", "z"} <= set(vertex) or not len(indices[0]):
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    if elements.get("edge") or elements.get("tristrips"):
-        omissions.add("edges and triangle strips")
+    for name in (name for name in elements if name not in _KNOWN):
+        near.omissions.add("edges and triangle strips" if name in ("edge", "tristrips") else f"elements '{name}'")
     sizes, places = (values.astype(np.int64) for values in indices)
     inside = np.clip(places, 0, max(len(vertex["x"]) - 1, 0))  # raw_meshes refuses the others
     given = Polygons(_columns_of(vertex, "xyz"), places, sizes)
     if {"nx", "ny", "nz"} <= set(vertex):
         given.normals = _columns_of(vertex, ("nx", "ny", "nz"))[inside]
-    if isinstance(own := face.get("texcoord"), tuple) and np.array_equal(own[0], 2 * sizes):
-        given.uvs = own[1].reshape(-1, 2).astype(np.float64)
-    elif names := next((names for names in _COORDINATES if set(names) <= set(vertex)), None):
-        given.uvs = _columns_of(vertex, names)[inside]
+    given.uvs, number = _coordinates(elements, sizes, inside, near)
     materials: list[Material | None] = [None]
     if max_texture is not None:
-        of_faces, of_vertices = _colours(face), _colours(vertex)
+        for name, known in _KNOWN.items():
+            near.omissions.unknown(f"properties of {name} elements", set(elements.get(name, ())) - known)
+        of_faces, of_vertices = _colours(face, near), _colours(vertex, near)
         given.colours = np.repeat(of_faces, sizes, axis=0) if of_faces is not None else None
         given.colours = of_vertices[inside] if of_vertices is not None else given.colours
-        for name in textures if given.uvs is not None else ():
-            file = beside(path.parent, "", name, where, omissions)
-            materials.append(None if file is None else Material(texture=texture_of(file, max_texture)))
-        number = face.get("texnumber", np.zeros(len(sizes)))
+        textures = [file for _, file in files_of_ply(data, near)]
+        for file in textures if given.uvs is not None else ():
+            texture = texture_beside(file, max_texture, near.omissions)
+            materials.append(None if texture is None else Material(texture=texture))
+        if textures and given.uvs is None:
+            near.omissions.add("a texture, since there are no texture coordinates")
         if len(materials) > 1 and isinstance(number, np.ndarray):
             # A face's number counts textures from 0, and -1 is none; material 0 is for faces without a texture.
             given.surfaces = np.clip(np.nan_to_num(number), -1, len(materials) - 2).astype(np.int64) + 1
-    return raw_meshes(given, materials, max_faces, where, log)
+    return raw_meshes(given, materials, max_faces, where, near.log)
+
+
+def _coordinates(
+    elements: dict[str, dict[str, Column]], sizes: np.ndarray, inside: np.ndarray, near: Neighbours
+) -> tuple[np.ndarray | None, Column]:
+    """Return ((C, 2) texture coordinates of corners, None without; (P,) the texture of each face)."""
+    vertex, face = elements["vertex"], elements["face"]
+    own, rows = (elements.get(name, {}) for name in _PART)
+    number = face.get("texnumber", np.zeros(len(sizes)))
+    lists = [(face[name], 2 * sizes) for name in _OF_CORNERS if isinstance(face.get(name), tuple)]
+    # Artec's scanners: a list of coordinates, and for each face which of them its corners have.
+    listed = isinstance(rows.get("texture_vertex_indices"), tuple) and {"u", "v"} <= set(own) and len(own["u"]) > 0
+    for (lengths, values), expected in [(rows["texture_vertex_indices"], sizes)] if listed else lists[:1]:
+        if not np.array_equal(lengths, expected):
+            near.omissions.add("texture coordinates that do not fit the faces")
+        elif listed:
+            chosen = values.astype(np.int64).clip(0, len(own["u"]) - 1)
+            return _columns_of(own, ("u", "v"))[chosen], rows.get("tx", number)
+        else:
+            return values.reshape(-1, 2).astype(np.float64), number
+    names = next((names for names in _COORDINATES if set(names) <= set(vertex)), None)
+    return None if names is None else _columns_of(vertex, names)[inside], number
+
+
+def files_of_ply(data: bytes, near: Neighbours) -> list[tuple[str, Path | None]]:
+    """Return the names of the textures in a PLY file's header, and what is there."""
+    head = _HEADER.match(data)
+    names = re.findall(rb"comment[ \t]+TextureFile[ \t]+([^\r\n]+)", head[1] if head else b"", re.IGNORECASE)
+    return [(name, near.optional((name,))) for name in (n.decode("utf-8", "replace").strip() for n in names)]
 
 
 def _columns_of(element: dict, names) -> np.ndarray:
     return np.column_stack([element[name] for name in names]).astype(np.float64)
 
 
-def _colours(element: dict) -> np.ndarray | None:
-    """Return (n, 3) linear colours of an element's items; None: it has none. Whole numbers are fractions of the largest
-    of their type."""
+def _colours(element: dict[str, Column], near: Neighbours) -> np.ndarray | None:
+    """Return (n, 3) linear colours of an element's items; None: it has none. One byte is a fraction of 255, two of
+    65535; what larger numbers are fractions of, their size says."""
     for names in _COLOURS:
         if set(names) <= set(element):
-            kind = element[names[0]].dtype
-            code = _columns_of(element, names) / (np.iinfo(kind).max if kind.kind in "iu" else 1)
-            return linear_from_srgb(np.clip(np.nan_to_num(code), 0, 1))
+            most = {"u1": 255.0, "u2": 65535.0}.get(np.asarray(element[names[0]]).dtype.str[1:])
+            opacity = next((element[name] for name in _OPACITIES if name in element), np.ones(0))
+            return linear_colours(_columns_of(element, names), near, most, np.asarray(opacity))
     return None
 
 
-def _elements(data: bytes, max_faces: int, where: str) -> tuple[dict[str, dict[str, Column]], list[str]]:
-    """Return (the columns of each element, the names of textures). Counts are checked before anything is allocated."""
-    # Lines may also end as on old Macs.
-    head = re.match(rb"ply\s*[\r\n](.{0,65536}?)end_header(?:\r\n|[^\n\r]*\n|\r)", data, re.DOTALL)
+# Lines may also end as on old Macs.
+_HEADER = re.compile(rb"ply\s*[\r\n](.{0,65536}?)end_header(?:\r\n|[^\n\r]*\n|\r)", re.DOTALL)
+
+
+def checked_ply(data: bytes, max_faces: int, where: str) -> tuple[list, _Body]:
+    """Return (name, number and properties of each element, what follows the header). Raises AssetError: no header,
+    an unknown form, or more elements than are allowed or fit into the file."""
+    head = _HEADER.match(data)
     if head is None:
         raise AssetError("the mesh is corrupt (no PLY header)", where=where)
-    form, textures = "", []
+    form = ""
     declared: list[tuple[str, int, list[tuple[str, str | None, str]]]] = []
     for line in re.split(r"[\r\n]+", head[1].decode("utf-8", "replace")):
         words = line.split()
         if words[:1] == ["format"]:
             form = words[1]
-        elif words[:2] == ["comment", "TextureFile"] and len(words) > 2:
-            textures.append(line.split("TextureFile", 1)[1].strip())
         elif words[:1] == ["element"]:
             declared.append((words[1], _count(words[1], words[2], max_faces, len(data) - head.end(), where), []))
         elif words[:2] == ["property", "list"]:
@@ -104,8 +147,7 @@ def _elements(data: bytes, max_faces: int, where: str) -> tuple[dict[str, dict[s
     orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
     if form not in orders:
         raise AssetError("the mesh is of an unknown PLY format", where=where, value=form, accepted=", ".join(orders))
-    body = _Body(data[head.end() :], orders[form], sum(count for _, count, _ in declared))
-    return {name: body.columns(count, properties, name, where) for name, count, properties in declared}, textures
+    return declared, _Body(data[head.end() :], orders[form], sum(count for _, count, _ in declared))
 
 
 def _count(name: str, digits: str, max_faces: int, available: int, where: str) -> int:

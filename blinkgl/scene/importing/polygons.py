@@ -3,7 +3,6 @@ images beside such a file."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,16 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import MAX_COORDINATE, crease_normals, weld
 from blinkgl.scene.geometry.polygons import triangulate
-from blinkgl.scene.importing.gltf_file import inside
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
 from blinkgl.scene.reading import Omissions, contents, limit_faces
-from blinkgl.scene.surfaces.images import content_hash, decode_image
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, UNKNOWN_FORMAT, content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
+from blinkgl.srgb import linear_from_srgb
 
+OPACITY = "opacity of vertex colours (left out)"
+# Most corners of a polygon: ear clipping may take a time that grows with their square.
 MAX_CORNERS = 50_000
-"""Most corners of a polygon: ear clipping may take a time that grows with their square."""
 
 
 @dataclass(eq=False)
@@ -54,28 +55,30 @@ def raw_meshes(
     triangles, owner, repeated = triangulate(given.points, given.places, given.sizes)
     if not len(triangles):
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    lost = len(given.sizes) - len(np.unique(owner))
+    lost = len(given.sizes) - int(np.count_nonzero(np.bincount(owner)))
     if repeated or lost:
         log.append(f"{Path(where).stem}: {repeated} repeated corners and {lost} faces of fewer than three left out")
     at = given.places[triangles]
-    normals = np.full((len(triangles), 3, 3), np.nan) if given.normals is None else given.normals[triangles]
+    normals = np.zeros((len(triangles), 3, 3)) if given.normals is None else given.normals[triangles]
     missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false
     if missing.any():
         groups = None if given.smoothing is None else given.smoothing[owner]
-        used, inner = np.unique(at, return_inverse=True)  # a point that no face has may lie anywhere
-        points, inner = given.points[used], inner.reshape(at.shape)
+        used = np.zeros(len(given.points), bool)  # a point that no face has may lie anywhere
+        used[at] = True
+        points, inner = given.points[used], (np.cumsum(used) - 1)[at]
         welded = weld(points, inner)[1] if groups is None else inner
-        made = crease_normals(points, inner, welded, groups=groups)
-        normals[missing] = made[missing]
+        normals = np.where(missing[..., None], crease_normals(points, inner, welded, groups=groups), normals)
+        del inner, welded, points
     # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
     a, b, c = (given.points[at[:, k]] for k in range(3))
     behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0
     for array in (triangles, at, normals):
         array[behind] = array[behind, ::-1]
     # v upwards becomes v downwards.
-    uvs = np.full((len(given.places), 2), np.nan) if given.uvs is None else given.uvs * [1, -1] + [0, 1]
+    uvs = None if given.uvs is None else given.uvs * [1, -1] + [0, 1]
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
-    kind = np.asarray(2 * surfaces + 1 - np.isfinite(uvs[triangles]).all(axis=(1, 2)))  # odd: without coordinates
+    mapped = 0 if uvs is None else np.isfinite(uvs[triangles]).all(axis=(1, 2))
+    kind = np.asarray(2 * surfaces + 1 - mapped)  # odd: without coordinates
     # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
     # One raw mesh for each material and for each of the two kinds of coordinates; faces keep the file's order.
     order, raws = np.argsort(kind, kind="stable"), []
@@ -88,7 +91,7 @@ def raw_meshes(
             drawn, tint = tinted(drawn, given.colours[corners])
         faces = np.arange(len(corners)).reshape(-1, 3)
         shape = given.points[at[chosen]].reshape(-1, 3), faces, normals[chosen].reshape(-1, 3)
-        raws.append(RawMesh(*shape, None if bare else uvs[corners], drawn, colours=tint))
+        raws.append(RawMesh(*shape, None if bare or uvs is None else uvs[corners], drawn, colours=tint))
     return raws
 
 
@@ -112,21 +115,44 @@ def _check(given: Polygons, max_faces: int, where: str) -> None:
         raise AssetError(problem, where=place, value=value, accepted=f"0 to {last}")
 
 
-def beside(folder: Path, inner: str, name: str, where: str, omissions: Omissions) -> Path | None:
-    """Return a file that is named relative to the folder ``inner`` below ``folder``, or to that; None where it is
-    missing, which is added to ``omissions``. Raises AssetError for one outside ``folder``."""
-    name = name.strip('"').replace("\\", "/")
-    for base in dict.fromkeys((inner, "")):
-        try:
-            return inside(folder, os.path.normpath(os.path.join(base, name)), where)
-        except AssetError as error:
-            if "missing" not in error.problem:
-                raise
-    omissions.add(f"'{name}', which is missing")
-    return None
+def texture_beside(image: Path | None, max_texture: int, omissions: Omissions) -> Texture | None:
+    """Return the texture of a file beside a mesh; None: there is none, or none of a known format, which is noted."""
+    if image is None:
+        return None
+    try:
+        return texture_of(image, max_texture)
+    except AssetError as error:
+        if UNKNOWN_FORMAT not in error.problem or image.suffix.lower() in IMAGE_SUFFIXES:
+            raise
+        omissions.add(f"'{image.name}', whose format is not known")
+        return None
 
 
 def texture_of(image: Path, max_texture: int) -> Texture:
     """Return the texture of an image file. Raises AssetError naming it."""
     data = contents(image, "image")
     return Texture(decode_image(data, max_texture, str(image)), image.name, content_hash(data))
+
+
+def linear_colours(
+    codes: np.ndarray, near: Neighbours, most: float | None = None, opacity: np.ndarray | float = 1.0
+) -> np.ndarray:
+    """Return (n, 3) linear light of (n, 3) sRGB codes; white where one is no number. What is guessed is noted.
+
+    most : the code of white; None: 1, or 255 or 65535 where whole numbers, or one beyond 2, say so.   opacity : the
+    codes of what is not drawn, 1 without."""
+    unknown = ~np.isfinite(codes).all(axis=1)
+    if unknown.any():
+        missing = f"{unknown.sum()} of {len(codes)} colours are missing or NaN"
+        near.log.append(f"{near.path.stem}: {missing}: they are white")
+    largest = float(codes[~unknown].max(initial=0))
+    if most is None:
+        whole = largest > 2 or bool((codes[~unknown] % 1 == 0).all())
+        most = next((m for m in (1.0, 255.0) if largest <= m), 65535.0) if whole else 1.0
+        if most > 1:
+            near.log.append(f"{near.path.stem}: colours up to {largest:g} are taken as parts of {most:g}")
+    if largest > most:
+        near.log.append(f"{near.path.stem}: colours up to {largest:g} are drawn as {most:g}")
+    if np.size(opacity) and float(np.min(opacity)) < (most if np.ndim(opacity) else 1):
+        near.omissions.add(OPACITY)
+    return linear_from_srgb(np.where(unknown.reshape(-1, 1), 1.0, codes / most).clip(0, 1))

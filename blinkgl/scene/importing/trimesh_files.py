@@ -6,78 +6,148 @@ import io
 import logging
 import re
 import zipfile
-from pathlib import Path
+from array import array
+from collections.abc import Sequence
+from itertools import islice, takewhile
 
 import numpy as np
 import trimesh
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import RawMesh, tinted, transformed
-from blinkgl.scene.importing.polygons import Polygons, raw_meshes
-from blinkgl.scene.reading import MAX_BYTES, Omissions, limit_faces
-from blinkgl.srgb import linear_from_srgb
+from blinkgl.scene.importing.polygons import Polygons, linear_colours, raw_meshes
+from blinkgl.scene.reading import MAX_BYTES, limit_faces
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings are of no use to a user
 
 
-def read_meshes(
-    path: Path, data: bytes, max_faces: int, max_texture: int | None, omissions: Omissions, log: list[str]
-) -> list[RawMesh]:
-    """Return raw meshes of an stl, off or 3mf file.
+def read_meshes(data: bytes, near: Neighbours, max_faces: int, max_texture: int | None) -> list[RawMesh]:
+    """Return raw meshes of an stl, off or 3mf file. ``near`` gets what is not drawn, and what was decided.
 
-    max_texture : None leaves colours out.   omissions, log : get what is not drawn, and what was decided. Raises
-    AssetError: truncated, corrupt, no faces, more than ``max_faces``."""
-    where, kind = str(path), path.suffix.lower()[1:]
+    max_texture : None leaves colours out. Raises AssetError: truncated, corrupt, no faces, more than ``max_faces``."""
+    where, kind = str(near.path), near.path.suffix.lower()[1:]
+    check_kind(data, max_faces, where)
     if kind == "off":
-        return _off(data, max_faces, max_texture is not None, where, log)
-    {"stl": _check_stl, "3mf": _check_3mf}[kind](data, max_faces, where)
+        return _off(data, max_faces, max_texture is not None, near)
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     raws = []
     for node in loaded.graph.nodes_geometry:
         place, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            raws.append(transformed(_raw_mesh(mesh, max_texture is not None), np.asarray(place, np.float64)))
+            raw = RawMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+            raws.append(transformed(raw, np.asarray(place, np.float64)))
     if not raws:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    if kind == "3mf" and any(tag in _model_of(data) for tag in (b"basematerials", b"texture2d", b"colorgroup")):
-        omissions.add("colours and textures of 3MF (drawn white)")
+    if kind == "stl" and max_texture is not None:
+        return [_coloured_stl(data, raw, near) for raw in raws]
+    if kind == "3mf" and max_texture is not None:
+        _note_3mf(_model_of(data), near)
     return raws
 
 
-def _raw_mesh(mesh: trimesh.Trimesh, wanted: bool) -> RawMesh:
-    """Return raw triangles, with the colours of faces where they are ``wanted``."""
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    if not wanted or getattr(mesh.visual, "kind", None) != "face":
-        return RawMesh(vertices, faces)
-    codes = np.asarray(mesh.visual.face_colors)[:, :3] / 255
-    material, tint = tinted(None, linear_from_srgb(np.repeat(codes, 3, axis=0)))
-    # Colours belong to faces, so no two share a vertex.
-    apart = np.arange(faces.size).reshape(-1, 3)
-    return RawMesh(vertices[faces.ravel()], apart, None, None, material, colours=tint)
+def _coloured_stl(data: bytes, raw: RawMesh, near: Neighbours) -> RawMesh:
+    """Return the triangles with the colours of a binary STL file, five bits a channel in the two bytes behind each
+    face: those of Magics, whose header has "COLOR=" and the colour of all others, or of VisCAM and SolidView."""
+    count = (len(data) - 84) // 50
+    if len(raw.faces) != count or (len(data) - 84) % 50:
+        return raw
+    bits = np.frombuffer(data, np.dtype([("corners", "V48"), ("bits", "<u2")]), count, 84)["bits"].astype(np.int64)
+    codes, own = np.stack([bits & 31, bits >> 5 & 31, bits >> 10 & 31], axis=1), bits >> 15 == 1
+    head, rest = data[:80].partition(b"COLOR=")[2], np.full(3, 31.0)
+    if b"MATERIAL=" in data[:80]:
+        near.omissions.add("the material of Magics (drawn by its colour alone)")
+    if len(head) > 3:  # bit 15 says that a face has the colour of all, and red is in the low bits
+        own, rest = ~own, np.frombuffer(head[:3], np.uint8) * (31 / 255)
+    elif not own.any():
+        return raw
+    colours = np.where(own[:, None], codes if len(head) > 3 else codes[:, ::-1], rest)
+    material, tint = tinted(None, linear_colours(np.repeat(colours, 3, axis=0), near, 31.0))
+    faces = np.arange(3 * count).reshape(-1, 3)
+    return RawMesh(raw.vertices[raw.faces.ravel()], faces, material=material, colours=tint)
 
 
-def _off(data: bytes, max_faces: int, wanted: bool, where: str, log: list[str]) -> list[RawMesh]:
-    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces."""
+# Tags of a 3MF model that are understood, and those without effect on shape; the colours of others are not drawn.
+_3MF = set("model resources object mesh vertices vertex triangles triangle build item components component".split())
+_3MF |= {"metadata", "metadatagroup"}
+_3MF_COLOURS = set("basematerials base colorgroup color texture2d texture2dgroup tex2coord compositematerials".split())
+_3MF_COLOURS |= {"composite", "multiproperties", "multi"}
+
+
+def _note_3mf(model: bytes, near: Neighbours) -> None:
+    tags = {tag.decode() for tag in re.findall(rb"<(?:[A-Za-z0-9_.-]+:)?([A-Za-z0-9_]+)", model)}
+    if tags & _3MF_COLOURS:
+        near.omissions.add("colours and textures of 3MF (drawn white)")
+    near.omissions.unknown("elements of 3MF", tags - _3MF - _3MF_COLOURS)
+
+
+# "4" and "n" (in lower case) are points of other than three numbers.
+_OFF_HEAD = re.compile(r"\s*((?:ST|st)?[Cc]?N?)(4?n?)(?i:OFF)(?!\s*(?i:BINARY))")
+
+
+def off_counts(data: bytes, where: str) -> tuple[str, int, int, str]:
+    """Return (letters before OFF, vertices, faces, the text behind the counts). Geomview allows an OFF file to lack its
+    keyword. Raises AssetError: another file, or points of other than three numbers."""
     text = re.sub(r"#.*", "", data.decode("latin-1"))
-    head = re.match(r"\s*((?:ST)?C?N?OFF)(?!\s*BINARY)", text, re.IGNORECASE)
-    if head is None:
-        raise AssetError("the mesh is no OFF file of text", where=where, value=text[:20], accepted="OFF, COFF, NOFF")
-    kind, rows = head[1].upper(), [words for line in text[head.end() :].splitlines() if (words := line.split())]
-    number, count = (int(word) for word in rows[0][:2])
-    vertices, faces = rows[1 : 1 + max(number, 0)], rows[1 + number : 1 + number + count]
-    sizes = np.array([int(row[0]) for row in faces], np.int64)
-    if len(vertices) != number or len(faces) != count or any(len(r) <= n for r, n in zip(faces, sizes, strict=True)):
+    head = _OFF_HEAD.match(text)
+    begin = head.end() if head else 0
+    counts = re.match(r"\s*(\d+)\s+(\d+)(?:\s+\d+)?[^\S\n]*", text[begin:])
+    if counts is None or (head and head[2]):
+        accepted = "OFF, COFF, NOFF, CNOFF, STOFF, without 4 or n, or the counts"
+        raise AssetError("the mesh is no OFF file of text", where=where, value=text[:20], accepted=accepted)
+    return head[1].upper() if head else "", int(counts[1]), int(counts[2]), text[begin + counts.end() :]
+
+
+def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[RawMesh]:
+    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces.
+    Numbers stand in free form; only the end of a line ends the colour of a face."""
+    where = str(near.path)
+    kind, number, count, text = off_counts(data, where)
+    # The numbers of a vertex: x y z, normal, colour, texture coordinates. A colour may lack its opacity.
+    first, width = (6 if "N" in kind else 3), 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
+    tints = 0 if "C" not in kind else 3 if len(text.lstrip().split("\n")[0].split()) == width + 3 else 4
+    stream = (match[0] for match in re.finditer(r"\n|[^\s]+", text + "\n"))
+    words = (word for word in stream if word != "\n")
+    rows = [list(islice(words, width + tints)) for _ in range(number)]
+    sizes, places, specs = array("q"), array("q"), []
+    for _ in range(count):
+        sizes.append(int(next(words, "-1")))
+        places.extend(map(int, islice(words, max(sizes[-1], 0))))
+        specs.append(tuple(takewhile(lambda word: word != "\n", stream)))
+    if any(len(row) < width + tints for row in rows[-1:]) or sum(map(abs, sizes)) != len(places):
         raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
-    places = np.array([int(place) for row in faces for place in row[1 : 1 + int(row[0])]], np.int64)
-    given, first = Polygons(np.array([row[:3] for row in vertices], np.float64), places, sizes), 6 if "N" in kind else 3
-    if wanted and "C" in kind:
-        given.colours = np.array([row[first : first + 3] for row in vertices], np.float64)[places.clip(0, number - 1)]
-    elif wanted and all(len(row) >= size + 4 for row, size in zip(faces, sizes, strict=True)):
-        given.colours = np.repeat(np.array([row[1 + int(row[0]) :][:3] for row in faces], np.float64), sizes, axis=0)
-    if given.colours is not None:  # whole numbers up to 255, or fractions
-        given.colours = linear_from_srgb((given.colours / (255 if given.colours.max() > 1 else 1)).clip(0, 1))
-    return raw_meshes(given, [None], max_faces, where, log)
+    points = np.array(rows, np.float64).reshape(number, width + tints)
+    given = Polygons(points[:, :3], np.array(places, np.int64), np.array(sizes, np.int64))
+    corner = given.places.clip(0, max(number - 1, 0))
+    given.normals = points[corner, 3:6] if "N" in kind else None
+    given.uvs = points[corner, -2:] if "ST" in kind else None
+    if wanted and tints:
+        given.colours = _off_colours([row[first : first + tints] for row in rows], near)[corner]
+    elif wanted and any(specs):
+        given.colours = np.repeat(_off_colours(specs, near), given.sizes, axis=0)
+    return raw_meshes(given, [None], max_faces, where, near.log)
+
+
+def _off_colours(specs: Sequence[Sequence[str]], near: Neighbours) -> np.ndarray:
+    """Return (n, 3) linear colours of words: three or four numbers, whole ones of 255, or fractions; none is white."""
+    if any(len(spec) in (1, 2) for spec in specs):
+        near.omissions.add("colours by their number in a colour map (drawn white)")
+    codes = np.array([[*spec[:4], "nan"][:4] if len(spec) > 2 else ["nan"] * 4 for spec in specs], np.float64)
+    opacity = codes[np.isfinite(codes[:, 3]), 3]
+    whole = not any("." in word or "e" in word for spec in specs for word in spec[:3])
+    # An opacity of 1 beside whole numbers up to 1 says that they are fractions.
+    small = np.nanmax(codes[:, :3], initial=0) <= 1 and (not whole or 0 < opacity.max(initial=0) <= 1)
+    return linear_colours(codes[:, :3], near, 1.0 if small else 255.0, opacity)
+
+
+def check_kind(data: bytes, max_faces: int, where: str) -> None:
+    """Check what an stl, off or 3mf file says about its size. Raises AssetError: truncated, or too many faces."""
+    {"stl": _check_stl, "3mf": _check_3mf, "off": _check_off}[where.lower()[-3:]](data, max_faces, where)
+
+
+def _check_off(data: bytes, max_faces: int, where: str) -> None:
+    limit_faces(off_counts(data, where)[2], max_faces, where)
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:

@@ -14,6 +14,7 @@ import re
 import struct
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,7 +32,8 @@ MAX_PIXELS = MAX_SIDE**2
 MAX_HDR_PIXELS = MAX_PIXELS // 2  # 12 bytes each: a panorama of 16384x8192
 _MAX_LINE = 1 << 20
 # Pillow reads many more; some run other programs (EPS), and none is a texture format.
-_FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "TIFF", "PPM", "GIF", "TGA")
+_FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "TIFF", "PPM", "GIF", "DDS", "TGA")
+UNKNOWN_FORMAT = "the image is corrupt or of an unknown format"
 _BLOCK_PIXELS = 1 << 22  # pixels converted or averaged at a time: limits the extra memory of a large image
 HDR_WHITE = 1.5  # largest radiance kept of an HDR image: light sources would outweigh everything else
 # Without those that are mostly black (retina, hubble_deep_field): no light, no events.
@@ -80,10 +82,11 @@ def load_image(path: Path, max_size: int | None = None, where: str | None = None
     return decode_image(contents(Path(path), "image", where), max_size, where or str(path))
 
 
-def decode_image(data: bytes, max_size: int | None, where: str) -> np.ndarray:
-    """Return :func:`load_image` of bytes already read."""
+def decode_image(data: bytes, max_size: int | None, where: str, gamma: bool = True) -> np.ndarray:
+    """Return :func:`load_image` of bytes already read. gamma : whether the file's own gamma counts (PNG's gAMA); glTF
+    says that it does not."""
     with reading("image", where):
-        image = _decode_hdr(data, where) if data[:2] == b"#?" or data[:4] == _EXR else _decode_ldr(data, where)
+        image = _decode_hdr(data, where) if data[:2] == b"#?" or data[:4] == _EXR else _decode_ldr(data, where, gamma)
         return shrink(image, max_size)
 
 
@@ -140,26 +143,35 @@ def _open(data: bytes, where: str) -> Image.Image:
         except (SyntaxError, IndexError, TypeError, struct.error):  # another format after all: handled as in Image.open
             continue
     raise AssetError(
-        "the image is corrupt or of an unknown format",
+        UNKNOWN_FORMAT,
         where=where,
         accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR, OpenEXR",
     )
 
 
-def _decode_ldr(data: bytes, where: str) -> np.ndarray:
+def _decode_ldr(data: bytes, where: str, gamma: bool = False) -> np.ndarray:
     # Pillow, because it reports a truncated file; OpenCV returns a half grey image.
     with _open(data, where) as image:
         _check_size(*image.size, where)
         image.load()
         ImageOps.exif_transpose(image, in_place=True)
         if image.mode.startswith("I") or image.mode == "F":
-            return _sixteen_bits(np.asarray(image), where)
+            return _codes(image.info if gamma else {})[_sixteen_bits(np.asarray(image), where)]
         width, height = image.size
         pixels = np.empty((height, width, 3), np.uint8)
         for rows in _blocks(height, width):
             block = image.crop((0, rows.start, width, rows.stop))
             pixels[rows] = np.asarray(block if block.mode == "RGB" else block.convert("RGB"))
-        return pixels
+        return _codes(image.info)[pixels] if gamma and "gamma" in image.info else pixels
+
+
+def _codes(info: dict[str, Any]) -> np.ndarray:
+    """Return the sRGB code of each of 256 codes of a picture with Pillow's ``info``: of PNG's gAMA, unless the file has
+    a profile, or a gamma next to sRGB's 1 / 2.2."""
+    codes, power = np.arange(256, dtype=np.uint8), float(info.get("gamma") or 1 / 2.2)
+    if info.keys() & {"srgb", "icc_profile"} or abs(power - 1 / 2.2) < 0.02:
+        return codes
+    return to_srgb8(((codes / 255.0) ** (1 / power)).astype(np.float32))
 
 
 def _sixteen_bits(grey: np.ndarray, where: str) -> np.ndarray:
@@ -193,7 +205,7 @@ def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, flo
             image = _radiance(data, where)
             factor = exposure(image)
         else:
-            image, factor = DECODE_8BIT[shrink(_decode_ldr(data, where), 4096)], 1.0
+            image, factor = DECODE_8BIT[shrink(_decode_ldr(data, where, gamma=True), 4096)], 1.0
     height, width = image.shape[:2]
     if not 1.9 < width / height < 2.1:
         raise AssetError(

@@ -26,7 +26,7 @@ from blinkgl.scene.geometry.figure import SPACINGS
 from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
-from blinkgl.scene.importing.mesh_files import Asset, clip_of, load_asset, sides_of
+from blinkgl.scene.importing.mesh_files import Asset, border_of, clip_of, load_asset, sides_of
 from blinkgl.scene.importing.polygons import texture_of
 from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
@@ -346,8 +346,10 @@ def _asset(
         wears = own_materials and name not in memory and config.primitive in COATS
         material = Material(coat(config.primitive, config.parameters.get("coat", 0))) if wears else Material()
         return Asset(name, mesh.source_hash, (Part(mesh, material),))
+    file = existing(config.file, base, f"scene.meshes.{name}.file", "a mesh file")
     return load_asset(
-        existing(config.file, base, f"scene.meshes.{name}.file", "a mesh file"),
+        file,
+        border=border_of(file, base),
         max_faces=max_faces,
         uv_size=config.uv_size,
         keep_materials=own_materials,

@@ -21,6 +21,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, Motion, clip_names, play, shown
+from blinkgl.scene.importing.mesh_files import border_of
 from blinkgl.scene.importing.parts import WHOLE, Z_UP, DeformerOf, RawMesh, part_of, transformed
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import AffinePath, StaticPath, nearest_rotation
@@ -47,6 +48,7 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
     own = config.lights == "file"
     with reading("scene", str(path)):
         limits = {"max_faces": config.max_faces, "max_texture": config.max_texture_size}
+        limits["border"] = border_of(path, base)
         scene = from_document(
             gltf.read(path, **limits, lights=own),
             camera,

@@ -1,15 +1,15 @@
 """Pools of objects and textures, listed by content hash, split into disjoint train and test parts, loaded lazily.
 
-An entry's split depends only on its content: the same file under two names, on two machines, in another order or in a
-larger pool is always on the same side. An entry is drawn by first choosing a source (a folder, the primitives, …) with
-equal chances and then an entry, so that a thousand patterns do not outweigh six photographs.
+An entry's split depends only on its shape: the same mesh file under two names, with other textures, on two machines, in
+another order or in a larger pool is always on the same side. An entry is drawn by first choosing a source (a folder,
+the primitives, …) with equal chances and then an entry, so that a thousand patterns do not outweigh six photographs.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,16 @@ from blinkgl.config.scene import TEXTURE_KINDS, PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.machine.extras import install
 from blinkgl.scene.geometry.random_primitives import random_primitive, random_primitive_hash
-from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
-from blinkgl.scene.reading import MAX_BYTES, contents, resolve
+from blinkgl.scene.importing.mesh_files import (
+    MESH_SUFFIXES,
+    Asset,
+    Identity,
+    bytes_of,
+    check_header,
+    identity_of,
+    load_asset,
+)
+from blinkgl.scene.reading import RECENT, Cache, contents, resolve
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
@@ -49,8 +57,11 @@ class ChangedAsset(AssetError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One mesh or texture that can be loaded. ``source`` is the folder or kind of source, ``file`` None for generated
-    ones."""
+    """One mesh or texture that can be loaded.
+
+    source_hash : its identity, of everything that is read for it.   source : the folder or kind of source.   file :
+    None for generated ones.   border : folder that its files lie below.   shape : hash of the mesh alone, which
+    decides split and order; "": ``source_hash``.   beside : hash of each other file that is read for it, by name."""
 
     source_hash: str
     name: str
@@ -58,36 +69,9 @@ class Entry:
     file: Path | None = None
     kind: str = ""
     index: int = 0
-
-
-class Cache:
-    """What was loaded last, ``limit`` bytes of all pools together: a process that makes sequences of many groups for
-    days uses no more memory than one that makes a few."""
-
-    def __init__(self, limit: int):
-        self.limit, self.held = limit, 0
-        self._kept: OrderedDict[tuple[object, str], tuple[Any, int]] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def get(self, key: tuple[object, str], load: Callable[[], Any]) -> Any:
-        """Return the stored content of this key, or ``load()``."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
-        loaded = load()
-        # Measured when it is loaded: textures and meshes are not changed afterwards.
-        size = _bytes_of(loaded)
-        self._kept[key] = loaded, size
-        self.held += size
-        # The last one stays whatever its size, since the caller uses it next.
-        while self.held > self.limit and len(self._kept) > 1:
-            self.held -= self._kept.popitem(last=False)[1][1]
-        return loaded
-
-
-_OF_ALL_POOLS = Cache(256_000_000)
+    border: Path | None = None
+    shape: str = ""
+    beside: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass
@@ -95,7 +79,7 @@ class Pool:
     """Entries in a deterministic order (by source, then hash), and what is needed to load them.
 
     bad_assets : "error" raises AssetError; "skip" logs it and draws again.   what, where : for messages.
-    cache : of what was loaded; default: the process's.
+    cache : of what was loaded; default: the process's.   notes : on what its folders hold and it does not.
     """
 
     entries: tuple[Entry, ...]
@@ -104,7 +88,8 @@ class Pool:
     where: str
     what: str
     bad_assets: str = "error"
-    cache: Cache = field(default=_OF_ALL_POOLS, repr=False)
+    notes: tuple[str, ...] = ()
+    cache: Cache = field(default=RECENT, repr=False)
     _own: object = field(default_factory=object, repr=False)  # identity: two pools may load the same file in two ways
     _sides: dict[str, dict[str, tuple[Entry, ...]]] = field(default_factory=dict, repr=False)
 
@@ -116,7 +101,7 @@ class Pool:
             raise ConfigError("unknown split", value=split, accepted="train or test")
         sides: dict[str, list[Entry]] = {}
         for entry in self.entries:
-            if split_of(entry.source_hash, self.test_fraction) == split:
+            if split_of(entry.shape or entry.source_hash, self.test_fraction) == split:
                 sides.setdefault(entry.source, []).append(entry)
         if not sides:
             if not self.entries:
@@ -136,7 +121,7 @@ class Pool:
 
     def load(self, entry: Entry) -> Any:
         """Return the entry's content, which may be the cache's."""
-        return self.cache.get((self._own, entry.source_hash), lambda: self.load_entry(entry))
+        return self.cache.get((self._own, entry.source_hash), lambda: self.load_entry(entry), _bytes_of)
 
     def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None) -> Any:
         """Return a random entry's content. The number of draws from ``rng`` does not depend on the cache."""
@@ -159,14 +144,7 @@ class Pool:
 
 
 def _bytes_of(loaded: Texture | Asset) -> int:
-    if isinstance(loaded, Texture):
-        return loaded.image.nbytes
-    own = sum(a.nbytes for p in loaded.parts for a in (p.mesh.vertices, p.mesh.faces, p.mesh.normals, p.mesh.uvs))
-    return own + sum(
-        t.image.nbytes
-        for t in {id(p.material.texture): p.material.texture for p in loaded.parts}.values()
-        if t is not None
-    )
+    return loaded.image.nbytes if isinstance(loaded, Texture) else bytes_of(loaded)
 
 
 def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
@@ -181,30 +159,38 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
             )
     folders = [(resolve(folder, base), f"{where}.folders.{i}", folder) for i, folder in enumerate(config.folders)]
     limit = int(config.max_file_mb * 1e6)
+    notes: list[str] = []
+    dressed = config.keep_materials is not False
+
+    def identity(file: Path, border: Path) -> Identity:
+        data = contents(file, "mesh", max_bytes=limit)
+        check_header(file, data, config.max_faces)
+        return identity_of(file, data, border, dressed)
+
     for folder, at, name in folders:
-        entries += _folder_entries(folder, at, name, MESH_SUFFIXES, limit, "mesh", config.bad_assets)
+        entries += _folder_entries(folder, at, name, MESH_SUFFIXES, "meshes", config.bad_assets, identity, notes)
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
             # People, flags and fish have their own colours; other primitives get a texture of the pool.
-            wears = config.keep_materials and entry.kind in COATS
+            wears = config.keep_materials is True and entry.kind in COATS
             material = Material(coat(entry.kind, entry.index)) if wears else Material()
             part = Part(random_primitive(entry.kind, entry.index), material)
             return Asset(entry.name, entry.source_hash, (part,), wears).normalised()
-        asset = load_asset(
-            entry.file,
-            max_faces=config.max_faces,
-            max_bytes=limit,
-            keep_materials=config.keep_materials,
-            max_texture=max_texture,
-            source_hash=entry.source_hash,
-            up=config.up,
-        )
-        # The hash decides split and order. A file that changed since it was listed would silently be another scene.
-        _same_content(entry, content_hash(contents(entry.file, "mesh", max_bytes=limit), *dependencies(entry.file)))
+        limits = {"max_faces": config.max_faces, "max_bytes": limit, "max_texture": max_texture, "up": config.up}
+        known = {"source_hash": entry.source_hash, "border": entry.border}
+        asset = load_asset(entry.file, keep_materials=dressed, **limits, **known)
+        if config.keep_materials == "auto" and not asset.has_looks:
+            asset = load_asset(entry.file, keep_materials=False, **limits, **known)
+        if config.keep_materials == "auto":
+            worn = "its own" if asset.has_materials else "one of the world, since it has none of its own"
+            looks = f"{asset.name}: its look is {worn} (scene.pool.keep_materials: auto)"
+            asset = replace(asset, log=(*asset.log, looks))
+        # A file that changed since it was listed would silently be another scene.
+        _same_content(entry, identity(entry.file, entry.border or entry.file.parent))
         return asset.normalised()
 
-    return Pool(_listed(entries), load, config.test_fraction, where, "meshes", config.bad_assets)
+    return Pool(_listed(entries), load, config.test_fraction, where, "meshes", config.bad_assets, tuple(notes))
 
 
 def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.textures") -> Pool:
@@ -226,29 +212,40 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
                 accepted=f"run {install('scikit-image')}, or set it to false",
             )
         entries += [Entry(content_hash(file.read_bytes()), name, "photographs", file) for name, file in bundled.items()]
+    notes: list[str] = []
+
+    def identity(file: Path, border: Path) -> Identity:
+        digest = content_hash(contents(file, "image"))
+        return Identity({}, digest, digest)
+
     for i, folder in enumerate(config.folders):
-        entries += _folder_entries(
-            resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES, "image", config.bad_assets
-        )
+        listed = resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, "images"
+        entries += _folder_entries(*listed, config.bad_assets, identity, notes)
 
     def load(entry: Entry) -> Texture:
         if entry.file is None:
             return procedural_texture(entry.kind, entry.index, config.max_size)
         data = contents(entry.file, "image")
-        _same_content(entry, content_hash(data))
+        _same_content(entry, Identity({}, content_hash(data), content_hash(data)))
         return Texture(decode_image(data, config.max_size, str(entry.file)), entry.name, entry.source_hash)
 
-    return Pool(_listed(entries), load, config.test_fraction, where, "textures", config.bad_assets)
+    return Pool(_listed(entries), load, config.test_fraction, where, "textures", config.bad_assets, tuple(notes))
 
 
-def _same_content(entry: Entry, found: str) -> None:
-    if found != entry.source_hash:
-        raise ChangedAsset(entry.file)
+def _same_content(entry: Entry, now: Identity) -> None:
+    """Raise ChangedAsset, which names the file, where one that is read for an entry is another than was listed."""
+    if entry.file is not None and now.whole != entry.source_hash:
+        before = dict(entry.beside)
+        other = sorted(n for n in before.keys() | now.files.keys() if before.get(n) != now.files.get(n))
+        raise ChangedAsset(entry.file.parent / other[0] if other else entry.file)
 
 
-def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str) -> list[Path]:
-    """Return files with these suffixes, recursively, sorted by name. Raises ConfigError when the folder is missing or
-    has none."""
+def files_below(
+    folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str, notes: list[str] | None = None
+) -> list[Path]:
+    """Return files with these suffixes, recursively, sorted by name. Links are followed, each folder is searched once;
+    hidden files and folders are left out.   notes : gets a line that counts those. Raises ConfigError when the folder
+    is missing or has none."""
     if not folder.is_dir():
         raise ConfigError(
             "is not a folder" if folder.exists() else "no such folder",
@@ -256,9 +253,10 @@ def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...],
             value=given,
             accepted=f"a folder of {what}",
         )
+    hidden: list[str] = []
     try:
         files = sorted(
-            p for p in folder.rglob("*") if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
+            p for p in _walk(folder, hidden) if p.suffix.lower() in suffixes and p.is_file() and p.name[0] != "."
         )
     except OSError as error:
         raise ConfigError(f"cannot read the folder: {error.strerror or error}", where=where, value=given) from None
@@ -268,22 +266,59 @@ def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...],
         )
     if len(files) > _MAX_FILES:
         raise ConfigError(f"the folder holds more than {_MAX_FILES} {what}", where=where, value=given)
+    if hidden and notes is not None:
+        names = ", ".join(sorted(hidden)[:3]) + (", …" if len(hidden) > 3 else "")
+        notes.append(f"{where}: {len(hidden)} hidden files or folders are left out ({names})")
     return files
 
 
+def _walk(folder: Path, hidden: list[str]) -> Iterator[Path]:
+    """Yield the files below a folder: of its own folders, then of those that links lead to. hidden : gets the names of
+    files and folders that begin with a dot."""
+    seen, waiting = set(), [folder]
+    while waiting:
+        for here, folders, names in os.walk(waiting.pop(0), onerror=_raise):
+            if (number := (os.stat(here).st_dev, os.stat(here).st_ino)) in seen:
+                folders.clear()
+                continue
+            seen.add(number)
+            hidden += [name for name in (*folders, *names) if name.startswith(".")]
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            waiting += [Path(here, name) for name in folders if os.path.islink(os.path.join(here, name))]
+            yield from (Path(here, name) for name in names)
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
 def _folder_entries(
-    folder: Path, where: str, given: str, suffixes, limit: int, what: str, bad_assets: str
+    folder: Path,
+    where: str,
+    given: str,
+    suffixes: tuple[str, ...],
+    what: str,
+    bad_assets: str,
+    identity: Callable[[Path, Path], Identity],
+    notes: list[str],
 ) -> Iterable[Entry]:
-    entries = []
-    for file in files_below(folder, where, given, suffixes, "meshes" if what == "mesh" else "images"):
+    entries, unusable = [], []
+    for file in files_below(folder, where, given, suffixes, what, notes):
+        # A linked folder is its own border: a user has put it there, and nothing leads further.
+        border = next(p for p in file.parents if p == folder or p.is_symlink())
         try:
-            data = contents(file, what, max_bytes=limit)
-            digest = content_hash(data, *dependencies(file, data))
-        except AssetError:
+            identified = identity(file, border)
+        except AssetError as error:
             if bad_assets == "error":
                 raise
+            unusable.append(f"{file.name}: {error.problem}")
             continue
-        entries.append(Entry(digest, str(file.relative_to(folder)), given, file))
+        name = str(file.relative_to(folder))
+        beside = tuple(identified.files.items())
+        entries.append(Entry(identified.whole, name, given, file, border=border, shape=identified.shape, beside=beside))
+    if unusable:
+        names = "; ".join(unusable[:3]) + ("; …" if len(unusable) > 3 else "")
+        notes.append(f"{where}: {len(unusable)} unusable files are left out ({names})")
     return entries
 
 
@@ -293,4 +328,8 @@ def _listed(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     sources: dict[str, dict[str, Entry]] = {}
     for entry in entries:
         sources.setdefault(entry.source, {}).setdefault(entry.source_hash, entry)
-    return tuple(entry for listed in sources.values() for _, entry in sorted(listed.items()))
+    return tuple(
+        entry
+        for listed in sources.values()
+        for entry in sorted(listed.values(), key=lambda e: (e.shape, e.source_hash))
+    )

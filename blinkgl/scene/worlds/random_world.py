@@ -65,7 +65,7 @@ def random_world(
         generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE, Role.SHAPE)
     )
     objects, textures = pools(config, base)
-    log: list[str] = []
+    log = [*objects.notes, *textures.notes]
     omissions: dict[str, None] = {}
     floor = config.ground.height if config.ground else 0.0
 
@@ -244,6 +244,12 @@ def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
     return _object_pool(config.pool, base.resolve(), config.textures.max_size), _texture_pool(
         config.textures, base.resolve()
     )
+
+
+def forget_pools() -> None:
+    """List the folders anew when they are next used: what they hold may have changed since another run."""
+    _object_pool.cache_clear()
+    _texture_pool.cache_clear()
 
 
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))

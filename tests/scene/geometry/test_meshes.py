@@ -272,3 +272,23 @@ def test_joining_moving_and_scaling():
     assert max(np.linalg.norm(m.vertices, axis=1).max() for m in two) == pytest.approx(1)
     with pytest.raises(AssetError, match="here: the mesh has size zero"):
         M.normalise((M.scale_mesh(box, 0.0),), where="here")
+
+
+def test_rows_of_one_hash_stay_apart():
+    """Equal rows are found by a hash. Two rows are made that have the same one: the search must not join them, and
+    agrees with np.unique on rows."""
+    rng = np.random.default_rng(3)
+    with np.errstate(over="ignore"):
+        mixed = (np.array([5, 9], np.uint64) * np.uint64(0x9E3779B97F4A7C15)).astype(np.uint64)
+    mixed ^= mixed >> np.uint64(29)
+    second = np.array([77, 77 ^ int(mixed[0] ^ mixed[1])], np.uint64).view(np.int64)
+    collide = [np.array([5, 9, 5]), second[[0, 1, 0]]]
+    plain = [rng.integers(-3, 3, 500) for _ in range(3)]
+    for columns in (collide, plain, [*plain, np.arange(500)]):
+        first, index = M._equal_rows(columns)
+        rows = np.stack(columns, axis=1)
+        np.testing.assert_array_equal(rows[first][index], rows)
+        assert (
+            len(first) == len(np.unique(rows, axis=0))
+            and (first == [index.tolist().index(k) for k in range(len(first))]).all()
+        )

@@ -388,7 +388,17 @@ def _video(path: Path, declared: Declared) -> FrameSource:
     size, timed = (reader.height, reader.width), None not in reader.times_ns
     # Some packets hold no picture, so a list of times is compared at the end.
     count = reader.count if declared.timestamps is None else None
-    return FrameSource(path, *size, count, frames, timed, "video", reader.transfer, reader.levels, reader.notes)
+    return FrameSource(
+        path,
+        *size,
+        count,
+        frames,
+        timed,
+        origin="video",
+        transfer=reader.transfer,
+        levels=reader.levels,
+        notes=reader.notes,
+    )
 
 
 def _array(path: Path, declared: Declared) -> FrameSource:

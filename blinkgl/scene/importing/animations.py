@@ -143,13 +143,13 @@ class Animation:
 
         moving = bool(mine) and not playing.is_static
         morphs = Morphs(
-            positions[used],
-            None if normals is None else normals[used],
-            weights,
-            not moving,
-            playing.period_ns if moving else None,
-            playing.span_ns if moving else 0,
-            playing.timescale_ns(mine),
+            positions=positions[used],
+            normals=None if normals is None else normals[used],
+            weights=weights,
+            is_static=not moving,
+            period_ns=playing.period_ns if moving else None,
+            span_ns=playing.span_ns if moving else 0,
+            timescale_ns=playing.timescale_ns(mine),
         )
         return morphs.taken(source).transformed(at_rest[:3, :3])
 

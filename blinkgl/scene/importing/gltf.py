@@ -142,7 +142,18 @@ class Document:
             material = self._without_coordinates(material) if uvs is None else material
         binding, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
         both = material is not None and bool(material.both_sides)
-        return RawMesh(vertices, faces, normals, uvs, material, binding, targets, colours, both, flat=True)
+        return RawMesh(
+            vertices=vertices,
+            faces=faces,
+            normals=normals,
+            uvs=uvs,
+            material=material,
+            binding=binding,
+            targets=targets,
+            colours=colours,
+            both_sides=both,
+            flat=True,
+        )
 
     def _faces(self, primitive: dict, mesh: int, count: int) -> np.ndarray:
         """Return the faces of a primitive of ``count`` vertices, (F, 3): separate triangles, a strip or a fan; without

@@ -213,6 +213,7 @@ def nodes_of(tree: dict, where: str) -> dict[int, Node]:
         name = str(n.get("name") or f"node-{i}")
         visible = n.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True) is not False
         visible = visible and (parent is None or nodes[parent].visible)
-        nodes[i] = Node(name, parent, n.get("mesh"), n.get("camera"), *rest, matrix, n.get("skin"), own, visible)
+        skin, camera = n.get("skin"), n.get("camera")
+        nodes[i] = Node(name, parent, n.get("mesh"), camera, *rest, matrix, skin=skin, weights=own, visible=visible)
         stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
     return nodes

@@ -108,7 +108,17 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
             codes = np.where((have >= 6)[:, None], vertices[:-1, 3:6], np.nan)
             colours = linear_colours(codes, near, None, vertices[:-1][have >= 7, 6])[at]
     surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
-    given = Polygons(vertices[:-1, :3], at, sizes, uvs, normals, colours, surfaces, groups, lines)
+    given = Polygons(
+        points=vertices[:-1, :3],
+        places=at,
+        sizes=sizes,
+        uvs=uvs,
+        normals=normals,
+        colours=colours,
+        surfaces=surfaces,
+        smoothing=groups,
+        lines=lines,
+    )
     return raw_meshes(given, materials, max_faces, where, log)
 
 

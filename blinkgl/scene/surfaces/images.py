@@ -12,6 +12,7 @@ import io
 import math
 import re
 import struct
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -165,7 +166,7 @@ def _decode_ldr(data: bytes, where: str, gamma: bool = False) -> np.ndarray:
         return _codes(image.info)[pixels] if gamma and "gamma" in image.info else pixels
 
 
-def _codes(info: dict[str, Any]) -> np.ndarray:
+def _codes(info: Mapping[Any, Any]) -> np.ndarray:
     """Return the sRGB code of each of 256 codes of a picture with Pillow's ``info``: of PNG's gAMA, unless the file has
     a profile, or a gamma next to sRGB's 1 / 2.2."""
     codes, power = np.arange(256, dtype=np.uint8), float(info.get("gamma") or 1 / 2.2)

@@ -96,8 +96,17 @@ def explicit_scene(
     if config.physics is not None:
         objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
     light, objects = with_environment(config.light.environment, make_light(config.light), base, objects)
-    said = tuple(log), tuple(omissions)
-    return Scene(objects, Rig.alone(camera, path), t0_ns, t1_ns, light, config.background, *said, dynamics)
+    return Scene(
+        objects,
+        Rig.alone(camera, path),
+        t0_ns,
+        t1_ns,
+        light=light,
+        background=config.background,
+        log=tuple(log),
+        omissions=tuple(omissions),
+        dynamics=dynamics,
+    )
 
 
 def _objects(

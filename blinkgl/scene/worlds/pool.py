@@ -190,7 +190,15 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
         _same_content(entry, identity(entry.file, entry.border or entry.file.parent))
         return asset.normalised()
 
-    return Pool(_listed(entries), load, config.test_fraction, where, "meshes", config.bad_assets, tuple(notes))
+    return Pool(
+        entries=_listed(entries),
+        load_entry=load,
+        test_fraction=config.test_fraction,
+        where=where,
+        what="meshes",
+        bad_assets=config.bad_assets,
+        notes=tuple(notes),
+    )
 
 
 def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.textures") -> Pool:
@@ -229,7 +237,15 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
         _same_content(entry, Identity({}, content_hash(data), content_hash(data)))
         return Texture(decode_image(data, config.max_size, str(entry.file)), entry.name, entry.source_hash)
 
-    return Pool(_listed(entries), load, config.test_fraction, where, "textures", config.bad_assets, tuple(notes))
+    return Pool(
+        entries=_listed(entries),
+        load_entry=load,
+        test_fraction=config.test_fraction,
+        where=where,
+        what="textures",
+        bad_assets=config.bad_assets,
+        notes=tuple(notes),
+    )
 
 
 def _same_content(entry: Entry, now: Identity) -> None:

@@ -10,17 +10,21 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import itertools
 import math
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.sizes import check_claim
+from blinkgl.machine.closing import Closing
 
 _MAX_CHUNK_BYTES = 1 << 28
 """HDF5 unpacks a whole chunk, even for a small part of it."""
@@ -35,7 +39,7 @@ _BLOSC_VALUES = 4
 _FILTERS = {1: "gzip", 2: "shuffle", 3: "Fletcher32", 32000: "lzf", 32001: "Blosc", 32004: "LZ4", 32015: "zstd"}
 """Filters that are run on files of strangers. Others that HDF5 or hdf5plugin know (szip, SZ, ZFP …) end the process on
 a damaged chunk."""
-_SUM, _SUM_BYTES = 3, 4
+_SHUFFLE, _SUM, _SUM_BYTES = 2, 3, 4
 """Fletcher32 ends the process on chunks shorter than its sum, so it has to be the last filter: their sizes show it."""
 _BLOSC, _PLUGGED = 32001, frozenset((32001, 32004, 32015))
 """Blosc, and all filters that hdf5plugin brings."""
@@ -43,8 +47,98 @@ _ECF = 0x8ECF
 """Prophesee's filter."""
 
 
-def open_hdf5(path: Path) -> h5py.File:
-    """Open a file for reading. Raises AssetError with the likely cause, also for a file that refers to other files."""
+class Data:
+    """A data set of a file that anybody may have written. What it says of itself is there at once; a value is decoded
+    only after its storage was checked.
+
+    name : its place in the file.   shape : None for one without values.   dtype : NumPy's."""
+
+    def __init__(self, data: h5py.Dataset, path: Path):
+        self._data, self._path, self._checked = data, path, False
+        self.name, self.shape = data.name.strip("/"), data.shape
+
+    @property
+    def dtype(self) -> np.dtype:
+        with hdf5_errors(self._path):
+            return self._data.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, place: Any) -> np.ndarray:
+        """Return the values at ``place``, integers and slices. Raises AssetError: as :func:`Data.check`; more than
+        fits into memory; damaged."""
+        with hdf5_errors(self._path):
+            self.check()
+            count = self.dtype.itemsize
+            parts = place if isinstance(place, tuple) else (place,)
+            for size, part in itertools.zip_longest(self.shape, parts[: len(self.shape)], fillvalue=slice(None)):
+                count *= len(range(*part.indices(size))) if isinstance(part, slice) else 1
+            packed = self._data.id.get_storage_size() if self._data.chunks else None
+            check_claim(count, f"{self._path}: '{self.name}'", packed)
+            return self._data[place]
+
+    def check(self) -> None:
+        """Check how it is stored, once. Raises AssetError as :func:`_check_storage`."""
+        if not self._checked:
+            with hdf5_errors(self._path):
+                _check_storage(self._data, self.name, self._path)
+            self._checked = True
+
+    def attribute(self, name: str) -> Any:
+        """Return an attribute as :func:`_attribute` does."""
+        return _attribute(self._data, name, self._path)
+
+
+class Group:
+    """A group of such a file: the names in it, and what they lead to, :class:`Data` or groups."""
+
+    def __init__(self, group: h5py.Group, path: Path):
+        self._group, self._path = group, path
+
+    def __contains__(self, name: str) -> bool:
+        return self.get(name) is not None
+
+    def get(self, name: str) -> Data | Group | None:
+        """Return what a name, or names with ``/`` between them, leads to; None: nothing, or a type alone."""
+        with hdf5_errors(self._path):
+            held = self._group.get(name)
+        if isinstance(held, h5py.Group):
+            return Group(held, self._path)
+        return Data(held, self._path) if isinstance(held, h5py.Dataset) else None
+
+    def data(self) -> dict[str, Data]:
+        """Return the data sets of this group by name, those of groups in it not."""
+        held = {name: self.get(name) for name in self.names()}
+        return {name: data for name, data in held.items() if isinstance(data, Data)}
+
+    def names(self) -> list[str]:
+        """Return the names in this group."""
+        return list(self._group)
+
+    def groups(self) -> dict[str, Group]:
+        """Return this group, as "", and all groups below it by their names, with ``/`` between them."""
+        below: dict[str, Group] = {"": self}
+        self._group.visititems(
+            lambda name, held: below.update({name: Group(held, self._path)}) if isinstance(held, h5py.Group) else None
+        )
+        return below
+
+    def attribute(self, name: str) -> Any:
+        """Return an attribute as :func:`_attribute` does."""
+        return _attribute(self._group, name, self._path)
+
+
+class Hdf5File(Group, Closing):
+    """A file that is open for reading: its first group. Use as a context manager."""
+
+    def close(self) -> None:
+        self._group.close()
+
+
+def open_hdf5(path: Path) -> Hdf5File:
+    """Open a file for reading: the only door to HDF5, behind which nothing is decoded unchecked. Raises AssetError with
+    the likely cause, also for a file that refers to other files."""
     path = Path(path)
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
@@ -71,7 +165,7 @@ def open_hdf5(path: Path) -> h5py.File:
                     where=str(path),
                     accepted="a file that holds its own data",
                 )
-    return file
+    return Hdf5File(file, path)
 
 
 def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
@@ -95,7 +189,7 @@ def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
 
 
 @contextlib.contextmanager
-def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
+def hdf5_errors(path: Path, file: h5py.File | Hdf5File | None = None) -> Iterator[None]:
     """Convert h5py's errors for invalid bytes to AssetError; ``file`` is closed on any exception."""
     try:
         yield
@@ -115,37 +209,37 @@ def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
         raise
 
 
-def dataset(
-    file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu"
-) -> h5py.Dataset:
+def dataset(file: Group, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu") -> Data:
     """Return the data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b"
     bools) as requested, and as many values stored as declared.
 
     Raises AssetError: none of that name (or a group), another shape or type, values that were never written, huge
     chunks."""
-    found = file.get(name)
-    if not isinstance(found, h5py.Dataset):
+    data = file.get(name)
+    if not isinstance(data, Data):
         raise AssetError(f"no dataset '{name}'", where=str(path))
     fits = (
-        found.shape is not None
-        and len(found.shape) == len(shape)
-        and all(b in (None, a) for a, b in zip(found.shape, shape))
+        data.shape is not None
+        and len(data.shape) == len(shape)
+        and all(b in (None, a) for a, b in zip(data.shape, shape))
     )
-    if not fits or found.dtype.kind not in kinds or found.dtype.shape:
+    if not fits or data.dtype.kind not in kinds or data.dtype.shape:
         wanted = {"iu": "integers", "iub": "integers", "f": "floats"}.get(kinds, "numbers")
         raise AssetError(
             f"dataset '{name}' has the wrong shape or type",
             where=str(path),
-            value=f"{found.dtype} {found.shape}",
+            value=f"{data.dtype} {data.shape}",
             accepted=f"{wanted} ({', '.join('N' if n is None else str(n) for n in shape)})",
         )
-    check_storage(found, name, path)
-    return found
+    data.check()
+    return data
 
 
-def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
+def _check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
     """Check how a data set is stored before a value of it is read. Raises AssetError: a filter that is not run, values
     that were never written, huge chunks, a filter without its parameters."""
+    if not _plain(found.dtype):
+        raise AssetError(f"dataset '{name}' holds neither numbers nor text", where=str(path), value=str(found.dtype))
     layout = found.id.get_create_plist()
     count = layout.get_nfilters()
     summed = [k for k in range(count) if layout.get_filter(k)[0] == _SUM]
@@ -179,10 +273,77 @@ def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
                 value=found.chunks,
                 accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each",
             )
+        _check_chunks(found, name, path)
         # The number of chunks along each axis is the quotient, rounded up.
         whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
     if not whole:
         raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
+
+
+def _check_chunks(data: h5py.Dataset, name: str, path: Path) -> None:
+    """Check that no chunk unpacks to more than its values, for HDF5 unpacks as much as a chunk itself states. Blosc
+    ends at 2 GB, and lzf at 88 times. Raises AssetError."""
+    layout, raw = data.id.get_create_plist(), math.prod(data.chunks) * data.dtype.itemsize
+    codes = [layout.get_filter(k)[0] for k in range(layout.get_nfilters())]
+    packing = [code for code in codes if code not in (_SHUFFLE, _SUM)]
+    if len(packing) > 1:
+        raise AssetError(
+            f"dataset '{name}' is packed twice", where=str(path), value=packing, accepted="one HDF5 filter that packs"
+        )
+    if not packing or packing[0] not in _CLAIMED:
+        return
+    chunks: list[tuple[int, int]] = []
+    # Bits of the mask are the filters that were left out for a chunk.
+    left_out = 1 << codes.index(packing[0])
+    data.id.chunk_iter(lambda c: chunks.append((c.byte_offset, 0 if c.filter_mask & left_out else c.size)))
+    with open(path, "rb") as file:
+        for offset, size in chunks:
+            file.seek(offset)
+            if size > raw + raw // 128 + 64 or (size and _CLAIMED[packing[0]](file, size, raw) > raw + _SUM_BYTES):
+                raise AssetError(
+                    f"damaged HDF5 file: a chunk of dataset '{name}' unpacks to more than its values",
+                    where=str(path),
+                    value=f"{size} bytes",
+                    accepted=f"{raw} bytes of values",
+                )
+
+
+def _inflated(file: BinaryIO, size: int, raw: int) -> int:
+    """Return how many bytes a chunk of gzip unpacks to, or 0 where its size cannot make that much: a byte unpacks to
+    1,032."""
+    if 1032 * size <= _MAX_CHUNK_BYTES * 4:
+        return 0
+    packed, count, rest = zlib.decompressobj(), 0, file.read(size)
+    with contextlib.suppress(zlib.error):  # reading says what is wrong
+        while rest and not packed.eof and count <= raw:
+            count += len(packed.decompress(rest, 1 << 20))
+            rest = packed.unconsumed_tail
+    return count
+
+
+def _zstd_claim(file: BinaryIO, *_: int) -> int:
+    """Return the size of the content that a frame states, 0: none, which the filter refuses. (RFC 8878, 3.1.1.1)"""
+    head = file.read(18)
+    flags = head[4] if len(head) == 18 else 0
+    single = flags >> 5 & 1
+    # The size follows the window's byte, which a single segment lacks, and the number of a dictionary.
+    start, length = 6 - single + (0, 1, 2, 4)[flags & 3], (single, 2, 4, 8)[flags >> 6]
+    return int.from_bytes(head[start : start + length], "little") + (256 if length == 2 else 0)
+
+
+_CLAIMED: dict[int, Callable[[BinaryIO, int, int], int]] = {
+    1: _inflated,
+    32004: lambda file, *_: int.from_bytes(file.read(8), "big"),
+    32015: _zstd_claim,
+}
+"""Filters -> what a chunk unpacks to: of the file, which is at its beginning, its size, and that of its values."""
+
+
+def _plain(dtype: np.dtype) -> bool:
+    """Return whether a type is of numbers, of text, or a record of these: nothing that leads to other objects."""
+    if dtype.names is not None:
+        return all(_plain(dtype[name]) for name in dtype.names)
+    return dtype.base.kind in "iufbS" or h5py.check_string_dtype(dtype) is not None
 
 
 def _shortest_chunk(found: h5py.Dataset) -> int:
@@ -190,7 +351,7 @@ def _shortest_chunk(found: h5py.Dataset) -> int:
     return min(sizes, default=_SUM_BYTES + 1)
 
 
-def attribute(file: h5py.HLObject, name: str, path: Path) -> Any:
+def _attribute(file: h5py.HLObject, name: str, path: Path) -> Any:
     """Return the attribute ``name`` of a file or an object in it, numbers or text; None where there is none.
 
     Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type

@@ -20,7 +20,7 @@ import numpy as np
 
 from blinkgl.config.over_time import ImuConfig
 from blinkgl.config.reader import to_yaml
-from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.hdf5 import dataset, open_hdf5
 
 FOLDER = "imu"
 CSV, IDEAL, H5, KALIBR = (f"{FOLDER}/{name}" for name in ("imu.csv", "ideal.csv", "imu.h5", "imu.yaml"))
@@ -64,7 +64,7 @@ def kalibr_yaml(config: ImuConfig, T_cam_imu: np.ndarray) -> str:
 def read_imu(sequence: str | os.PathLike) -> dict[str, np.ndarray]:
     """Return the arrays in ``imu.h5`` of a sequence, by name. Raises AssetError: there is none, or it is damaged."""
     path = Path(sequence) / H5
-    with open_hdf5(path) as file, hdf5_errors(path):
+    with open_hdf5(path) as file:
         arrays = {"t_ns": dataset(file, "t_ns", path, shape=(None,))[()]}
         for name in ROWS:
             arrays[name] = dataset(file, name, path, shape=(len(arrays["t_ns"]), 3), kinds="f")[()]

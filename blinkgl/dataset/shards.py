@@ -33,6 +33,7 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
+from blinkgl.io.images import read_image
 from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
@@ -133,10 +134,18 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         for form in label.forms:
             if form.file(k) in manifest["files"]:
                 name = label.shard.rpartition(".")[0]
-                yield f"{key}.{name}.{form.ending}", (folder / form.file(k)).read_bytes()
+                read = form if form.read is not None else label.forms[0]
+                value = label.read(folder / read.file(k), read, manifest["height"], manifest["width"])
+                # An archive may hold more than was read.
+                anew = form.encode is not None and (form is not read or form.ending == "npz")
+                data = form.encode(value) if anew else (folder / form.file(k)).read_bytes()
+                yield f"{key}.{name}.{form.ending}", data
     for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():
         ending = "camera.png" if picture == "images" else f"camera_{picture}.png"
-        yield f"{key}.{ending}", (folder / picture_file(picture, taken[0])).read_bytes()
+        path = folder / picture_file(picture, taken[0])
+        if (shape := read_image(path).shape[:2]) != (manifest["height"], manifest["width"]):
+            raise AssetError("not of this sequence's size", where=str(path), value=shape)
+        yield f"{key}.{ending}", path.read_bytes()
 
 
 def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]:

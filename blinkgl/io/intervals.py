@@ -66,6 +66,9 @@ def read_intervals(path: str | os.PathLike, names: tuple[str, ...]) -> tuple[int
     intervals that do not increase."""
     path = Path(path)
     with open_hdf5(path) as file:
+        # Shards hand on the file as a whole, so that all that it holds is checked.
+        for data in (data for group in file.groups().values() for data in group.data().values()):
+            data.check()
         from_us = int(_int64(dataset(file, "from_us", path, shape=())[()].reshape(1), "from_us", path)[0])
         interval_ns = _int64(dataset(file, "interval_ns", path, shape=(None,))[()], "interval_ns", path)
         arrays = {name: dataset(file, name, path, shape=SHAPES[name][0], kinds=SHAPES[name][1])[()] for name in names}

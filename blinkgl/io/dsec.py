@@ -25,7 +25,6 @@ from blinkgl.io.columns import MAX_SIDE, CheckedWriter, check_events, check_size
 from blinkgl.io.hdf5 import (
     SHUFFLE,
     Blocks,
-    Data,
     dataset,
     growing_dataset,
     hdf5_errors,
@@ -232,9 +231,6 @@ class DsecEventReader(Closing):
         self.path, self._checked = Path(path), size is not None
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            missing = [k for k in map("events/{}".format, "xytp") if not isinstance(self._file.get(k), Data)]
-            if missing:
-                raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
             self._columns = {
                 k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"
             }

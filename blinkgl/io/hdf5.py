@@ -47,54 +47,61 @@ _ECF = 0x8ECF
 """Prophesee's filter."""
 
 
-class Data:
+class _Held:
+    """What a name in a file leads to, with the file's path for messages."""
+
+    def __init__(self, held: h5py.HLObject, path: Path):
+        self._held, self._path = held, path
+
+    def attribute(self, name: str) -> Any:
+        """Return an attribute, numbers or text; None where there is none.
+
+        Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type
+        that is taken for one ends the process."""
+        if name not in self._held.attrs:
+            return None
+        kind = h5py.h5a.open(self._held.id, name.encode()).get_type().get_class()
+        if kind not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING):
+            raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(self._path))
+        return self._held.attrs[name]
+
+
+class Data(_Held):
     """A data set of a file that anybody may have written. What it says of itself is there at once; a value is decoded
     only after its storage was checked.
 
     name : its place in the file.   shape : None for one without values.   dtype : NumPy's."""
 
     def __init__(self, data: h5py.Dataset, path: Path):
-        self._data, self._path, self._checked = data, path, False
-        self.name, self.shape = data.name.strip("/"), data.shape
-
-    @property
-    def dtype(self) -> np.dtype:
-        with hdf5_errors(self._path):
-            return self._data.dtype
+        super().__init__(data, path)
+        self.name, self.shape, self.dtype, self._checked = data.name.strip("/"), data.shape, data.dtype, False
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def __getitem__(self, place: Any) -> np.ndarray:
-        """Return the values at ``place``, integers and slices. Raises AssetError: as :func:`Data.check`; more than
-        fits into memory; damaged."""
+        """Return the values at ``place``, integers and slices. Raises AssetError: as :meth:`check`; more than fits into
+        memory; damaged."""
+        self.check()
         with hdf5_errors(self._path):
-            self.check()
-            count = self.dtype.itemsize
-            parts = place if isinstance(place, tuple) else (place,)
+            count, parts = self.dtype.itemsize, place if isinstance(place, tuple) else (place,)
             for size, part in itertools.zip_longest(self.shape, parts[: len(self.shape)], fillvalue=slice(None)):
                 count *= len(range(*part.indices(size))) if isinstance(part, slice) else 1
-            packed = self._data.id.get_storage_size() if self._data.chunks else None
+            packed = self._held.id.get_storage_size() if self._held.chunks else None
             check_claim(count, f"{self._path}: '{self.name}'", packed)
-            return self._data[place]
+            return self._held[place]
 
     def check(self) -> None:
-        """Check how it is stored, once. Raises AssetError as :func:`_check_storage`."""
+        """Check how it is stored, once. Raises AssetError: a type, a filter that is not run, values that were never
+        written, huge chunks, chunks that unpack to more than their values."""
         if not self._checked:
             with hdf5_errors(self._path):
-                _check_storage(self._data, self.name, self._path)
+                _check_storage(self._held, f"dataset '{self.name}'", self._path)
             self._checked = True
 
-    def attribute(self, name: str) -> Any:
-        """Return an attribute as :func:`_attribute` does."""
-        return _attribute(self._data, name, self._path)
 
-
-class Group:
+class Group(_Held):
     """A group of such a file: the names in it, and what they lead to, :class:`Data` or groups."""
-
-    def __init__(self, group: h5py.Group, path: Path):
-        self._group, self._path = group, path
 
     def __contains__(self, name: str) -> bool:
         return self.get(name) is not None
@@ -102,10 +109,9 @@ class Group:
     def get(self, name: str) -> Data | Group | None:
         """Return what a name, or names with ``/`` between them, leads to; None: nothing, or a type alone."""
         with hdf5_errors(self._path):
-            held = self._group.get(name)
-        if isinstance(held, h5py.Group):
-            return Group(held, self._path)
-        return Data(held, self._path) if isinstance(held, h5py.Dataset) else None
+            kinds = {h5py.Dataset: Data, h5py.Group: Group}
+            held = self._held.get(name)
+            return kinds[type(held)](held, self._path) if type(held) in kinds else None
 
     def data(self) -> dict[str, Data]:
         """Return the data sets of this group by name, those of groups in it not."""
@@ -114,26 +120,22 @@ class Group:
 
     def names(self) -> list[str]:
         """Return the names in this group."""
-        return list(self._group)
+        return list(self._held)
 
     def groups(self) -> dict[str, Group]:
         """Return this group, as "", and all groups below it by their names, with ``/`` between them."""
         below: dict[str, Group] = {"": self}
-        self._group.visititems(
+        self._held.visititems(
             lambda name, held: below.update({name: Group(held, self._path)}) if isinstance(held, h5py.Group) else None
         )
         return below
-
-    def attribute(self, name: str) -> Any:
-        """Return an attribute as :func:`_attribute` does."""
-        return _attribute(self._group, name, self._path)
 
 
 class Hdf5File(Group, Closing):
     """A file that is open for reading: its first group. Use as a context manager."""
 
     def close(self) -> None:
-        self._group.close()
+        self._held.close()
 
 
 def open_hdf5(path: Path) -> Hdf5File:
@@ -235,97 +237,68 @@ def dataset(file: Group, name: str, path: Path, *, shape: tuple[int | None, ...]
     return data
 
 
-def _check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
-    """Check how a data set is stored before a value of it is read. Raises AssetError: a filter that is not run, values
-    that were never written, huge chunks, a filter without its parameters."""
-    if not _plain(found.dtype):
-        raise AssetError(f"dataset '{name}' holds neither numbers nor text", where=str(path), value=str(found.dtype))
-    layout = found.id.get_create_plist()
-    count = layout.get_nfilters()
-    summed = [k for k in range(count) if layout.get_filter(k)[0] == _SUM]
-    if summed and (summed != [count - 1] or _shortest_chunk(found) <= _SUM_BYTES):
-        raise AssetError(
-            f"dataset '{name}' is packed by an HDF5 filter that is not run here",
-            where=str(path),
-            value="Fletcher32 within others, or over less than its sum",
-            accepted=f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
-        )
-    for code, _, values, called in (layout.get_filter(k) for k in range(count)):
-        if code not in _FILTERS:
-            raise AssetError(
-                f"dataset '{name}' is packed by an HDF5 filter that is not run here",
-                where=str(path),
-                value=f"{code} {called.decode(errors='replace')}".strip(),
-                accepted="the camera's .raw"
-                if code == _ECF
-                else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
-            )
-        if code == _BLOSC and len(values) < _BLOSC_VALUES:
-            raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks data that Blosc needs", where=str(path))
-    if found.chunks is None:
-        # Compact data lie in the object's header and are always whole.
-        whole = layout.get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
-    else:
-        if math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
-            raise AssetError(
-                f"dataset '{name}' has chunks that are too large",
-                where=str(path),
-                value=found.chunks,
-                accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each",
-            )
-        _check_chunks(found, name, path)
-        # The number of chunks along each axis is the quotient, rounded up.
-        whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
-    if not whole:
-        raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
-
-
-def _check_chunks(data: h5py.Dataset, name: str, path: Path) -> None:
-    """Check that no chunk unpacks to more than its values, for HDF5 unpacks as much as a chunk itself states. Blosc
-    ends at 2 GB, and lzf at 88 times. Raises AssetError."""
-    layout, raw = data.id.get_create_plist(), math.prod(data.chunks) * data.dtype.itemsize
-    codes = [layout.get_filter(k)[0] for k in range(layout.get_nfilters())]
+def _check_storage(data: h5py.Dataset, name: str, path: Path) -> None:
+    """Check how a data set is stored before a value of it is read. Raises AssetError as :meth:`Data.check`."""
+    layout = data.id.get_create_plist()
+    filters = [layout.get_filter(k) for k in range(layout.get_nfilters())]
+    codes = [code for code, *_ in filters]
     packing = [code for code in codes if code not in (_SHUFFLE, _SUM)]
-    if len(packing) > 1:
-        raise AssetError(
-            f"dataset '{name}' is packed twice", where=str(path), value=packing, accepted="one HDF5 filter that packs"
-        )
-    if not packing or packing[0] not in _CLAIMED:
-        return
-    chunks: list[tuple[int, int]] = []
-    # Bits of the mask are the filters that were left out for a chunk.
-    left_out = 1 << codes.index(packing[0])
-    data.id.chunk_iter(lambda c: chunks.append((c.byte_offset, 0 if c.filter_mask & left_out else c.size)))
-    with open(path, "rb") as file:
-        for offset, size in chunks:
-            file.seek(offset)
-            if size > raw + raw // 128 + 64 or (size and _CLAIMED[packing[0]](file, size, raw) > raw + _SUM_BYTES):
-                raise AssetError(
-                    f"damaged HDF5 file: a chunk of dataset '{name}' unpacks to more than its values",
-                    where=str(path),
-                    value=f"{size} bytes",
-                    accepted=f"{raw} bytes of values",
-                )
+    others = [f"{f[0]} {f[3].decode(errors='replace')}".strip() for f in filters if f[0] not in _FILTERS]
+    bare = [code for code, _, values, _ in filters if code == _BLOSC and len(values) < _BLOSC_VALUES]
+    raw = math.prod(data.chunks or ()) * data.dtype.itemsize
+    # The place and the stored size of each chunk, of which only these filters tell something.
+    chunks: list[tuple[int, int, int]] = []
+    if data.chunks and {_SUM, *_CLAIMED} & {*codes}:
+        data.id.chunk_iter(lambda c: chunks.append((c.byte_offset, c.size, c.filter_mask)))
+    if _SUM in codes and (codes[-1] != _SUM or any(size <= _SUM_BYTES for _, size, _ in chunks)):
+        others = ["Fletcher32 within others, or over less than its sum"]
+    # The number of chunks along each axis is the quotient, rounded up; compact data lie in the object's header.
+    missing = (
+        data.id.get_num_chunks() < math.prod(-(-n // c) for n, c in zip(data.shape, data.chunks))
+        if data.chunks
+        else layout.get_layout() != h5py.h5d.COMPACT and data.id.get_storage_size() < data.nbytes
+    )
+    packs = "the camera's .raw" if _ECF in codes else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)"
+    problems: list[tuple[Any, str, Any, str]] = [
+        (not _plain(data.dtype), f"{name} holds neither numbers nor text", str(data.dtype), "numbers or text"),
+        (others, f"{name} is packed by an HDF5 filter that is not run here", ", ".join(others), packs),
+        (bare, f"damaged HDF5 file: {name} lacks data that Blosc needs", bare, "its parameters"),
+        (packing[1:], f"{name} is packed twice", packing, "one filter that packs"),
+        (
+            raw > _MAX_CHUNK_BYTES,
+            f"{name} has chunks that are too large",
+            data.chunks,
+            f"{_MAX_CHUNK_BYTES} bytes",
+        ),
+        (missing, f"{name} declares {data.size} values, but stores fewer", data.id.get_storage_size(), "all of them"),
+    ]
+    for _, problem, value, accepted in (row for row in problems if row[0]):
+        raise AssetError(problem, where=str(path), value=value, accepted=accepted)
+    # HDF5 unpacks as much as a chunk itself states; Blosc ends at 2 GB, lzf at 88 times.
+    if packing and packing[0] in _CLAIMED:
+        with open(path, "rb") as file:
+            # Bits of the mask are the filters that were left out for a chunk.
+            for offset, size, mask in chunks:
+                file.seek(offset)
+                unpacked = 0 if mask >> codes.index(packing[0]) & 1 else _CLAIMED[packing[0]](file, size, raw)
+                if max(unpacked, size - raw // 128 - 64) > raw + _SUM_BYTES:
+                    problem = f"damaged HDF5 file: a chunk of {name} unpacks to more than its values"
+                    raise AssetError(problem, where=str(path), value=f"{size} bytes", accepted=f"{raw} bytes of values")
 
 
 def _inflated(file: BinaryIO, size: int, raw: int) -> int:
-    """Return how many bytes a chunk of gzip unpacks to, or 0 where its size cannot make that much: a byte unpacks to
-    1,032."""
-    if 1032 * size <= _MAX_CHUNK_BYTES * 4:
-        return 0
-    packed, count, rest = zlib.decompressobj(), 0, file.read(size)
-    with contextlib.suppress(zlib.error):  # reading says what is wrong
-        while rest and not packed.eof and count <= raw:
-            count += len(packed.decompress(rest, 1 << 20))
-            rest = packed.unconsumed_tail
-    return count
+    """Return how many bytes a chunk of gzip unpacks to, at most one too many; 0 where its size cannot make a gigabyte,
+    of 1,032 a byte, or where reading says what is wrong."""
+    with contextlib.suppress(zlib.error):
+        if 1032 * size > 1 << 30:
+            return len(zlib.decompressobj().decompress(file.read(size), raw + _SUM_BYTES + 1))
+    return 0
 
 
 def _zstd_claim(file: BinaryIO, *_: int) -> int:
     """Return the size of the content that a frame states, 0: none, which the filter refuses. (RFC 8878, 3.1.1.1)"""
-    head = file.read(18)
-    flags = head[4] if len(head) == 18 else 0
-    single = flags >> 5 & 1
+    head = file.read(18).ljust(18, b"\0")
+    flags, single = head[4], head[4] >> 5 & 1
     # The size follows the window's byte, which a single segment lacks, and the number of a dictionary.
     start, length = 6 - single + (0, 1, 2, 4)[flags & 3], (single, 2, 4, 8)[flags >> 6]
     return int.from_bytes(head[start : start + length], "little") + (256 if length == 2 else 0)
@@ -344,24 +317,6 @@ def _plain(dtype: np.dtype) -> bool:
     if dtype.names is not None:
         return all(_plain(dtype[name]) for name in dtype.names)
     return dtype.base.kind in "iufbS" or h5py.check_string_dtype(dtype) is not None
-
-
-def _shortest_chunk(found: h5py.Dataset) -> int:
-    sizes = (found.id.get_chunk_info(k).size for k in range(found.id.get_num_chunks()))
-    return min(sizes, default=_SUM_BYTES + 1)
-
-
-def _attribute(file: h5py.HLObject, name: str, path: Path) -> Any:
-    """Return the attribute ``name`` of a file or an object in it, numbers or text; None where there is none.
-
-    Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type
-    that is taken for one ends the process."""
-    if name not in file.attrs:
-        return None
-    kind = h5py.h5a.open(file.id, name.encode()).get_type().get_class()
-    if kind not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING):
-        raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(path))
-    return file.attrs[name]
 
 
 def growing_dataset(

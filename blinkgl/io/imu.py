@@ -67,16 +67,15 @@ def made_again(sequence: str | os.PathLike) -> dict[str, bytes]:
     """Return the content of a sequence's :data:`FILES`, made of the numbers in ``imu.h5`` and ``imu.yaml``, and nothing
     else that these hold. Raises AssetError: missing, damaged."""
     arrays, path = read_imu(sequence), Path(sequence) / KALIBR
-    table = read_table(path)
-    T_cam_imu = table.pop("T_cam_imu", None)
-    if set(table) != {*_NOISE, "update_rate"} or T_cam_imu != arrays["T_cam_imu"].tolist():
-        raise AssetError("not the inertial unit of imu.h5", where=str(path), value=sorted(map(str, table)))
-    for key, value in table.items():
-        if type(value) not in (int, float) or not 0 <= value < math.inf:
-            raise AssetError("no density of noise or rate", where=f"{path}: {key}", value=value, accepted="a number")
-    texts = {CSV: imu_csv(arrays["t_ns"], arrays["rate"], arrays["acceleration"])}
-    texts[IDEAL] = imu_csv(arrays["t_ns"], arrays["ideal_rate"], arrays["ideal_acceleration"])
-    texts[KALIBR] = to_yaml({**table, "T_cam_imu": T_cam_imu})
+    table, pose = read_table(path), {"T_cam_imu": arrays["T_cam_imu"].tolist()}
+    numbers = {key: value for key, value in table.items() if type(value) in (int, float) and 0 <= value < math.inf}
+    if table != numbers | pose or set(numbers) != {*_NOISE, "update_rate"}:
+        raise AssetError("not the inertial unit of imu.h5: densities of noise, update_rate, T_cam_imu", where=str(path))
+    texts = {
+        CSV: imu_csv(arrays["t_ns"], arrays["rate"], arrays["acceleration"]),
+        IDEAL: imu_csv(arrays["t_ns"], arrays["ideal_rate"], arrays["ideal_acceleration"]),
+        KALIBR: to_yaml(numbers | pose),
+    }
     return {H5: imu_h5(arrays)} | {name: text.encode() for name, text in texts.items()}
 
 

@@ -3,12 +3,35 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from typing import Any
 
 from blinkgl.errors import AssetError
 
 _UNSUSPECTED, _MOST_RATIO = 1 << 28, 100
 """What is packed may unpack to so many bytes, or to so many times its own: events pack to a tenth, pictures to a
 fiftieth."""
+
+
+def most_unpacked(packed: int, unsuspected: int = _UNSUSPECTED) -> int:
+    """Return the bytes that ``packed`` bytes of a file may unpack to, at least ``unsuspected``."""
+    return max(unsuspected, _MOST_RATIO * packed)
+
+
+def unpacked(make: Callable[[], Any], data: bytes, unsuspected: int = _UNSUSPECTED) -> bytes:
+    """Return what all streams in ``data`` unpack to.   make : returns an unpacker of bz2's form, of one stream.
+
+    Raises ValueError: more than :func:`most_unpacked`, or a stream that is cut; and what the unpacker raises."""
+    parts, left = [], most_unpacked(len(data), unsuspected)
+    while data:
+        unpacker = make()
+        # One byte more than allowed tells a stream that is too long.
+        parts.append(unpacker.decompress(data, max_length=left + 1))
+        left -= len(parts[-1])
+        if left < 0 or not unpacker.eof:
+            raise ValueError("is cut" if left >= 0 else f"unpacks to more than {_MOST_RATIO} times its size")
+        data = unpacker.unused_data
+    return b"".join(parts)
 
 
 def check_claim(size: int, where: str, packed: int | None = None) -> None:
@@ -18,16 +41,9 @@ def check_claim(size: int, where: str, packed: int | None = None) -> None:
     Raises AssetError: more than half of this machine's memory, or far more than so many bytes unpack to."""
     limit = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     if size > limit:
-        raise AssetError(
-            "too large for this machine's memory",
-            where=where,
-            value=f"{size / 1e9:.1f} GB",
-            accepted=f"at most {limit / 1e9:.1f} GB",
-        )
-    if packed is not None and size > max(_UNSUSPECTED, _MOST_RATIO * packed):
-        raise AssetError(
-            f"unpacks to more than {_MOST_RATIO} times its size",
-            where=where,
-            value=f"{size} bytes of {packed}",
-            accepted="a file that is not packed",
-        )
+        problem, limits = "too large for this machine's memory", f"at most {limit / 1e9:.1f} GB"
+    elif packed is not None and size > most_unpacked(packed):
+        problem, limits = f"unpacks to more than {_MOST_RATIO} times its size", "a file that is not packed"
+    else:
+        return
+    raise AssetError(problem, where=where, value=f"{size} bytes", accepted=limits)

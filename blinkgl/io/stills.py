@@ -248,7 +248,7 @@ def _png(path: Path, head: bytes) -> Stills:
 
 def _animated(path: Path) -> Stills:
     with _pillow(path) as image, _decoding(path):
-        if problem := size_problem(*image.size):
+        if problem := size_problem(*image.size, path.stat().st_size):
             raise AssetError(problem, where=str(path))
         delays = []
         for page in ImageSequence.Iterator(image):
@@ -279,7 +279,8 @@ def _bits(page: Any) -> int:
 def _tiff(path: Path) -> Stills:
     with _opened_tiff(path) as file:
         series, notes, page = file.series[0], [], file.series[0].keyframe
-        if problem := size_problem(page.imagewidth, page.imagelength):
+        depth = max(1, page.samplesperpixel) * -(-_bits(page) // 8)
+        if problem := size_problem(page.imagewidth, page.imagelength, path.stat().st_size, depth):
             raise AssetError(problem, where=str(path))
         _check_tags(page, path)
         stated, channels = _interval_ms(file, notes)
@@ -368,7 +369,7 @@ def _by_pillow(data: bytes, path: Path, notes: list[str], index: int = 0, *, as_
             warnings.simplefilter("ignore")
             with iio.imopen(io.BytesIO(data), "r", plugin="pillow") as file:
                 meta = file.metadata(index=index, exclude_applied=False)
-                if problem := size_problem(meta["shape"][0], meta["shape"][1]):
+                if problem := size_problem(meta["shape"][0], meta["shape"][1], len(data)):
                     raise AssetError(problem, where=str(path))
                 mode = meta["mode"]
                 if mode not in _MODES:

@@ -17,6 +17,7 @@ from blinkgl.io.columns import check_events, microseconds
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
 from blinkgl.io.mvsec import event_table, events_of_rows
+from blinkgl.io.sizes import check_claim
 from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
 
@@ -85,6 +86,7 @@ class NpzRows:
         shape, dtype, start = self._layout[name]
         shape = shape if row is None else shape[1:]
         count = math.prod(shape)
+        check_claim(count * dtype.itemsize, str(self.path), self.path.stat().st_size)
         with numpy_errors(self.path), zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
             member.seek(start + (row or 0) * count * dtype.itemsize)
             return np.frombuffer(member.read(count * dtype.itemsize), dtype).reshape(shape)

@@ -70,8 +70,7 @@ class Declared:
         if self.damaged not in ("refuse", "keep"):
             raise ConfigError("cannot read --damaged", where="--damaged", value=self.damaged, accepted="refuse or keep")
         if self.fps is not None and not 1e-6 <= self.fps <= 1e9:
-            accepted = "a positive number, from 1e-6 to 1e9"
-            raise EventDataError("frame rate", where="--fps", value=self.fps, accepted=accepted)
+            raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
         if self.time_unit != "frames":
             checked_unit(self.time_unit)
             if self.fps is not None and self.timestamps is not None:

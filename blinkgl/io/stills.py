@@ -17,8 +17,9 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import cv2
 import numpy as np
@@ -33,6 +34,7 @@ from blinkgl.io.records import decoding, input_errors
 SUFFIXES = frozenset(
     ".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pbm .pgm .ppm .pnm .exr .hdr .pfm .avif .jp2 .tga".split()
 )
+_KINDS = ("PNG", "JPEG", "JPEG2000", "BMP", "DIB", "WEBP", "GIF", "PPM", "AVIF", "TGA", "TIFF")
 _ANIMATED = {".gif", ".webp", ".png", ".apng"}
 _TIFF = {".tif", ".tiff"}
 _UNSTATED_MS = 100
@@ -131,7 +133,7 @@ class Stills:
             self.notes.append(note)
 
     def _animation(self, first: int) -> Iterator[np.ndarray]:
-        with _pillow(self.path) as image, _decoding(self.path):
+        with _pillow(self.path, self.path) as image, _decoding(self.path):
             for k, page in enumerate(ImageSequence.Iterator(image)):
                 if k >= first:
                     yield np.asarray(page.convert("RGBA"))
@@ -247,7 +249,7 @@ def _png(path: Path, head: bytes) -> Stills:
 
 
 def _animated(path: Path) -> Stills:
-    with _pillow(path) as image, _decoding(path):
+    with _pillow(path, path) as image, _decoding(path):
         if problem := size_problem(*image.size, path.stat().st_size):
             raise AssetError(problem, where=str(path))
         delays = []
@@ -267,9 +269,11 @@ def _opened_tiff(path: Path) -> Iterator[Any]:
     import tifffile
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
-    # OME-XML may name other files; what it says of its own is read from the description instead.
-    with _decoding(path), open(path, "rb") as raw, tifffile.TiffFile(raw, is_ome=False) as file:
-        yield file
+    # OME-XML may name other files; what it says of its own is read from the description instead. MMStack's and NDTiff's
+    # indices name those beside a file: bytes without a name and a folder have none.
+    with _decoding(path), open(path, "rb") as raw, mmap(raw.fileno(), 0, access=ACCESS_READ) as held:
+        with tifffile.TiffFile(cast(BinaryIO, held), is_ome=False) as file:
+            yield file
 
 
 def _bits(page: Any) -> int:
@@ -367,7 +371,11 @@ def _by_pillow(data: bytes, path: Path, notes: list[str], index: int = 0, *, as_
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with iio.imopen(io.BytesIO(data), "r", plugin="pillow") as file:
+            # The library tries all kinds that Pillow knows, some of which run other programs.
+            with (
+                _pillow(io.BytesIO(data), path),
+                iio.imopen(io.BytesIO(data), "r", plugin="pillow") as file,
+            ):
                 meta = file.metadata(index=index, exclude_applied=False)
                 if problem := size_problem(meta["shape"][0], meta["shape"][1], len(data)):
                     raise AssetError(problem, where=str(path))
@@ -439,7 +447,9 @@ def _decoding(path: Path) -> AbstractContextManager[None]:
     return decoding(path, "cannot decode image (corrupt or truncated)", Damage)
 
 
-def _pillow(path: Path) -> Image.Image:
+def _pillow(source: Path | io.BytesIO, path: Path) -> Image.Image:
+    """Open a picture whose bytes are one of :data:`_KINDS`, whatever its name says."""
     with _decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return Image.open(path)
+        Image.init()  # most kinds are known only then
+        return Image.open(source, formats=[kind for kind in _KINDS if kind in Image.OPEN])

@@ -149,8 +149,12 @@ class FrameSource:
                     accepted=f"more than {last / 1e9:.9g} s, or --fps instead of the stamps",
                 )
             if abs(t_ns) >= 2**62:
-                where = f"{self.path}: frame {count} ({name})"
-                raise EventDataError("time beyond 2^62 ns", where=where, value=t_ns, accepted="another --time-unit")
+                raise EventDataError(
+                    "time beyond 2^62 ns",
+                    where=f"{self.path}: frame {count} ({name})",
+                    value=t_ns,
+                    accepted="another --time-unit",
+                )
             last = t_ns
             first = t_ns if first is None else first
             yield frame, t_ns - first if self.zero_time else t_ns, name

@@ -40,10 +40,9 @@ def check_claim(size: int, where: str, packed: int | None = None) -> None:
 
     Raises AssetError: more than half of this machine's memory, or far more than so many bytes unpack to."""
     limit = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    if size > limit:
-        problem, limits = "too large for this machine's memory", f"at most {limit / 1e9:.1f} GB"
-    elif packed is not None and size > most_unpacked(packed):
-        problem, limits = f"unpacks to more than {_MOST_RATIO} times its size", "a file that is not packed"
-    else:
-        return
-    raise AssetError(problem, where=where, value=f"{size} bytes", accepted=limits)
+    far = packed is not None and size > most_unpacked(packed)
+    if far or size > limit:
+        problem = f"unpacks to more than {_MOST_RATIO} times its size" if far else "too large for this machine's memory"
+        raise AssetError(
+            problem, where=where, value=f"{size} bytes", accepted=f"at most {limit / 1e9:.1f} GB, unpacked"
+        )

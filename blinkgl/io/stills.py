@@ -271,9 +271,13 @@ def _opened_tiff(path: Path) -> Iterator[Any]:
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     # OME-XML may name other files; what it says of its own is read from the description instead. MMStack's and NDTiff's
     # indices name those beside a file: bytes without a name and a folder have none.
-    with _decoding(path), open(path, "rb") as raw, mmap(raw.fileno(), 0, access=ACCESS_READ) as held:
-        with tifffile.TiffFile(cast(BinaryIO, held), is_ome=False) as file:
-            yield file
+    with (
+        _decoding(path),
+        open(path, "rb") as raw,
+        mmap(raw.fileno(), 0, access=ACCESS_READ) as held,
+        tifffile.TiffFile(cast(BinaryIO, held), is_ome=False) as file,
+    ):
+        yield file
 
 
 def _bits(page: Any) -> int:

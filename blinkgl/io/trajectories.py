@@ -31,7 +31,7 @@ from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
 from blinkgl.io.rows import read_rows, titles_of
 from blinkgl.io.stamps import read_timestamps
-from blinkgl.types.numbers import exact, is_number, plain
+from blinkgl.types.numbers import exact, is_number
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")
@@ -290,10 +290,10 @@ def _colmap(path: Path, text: str, declared: PoseFile) -> _Table:
 
 def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
     try:
-        tree = json.loads(text, parse_int=plain, parse_float=plain)
+        tree = json.loads(text, parse_int=str, parse_float=str)
         frames = tree["frames"]
         given = np.array([frame["transform_matrix"] for frame in frames], np.float64)
-        if given.ndim != 3 or given.shape[1] not in (3, 4) or given.shape[2] != 4 or not np.isfinite(given).all():
+        if given.ndim != 3 or given.shape[1] not in (3, 4) or given.shape[2] != 4 or not (np.abs(given) < 1e100).all():
             raise ValueError("transform_matrix")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split())[:80]

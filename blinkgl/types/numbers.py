@@ -20,9 +20,3 @@ def exact(text: str) -> Fraction:
     if not is_number(text):
         raise ValueError(f"{text[:40]} is no number below 1e100")
     return Fraction(text)
-
-
-def plain(text: str) -> int | float:
-    """Return a number as JSON has it, whole or not. Raises ValueError unless :func:`is_number`."""
-    number = exact(text)
-    return int(number) if text.lstrip("-").isdigit() else float(text)

@@ -24,7 +24,7 @@ from blinkgl.io.reading import EventReading
 from blinkgl.io.stamps import read_label_times, read_timestamps
 from blinkgl.io.stills import open_stills
 from blinkgl.io.trajectories import read_trajectory
-from blinkgl.types.numbers import exact, is_number, plain
+from blinkgl.types.numbers import exact, is_number
 from eflow.data.sources import read_submission_times
 
 ABSURD = (
@@ -196,7 +196,6 @@ def test_what_a_number_is():
         map(is_number, ("", ".", "1e", "1e1000", "1e100", "9" * 101, "nan", "inf", "1_0", "٣", "1/2", " 1", "1\n"))
     )
     assert exact("1403636579.763555584") * 10**9 == 1403636579763555584
-    assert plain("-12") == -12 and type(plain("-12")) is int and plain("1.5e2") == 150.0
     for number in ABSURD[:5]:
         with pytest.raises(ValueError, match="is no number below 1e100"):
             exact(number)
@@ -217,7 +216,7 @@ def test_numbers_of_json_are_limited_where_poses_are_read(tmp_path):
     path = tmp_path / "transforms.json"
     for number in ("9" * 400, "1e999", "9" * 5000):
         path.write_text(nerf(number))
-        with pytest.raises(BlinkGLError, match="no transforms.json: 9|no transforms.json: 1e999"):
+        with pytest.raises(BlinkGLError, match="no transforms.json: transform_matrix"):
             read_trajectory(path)
     json.loads(nerf("1"))
     path.write_text(nerf("1"))

@@ -16,8 +16,7 @@ from blinkgl.errors import ConfigError
 STEPS = 100
 """Largest number of a solver's steps; five or six are usual, halving brackets takes about sixty where the derivative
 vanishes."""
-_LARGEST = 1e6
-"""Of a coefficient, as in YAML: powers of it are finite."""
+_LARGEST = 1e6  # of a coefficient, as in YAML: powers of it are finite
 _GRID = 33  # grid points along each side of the picture at which the magnification is computed
 
 

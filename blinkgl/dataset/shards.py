@@ -33,7 +33,6 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
-from blinkgl.io.images import read_image
 from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
@@ -138,13 +137,14 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
                 value = label.read(folder / read.file(k), read, manifest["height"], manifest["width"])
                 # An archive may hold more than was read.
                 anew = form.encode is not None and (form is not read or form.ending == "npz")
-                data = form.encode(value) if anew else (folder / form.file(k)).read_bytes()
-                yield f"{key}.{name}.{form.ending}", data
+                yield (
+                    f"{key}.{name}.{form.ending}",
+                    form.encode(value) if anew else (folder / form.file(k)).read_bytes(),
+                )
     for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():
         ending = "camera.png" if picture == "images" else f"camera_{picture}.png"
-        path = folder / picture_file(picture, taken[0])
-        if (shape := read_image(path).shape[:2]) != (manifest["height"], manifest["width"]):
-            raise AssetError("not of this sequence's size", where=str(path), value=shape)
+        path, image = folder / picture_file(picture, taken[0]), LABELS["images"]
+        image.read(path, image.forms[0], manifest["height"], manifest["width"])
         yield f"{key}.{ending}", path.read_bytes()
 
 

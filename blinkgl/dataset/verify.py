@@ -205,14 +205,16 @@ def look_at_camera(folder: Path, name: str, manifest: dict[str, Any], config: Se
 def events_problems(folder: Path, manifest: dict[str, Any]) -> list[str]:
     """Return the problems of the events, all of which are read: storage, order, place, time, number. Raises AssetError,
     EventDataError: the first of them that a reader refuses."""
-    start, size = manifest["t_offset_us"], (manifest["height"], manifest["width"])
-    end = start + (manifest.get("duration_us") or 0)
-    with DsecEventReader(folder / "events.h5", size=size) as reader:
+    start, duration = manifest["t_offset_us"], manifest.get("duration_us") or 0
+    with DsecEventReader(folder / "events.h5", size=(manifest["height"], manifest["width"])) as reader:
         if reader.count != manifest["events"]:
             return [f"events.h5: holds {reader.count} events, {MANIFEST} says {manifest['events']}"]
         for events in reader.chunks():
-            if len(events) and not start <= events.t[0] <= events.t[-1] <= end:
-                return [f"events.h5: events from {events.t[0]} to {events.t[-1]} µs; the sequence: {start} to {end}"]
+            if len(events) and not start <= events.t[0] <= events.t[-1] <= start + duration:
+                return [
+                    f"events.h5: events from {events.t[0]} to {events.t[-1]} µs; the sequence: {start} to "
+                    + str(start + duration)
+                ]
     return []
 
 

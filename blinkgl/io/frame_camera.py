@@ -96,10 +96,9 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
             first, *rows = csv.reader(file)
         if first != heading or any(len(row) != len(heading) for row in rows):
             raise ValueError("not the columns " + ", ".join(heading))
-        if not all(row[-1].isdigit() for row in rows):
-            raise ValueError("instants that are no count")
         numbers = [[float(exact(field)) for field in row] for row in rows]
-        return [ExposureLine(a, b, exposure, row_us, gain_db, int(n)) for a, b, exposure, row_us, gain_db, n in numbers]
+        return [ExposureLine(a, b, each, row_us, gain, int(row[-1]))
+                for row, (a, b, each, row_us, gain, _) in zip(rows, numbers)]  # fmt: skip
     except FileNotFoundError:
         raise AssetError(
             "the sequence has no frame camera", where=str(path), accepted="a sequence made with images:"

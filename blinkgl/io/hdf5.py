@@ -87,8 +87,11 @@ class Data(_Held):
             count, parts = self.dtype.itemsize, place if isinstance(place, tuple) else (place,)
             for size, part in itertools.zip_longest(self.shape, parts[: len(self.shape)], fillvalue=slice(None)):
                 count *= len(range(*part.indices(size))) if isinstance(part, slice) else 1
-            packed = self._held.id.get_storage_size() if self._held.chunks else None
-            check_claim(count, f"{self._path}: '{self.name}'", packed)
+            check_claim(
+                count,
+                f"{self._path}: '{self.name}'",
+                self._held.id.get_storage_size() if self._held.chunks else None,
+            )
             return self._held[place]
 
     def check(self) -> None:
@@ -304,12 +307,12 @@ def _zstd_claim(file: BinaryIO, *_: int) -> int:
     return int.from_bytes(head[start : start + length], "little") + (256 if length == 2 else 0)
 
 
+# Filters -> what a chunk unpacks to: of the file, which is at its beginning, its size, and that of its values.
 _CLAIMED: dict[int, Callable[[BinaryIO, int, int], int]] = {
     1: _inflated,
     32004: lambda file, *_: int.from_bytes(file.read(8), "big"),
     32015: _zstd_claim,
 }
-"""Filters -> what a chunk unpacks to: of the file, which is at its beginning, its size, and that of its values."""
 
 
 def _plain(dtype: np.dtype) -> bool:

@@ -319,5 +319,6 @@ def size_problem(width: int, height: int, packed: int, depth: int = 4) -> str | 
     most = min(_MAX_PIXELS, most_unpacked(packed) // depth)
     if 0 < width * height <= most:
         return None
-    held = f" in {packed} bytes" if most < _MAX_PIXELS else ""
-    return f"image of {width}x{height} px is too large (at most {most >> 20} Mpx{held})"
+    return f"image of {width}x{height} px is too large (at most {most >> 20} Mpx" + (
+        f" in {packed} bytes)" if most < _MAX_PIXELS else ")"
+    )

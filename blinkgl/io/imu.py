@@ -71,12 +71,12 @@ def made_again(sequence: str | os.PathLike) -> dict[str, bytes]:
     numbers = {key: value for key, value in table.items() if type(value) in (int, float) and 0 <= value < math.inf}
     if table != numbers | pose or set(numbers) != {*_NOISE, "update_rate"}:
         raise AssetError("not the inertial unit of imu.h5: densities of noise, update_rate, T_cam_imu", where=str(path))
-    texts = {
-        CSV: imu_csv(arrays["t_ns"], arrays["rate"], arrays["acceleration"]),
-        IDEAL: imu_csv(arrays["t_ns"], arrays["ideal_rate"], arrays["ideal_acceleration"]),
-        KALIBR: to_yaml(numbers | pose),
+    return {
+        H5: imu_h5(arrays),
+        CSV: imu_csv(arrays["t_ns"], arrays["rate"], arrays["acceleration"]).encode(),
+        IDEAL: imu_csv(arrays["t_ns"], arrays["ideal_rate"], arrays["ideal_acceleration"]).encode(),
+        KALIBR: to_yaml(numbers | pose).encode(),
     }
-    return {H5: imu_h5(arrays)} | {name: text.encode() for name, text in texts.items()}
 
 
 def read_imu(sequence: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -40,8 +40,11 @@ class Series:
         if step <= 0 or often < 0.5 * len(steps) or often == len(steps):
             return None
         places = [(number - self.numbers[0]) / step for number in self.numbers]
-        whole = places[-1] < _MOST_PLACES and all(place == place.to_integral_value() for place in places)
-        return places if whole else None
+        return (
+            places
+            if places[-1] < _MOST_PLACES and all(place == place.to_integral_value() for place in places)
+            else None
+        )
 
     def missing(self) -> list[str]:
         """Return the lines that say which numbers are missing."""

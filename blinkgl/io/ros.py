@@ -64,10 +64,6 @@ def typestore(ros2: bool) -> Any:
     return store
 
 
-_CHUNK_BYTES = 1 << 26
-"""What a chunk of any size may unpack to: recorders write less than a megabyte."""
-
-
 @functools.cache
 def _limited() -> None:
     """Give the unpackers of rosbags a limit: they unpack as much as a chunk holds, in 5 kB the events of a gigabyte."""
@@ -77,15 +73,15 @@ def _limited() -> None:
     from rosbags.rosbag1.reader import decompressors
     from rosbags.rosbag2 import reader, storage_mcap
 
-    limited = lambda make: lambda data, *_: unpacked(make, data, _CHUNK_BYTES)
+    # Recorders write chunks of less than a megabyte.
+    limited = lambda make: lambda data, *_: unpacked(make, data, 1 << 26)
     decompressors.update(bz2=limited(bz2.BZ2Decompressor), lz4=limited(LZ4FrameDecompressor))
-    storage_mcap.DECOMPRESSORS.update(lz4=limited(LZ4FrameDecompressor))
-    if library := getattr(
-        reader, "zstd", None
-    ):  # versions before use a library that takes the size that a chunk states
-        zstd = limited(library.ZstdDecompressor)
-        storage_mcap.DECOMPRESSORS.update(zstd=zstd)
-        reader.zstd = SimpleNamespace(decompress=zstd, open=library.open)
+    # Versions without it use a library that takes the size that a chunk states.
+    library = getattr(reader, "zstd", None)
+    zstd = {} if library is None else {"zstd": limited(library.ZstdDecompressor)}
+    storage_mcap.DECOMPRESSORS.update(lz4=limited(LZ4FrameDecompressor), **zstd)
+    if library is not None:
+        reader.zstd = SimpleNamespace(decompress=zstd["zstd"], open=library.open)
 
 
 class BagReader:

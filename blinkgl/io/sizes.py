@@ -8,9 +8,8 @@ from typing import Any
 
 from blinkgl.errors import AssetError
 
+# What is packed may unpack to so many bytes, or so many times its own: events pack to a tenth, pictures to a fiftieth.
 _UNSUSPECTED, _MOST_RATIO = 1 << 28, 100
-"""What is packed may unpack to so many bytes, or to so many times its own: events pack to a tenth, pictures to a
-fiftieth."""
 
 
 def most_unpacked(packed: int, unsuspected: int = _UNSUSPECTED) -> int:

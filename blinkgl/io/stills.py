@@ -287,8 +287,9 @@ def _bits(page: Any) -> int:
 def _tiff(path: Path) -> Stills:
     with _opened_tiff(path) as file:
         series, notes, page = file.series[0], [], file.series[0].keyframe
-        depth = max(1, page.samplesperpixel) * -(-_bits(page) // 8)
-        if problem := size_problem(page.imagewidth, page.imagelength, path.stat().st_size, depth):
+        if problem := size_problem(
+            page.imagewidth, page.imagelength, path.stat().st_size, max(1, page.samplesperpixel) * -(-_bits(page) // 8)
+        ):
             raise AssetError(problem, where=str(path))
         _check_tags(page, path)
         stated, channels = _interval_ms(file, notes)

@@ -449,8 +449,11 @@ def decode_exr(data: bytes, where: str) -> np.ndarray:
         decoder.options = {"max_pixels": str(most)}
         frames = decoder.decode(av.Packet(data))
     except (av.FFmpegError, OSError, ValueError) as error:
-        accepted = f"at most {most} px in {len(data)} bytes"
-        raise AssetError(f"cannot decode OpenEXR image: {_gist(error)}", where=where, accepted=accepted) from error
+        raise AssetError(
+            f"cannot decode OpenEXR image: {_gist(error)}",
+            where=where,
+            accepted=f"at most {most} px in {len(data)} bytes",
+        ) from error
     except NotImplementedError as error:
         raise AssetError("cannot decode OpenEXR image: a kind that is not read", where=where) from error
     if not frames or "f" not in frames[0].format.name:

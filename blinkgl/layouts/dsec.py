@@ -128,8 +128,9 @@ def image_times(source: Source) -> list[int]:
 def write_events(source: Source, folder: Path) -> None:
     """Write ``events.h5``, anew, since nothing but its events may be handed on, and ``rectify_map.h5``."""
     folder.mkdir(parents=True, exist_ok=True)
-    path, codec = folder / "events.h5", source.codec
-    with DsecEventWriter(path, source.height, source.width, source.start_us, codec=codec) as writer:
+    with DsecEventWriter(
+        folder / "events.h5", source.height, source.width, source.start_us, codec=source.codec
+    ) as writer:
         writer.t_end_us = source.end_us
         for events in source.events():
             writer.append(events)

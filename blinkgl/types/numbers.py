@@ -6,8 +6,8 @@ import re
 from fractions import Fraction
 
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]{1,3})?")
+# Characters of a number, and its size: squares and cubes of it are finite, too.
 _LONGEST, _LARGEST = 100, 1e100
-"""Characters of a number, and its size: squares and cubes of it are finite, too."""
 
 
 def is_number(text: str) -> bool:

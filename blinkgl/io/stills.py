@@ -200,7 +200,9 @@ def open_stills(path: Path) -> Stills:
     if suffix in _ANIMATED:
         head = _bytes(path, 4096 if suffix in (".png", ".apng") else 64)
         # acTL is a chunk of animated PNG files; bit 1 of a WebP file's flags says that it is animated.
-        animated = suffix == ".gif" or b"acTL" in head or (head[8:16] == b"WEBPVP8X" and head[20] & 2)
+        animated = (
+            suffix == ".gif" or b"acTL" in head or (head[8:16] == b"WEBPVP8X" and head[20:21] > b"\1" and head[20] & 2)
+        )
         if animated:
             return _animated(path)
         return _png(path, head) if head[:4] == b"\x89PNG" else Stills(path)
@@ -225,7 +227,7 @@ def _png(path: Path, head: bytes) -> Stills:
     for _, kind, body in png_chunks(head):
         if kind == b"IHDR":
             # The bit depth comes after width and height, four bytes each.
-            bits = body[8]
+            bits = int.from_bytes(body[8:9])
         elif kind == b"cICP" and len(body) == 4:
             from blinkgl.io.video import TRANSFERS
 

@@ -262,3 +262,22 @@ def test_opencv_and_numpy_read_bytes(tmp_path, baits):
             with pytest.raises(BlinkGLError):
                 read(tmp_path / name)
     assert not (tmp_path / "RAN").exists()
+
+
+HEADS = {
+    "png": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\1\0\0\0\1\x10\0\0\0\0", "tif": b"II*\0\x08\0\0\0\1\0",
+    "apng": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\1", "webp": b"RIFF\x40\0\0\0WEBPVP8X\x0a\0\0\0\2",
+    "gif": b"GIF89a\1\0\1\0\0\0\0", "jpg": b"\xff\xd8\xff\xe0\0\x10JFIF", "ppm": b"P6 1 1 255\n",
+    "bmp": b"BM" + bytes(9), "hdr": b"#?RADIANCE\n", "exr": struct.pack("<II", 20000630, 2), "pfm": b"PF\n1 1\n-1\n",
+    "avif": bytes(30), "jp2": bytes(30), "tga": bytes(9),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", HEADS)
+def test_headers_that_end_anywhere_are_one_line(tmp_path, ending):
+    """What the fuzz found in a cut IHDR."""
+    for length in range(len(HEADS[ending]) + 1):
+        (tmp_path / f"a.{ending}").write_bytes(HEADS[ending][:length])
+        with pytest.raises(BlinkGLError) as caught:
+            open_stills(tmp_path / f"a.{ending}").read()
+        assert "\n" not in str(caught.value)

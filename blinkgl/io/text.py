@@ -235,8 +235,11 @@ def _row(line: bytes) -> list[float] | None:
     words = re.split(rb"[ \t,;\r]+", line.strip())
     known = {"true": 1.0, "false": 0.0}
     texts = [word.decode("latin-1").lower() for word in words]
-    sound = all(text in known or is_number(text) for text in texts)
-    return [known[text] if text in known else float(text) for text in texts] if sound else None
+    return (
+        [known[text] if text in known else float(text) for text in texts]
+        if all(text in known or is_number(text) for text in texts)
+        else None
+    )
 
 
 class TextWriter(CheckedWriter):

@@ -35,7 +35,7 @@ from blinkgl.machine.interrupts import uninterrupted
 if TYPE_CHECKING:
     import av
 
-_MAX_PIXELS = 1 << 26
+_MAX_PIXELS, _MOST = 1 << 26, "at most 64 Mpx a frame"
 _FORMATS = frozenset(
     "mov mp4 m4a 3gp 3g2 mj2 matroska webm avi mpegts mpeg mpegvideo flv asf ogg apng ivf nut dv mxf yuv4mpegpipe h264 "
     "hevc vvc av1 obu m4v mjpeg rm wtv cine live_flv".split()
@@ -427,12 +427,8 @@ class VideoReader:
             if stream.codec_context is None:
                 raise AssetError("cannot read video: unknown codec", where=str(self.path))
             if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
-                raise AssetError(
-                    "video too large",
-                    where=str(self.path),
-                    value=f"{stream.codec_context.width}x{stream.codec_context.height}",
-                    accepted=f"at most {_MAX_PIXELS >> 20} Mpx a frame",
-                )
+                size = f"{stream.codec_context.width}x{stream.codec_context.height}"
+                raise AssetError("video too large", where=str(self.path), value=size, accepted=_MOST)
             # A frame may have another size than the container states.
             stream.codec_context.options = {"max_pixels": str(_MAX_PIXELS)}
             yield file, stream
@@ -448,14 +444,9 @@ def decode_exr(data: bytes, where: str) -> np.ndarray:
         decoder = av.CodecContext.create("exr", "r")
         decoder.options = {"max_pixels": str(most)}
         frames = decoder.decode(av.Packet(data))
-    except (av.FFmpegError, OSError, ValueError) as error:
-        raise AssetError(
-            f"cannot decode OpenEXR image: {_gist(error)}",
-            where=where,
-            accepted=f"at most {most} px in {len(data)} bytes",
-        ) from error
-    except NotImplementedError as error:
-        raise AssetError("cannot decode OpenEXR image: a kind that is not read", where=where) from error
+    except (av.FFmpegError, OSError, ValueError, NotImplementedError) as error:
+        accepted = f"at most {most} px in {len(data)} bytes"
+        raise AssetError(f"cannot decode OpenEXR image: {_gist(error)}", where=where, accepted=accepted) from error
     if not frames or "f" not in frames[0].format.name:
         raise AssetError("cannot decode OpenEXR image: no picture of floats", where=where)
     return floats_of(frames[0])

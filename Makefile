@@ -57,6 +57,7 @@ bench: .venv/.installed-dev opengl
 
 fuzz: .venv/.installed-dev
 	.venv/bin/python -m blinkgl.tools.fuzz --mutants 1000
+	.venv/bin/python -m blinkgl.tools.fuzz configurations --mutants 1000
 
 # Environments of nox, in .nox/; without torch, so that the tests of eflow are skipped.
 matrix: .venv/.installed-dev opengl

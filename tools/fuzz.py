@@ -1,7 +1,7 @@
 """Damaged files: each mutant of a small whole file, or of a data set with one file damaged, is read, or refused with
 one line.
 
-    python -m blinkgl.tools.fuzz [NAME …] [--mutants 200] [--seed 0] [--only K] [--keep FILE]
+    python -m blinkgl.tools.fuzz [NAME … | configurations] [--mutants 200] [--seed 0] [--only K] [--keep FILE]
 
 A mutant is read in a process of its own, under a clock and a memory limit. Defects are a traceback, a crash, a message
 of several lines, more than ``CPU_S`` processor seconds or ``MEMORY_MB`` more memory. Each is printed with the command
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import faulthandler
-import gzip
 import json
 import multiprocessing
 import os
@@ -34,34 +33,34 @@ from functools import partial
 from importlib import resources
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
-import h5py
 import hdf5plugin
 import numpy as np
 import trimesh
-from scipy.io import savemat
 
+from blinkgl.config.camchain import read_camchain
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.flow import read_flo, read_flow_png, write_flow
+from blinkgl.io.flow import read_flo, read_flow, read_flow_png, write_flow
 from blinkgl.io.formats import open_events, write_events
-from blinkgl.io.frames import Declared, open_frames
+from blinkgl.io.frames import Declared, open_frames, read_any_image
 from blinkgl.io.reading import EventReading
 from blinkgl.io.records import sealed
+from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.trajectories import PoseFile, read_trajectory
 from blinkgl.layouts import export_layout
 from blinkgl.report.page import write_report
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.sequence_files.sequence_dir import digest_of
-from blinkgl.types.events import Events
+from blinkgl.tools import fuzz_configurations, fuzz_files
 from blinkgl.viewer.views import SequenceView, sequences_in
 from eflow.data.sources import open_source
 
-HEIGHT, WIDTH = 24, 32
 CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048
 READ, REFUSED = "read", "refused"
 FORK = multiprocessing.get_context("fork")
@@ -76,112 +75,37 @@ class Format(NamedTuple):
     files: Callable[[Path], list[Path]] = lambda path: [path]
 
 
-def _events() -> Events:
-    rng = np.random.default_rng(5)
-    columns = (rng.integers(0, size, 400) for size in (WIDTH, HEIGHT, 60_000, 2))
-    x, y, t, p = (column.astype(kind) for column, kind in zip(columns, (np.uint16, np.uint16, np.int64, np.uint8)))
-    return Events(x, y, np.sort(t), p)
-
-
-Make = Callable[[Path, Events], object]
-
-
-def _events_as(make: Make = lambda path, events: write_events(path, events, HEIGHT, WIDTH)) -> Format:
-    """Events, written by ``make`` (as the ending says), are read; the whole parts of a damaged file, too."""
+def _events_as(
+    make: fuzz_files.Make = lambda path, events: write_events(path, events, fuzz_files.HEIGHT, fuzz_files.WIDTH),
+    **declared: str,
+) -> Format:
+    """Events, written by ``make`` (as the ending says), are read; the whole parts of a damaged file, too.   declared :
+    what the file does not say, as options of the commands."""
 
     def read(path: Path) -> None:
-        with contextlib.suppress(BlinkGLError), open_events(path, EventReading(damaged="keep", sort=True)) as file:
+        with (
+            contextlib.suppress(BlinkGLError),
+            open_events(path, EventReading.of(damaged="keep", sort=True, **declared)) as file,
+        ):
             list(file.chunks())
-        with open_events(path) as file:
+        with open_events(path, EventReading.of(**declared)) as file:
             sized = file.sized()
             for events in sized.chunks():
                 assert not len(events) or (events.x.max() < sized.width and events.y.max() < sized.height)
 
-    return Format(lambda path: make(path, _events()), read)
-
-
-def _es(path: Path, e: Events) -> None:
-    """Event Stream, version 2."""
-    data, last = bytearray(b"Event Stream" + bytes([2, 0, 0, 1, WIDTH, 0, HEIGHT, 0])), 0
-    for x, y, t, p in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist()):
-        data += b"\xff" * ((t - last) // 127) + bytes([(t - last) % 127 << 1 | p, x, 0, y, 0])
-        last = t
-    path.write_bytes(data)
-
-
-def _dat(path: Path, e: Events) -> None:
-    rows = np.stack([e.t, e.x | e.y.astype(np.int64) << 14 | e.p.astype(np.int64) << 28], axis=1).astype("<u4")
-    path.write_bytes(f"% Version 2\n% Height {HEIGHT}\n% Width {WIDTH}\n".encode() + bytes([12, 8]) + rows.tobytes())
-
-
-def _bin(path: Path, e: Events) -> None:
-    rows = zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist())
-    path.write_bytes(b"".join(bytes([x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255]) for x, y, t, p in rows))
-
-
-def _mat(path: Path, e: Events) -> None:
-    savemat(path, {"events": {"x": e.x * 1.0, "y": e.y, "ts": e.t * 1.0, "p": e.p}}, do_compression=True)
-
-
-def _h5(*packed: Any) -> Make:
-    """Columns of a stranger's HDF5, packed by filters."""
-
-    def make(path: Path, e: Events) -> None:
-        with h5py.File(path, "w") as file:
-            file["t_offset"] = np.array([7])
-            for k, name in enumerate(("x", "y", "t", "p")):
-                file.create_dataset(f"events/{name}s", data=getattr(e, name), chunks=(128,), **packed[k % len(packed)])
-
-    return make
-
-
-def _rows(path: Path, e: Events) -> None:
-    with h5py.File(path, "w") as file:
-        file["davis/left/events"] = np.stack([e.x, e.y, e.t * 1e-6, e.p * 2.0 - 1], axis=1)
-
-
-def _mat73(path: Path, e: Events) -> None:
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name in "xytp":
-            file[name] = getattr(e, name)[None]
-    with open(path, "r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
-
-
-def _gz(path: Path, e: Events) -> None:
-    with gzip.open(path, "wt") as file:
-        file.writelines(f"{t} {x} {y} {p}\n" for x, y, t, p in zip(e.x, e.y, e.t, e.p))
-
-
-def _bag(path: Path, e: Events) -> None:
-    from rosbags.rosbag1 import Writer
-
-    from blinkgl.io.ros import event_array, typestore
-
-    with Writer(path) as bag:
-        kind, data = event_array(e, HEIGHT, WIDTH)
-        bag.write(bag.add_connection("/events", kind, typestore=typestore(False)), 1, data)
-
-
-def _flow() -> tuple[np.ndarray, np.ndarray]:
-    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
-    return np.dstack([x * 0.25 - 3, y * 0.5 - 6]), (x + y) % 7 > 0
+    return Format(lambda path: make(path, fuzz_files.events()), read)
 
 
 def _sound(flow: np.ndarray, valid: np.ndarray) -> None:
     assert np.isfinite(flow[valid]).all(), "a valid flow that is not finite"
 
 
-def _picture() -> np.ndarray:
-    return np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-
-
 def _write_picture(path: Path) -> None:
     for file in (path, path.with_stem("1")):
         if path.suffix == ".pfm":
-            cv2.imwrite(str(file), _picture().astype(np.float32) / 255)
+            cv2.imwrite(str(file), fuzz_files.picture().astype(np.float32) / 255)
         else:
-            cv2.imwrite(str(file), _picture())
+            cv2.imwrite(str(file), fuzz_files.picture())
 
 
 def _read_frames(path: Path) -> None:
@@ -189,9 +113,53 @@ def _read_frames(path: Path) -> None:
     list(open_frames(path if path.suffix in (".npy", ".npz") else path.parent, Declared(fps=100.0)))
 
 
+def _text(text: str, read: Callable[[Path], object]) -> Format:
+    return Format(lambda path: path.write_text(text), read)
+
+
+def _poses(path: Path) -> None:
+    """At a rate where the file has no times: nothing is infinite."""
+    t_ns, T = read_trajectory(path, PoseFile(rate=10.0))
+    assert len(t_ns) == len(T) and np.isfinite(T).all(), "poses that are not finite"
+
+
+def _camera(path: Path) -> None:
+    for one in read_camchain(path).values():
+        assert np.isfinite(one.camera.project(np.array([[0.0, 0.0, 1.0]]))).all(), "a camera that sees nothing"
+
+
+def _below(path: Path) -> list[Path]:
+    return sorted(file for file in path.rglob("*") if file.is_file())
+
+
+def _exported(layout: str) -> Format:
+    """An export of a data set: what reads the published data set reads it."""
+
+    def make(path: Path) -> None:
+        with tempfile.TemporaryDirectory(prefix="blinkgl-fuzz-") as folder:
+            run_dataset(load_run(CONFIG, re.split(r" (?=[a-z]\w*[.=])", SMALL)), Path(folder) / "set")
+            export_layout(Path(folder) / "set", path, layout)
+
+    def read(path: Path) -> None:
+        refused: list[BlinkGLError] = []
+        for file in (*path.rglob("*.h5"), *path.rglob("*.hdf5")):
+            with collected(refused), open_events(file) as opened:
+                list(opened.sized().chunks())
+        with collected(refused):
+            _samples(path, path)
+        for file in path.rglob("cam_to_cam.yaml"):
+            with collected(refused):
+                _camera(file)
+        # Files of labels hold no events: a refusal counts where it is no single line.
+        for error in (error for error in refused if "\n" in str(error)):
+            raise error
+
+    return Format(make, read, _below)
+
+
 SMALL = (
     "camera.width=32 camera.height=24 time.duration=0.1 time.label_rate=20 output.sequences=1 preview.enabled=false "
-    "labels={flow: [forward, backward], depth: true, boxes: true, ids: true}"
+    "labels={flow: [forward, backward, 0.01], depth: true, boxes: true, ids: true}"
 )
 
 
@@ -200,7 +168,7 @@ def _set_of(layouts: tuple[str, ...], *changes: str) -> Format:
     exports = [partial(_laid_out, name=name) for name in layouts]
 
     def make(path: Path) -> None:
-        run_dataset(load_run(CONFIG, re.split(r" (?=\w+[.=])", SMALL) + list(changes)), path)
+        run_dataset(load_run(CONFIG, re.split(r" (?=[a-z]\w*[.=])", SMALL) + list(changes)), path)
 
     def files(path: Path) -> list[Path]:
         later = re.compile(r"(?!0+\.)\d+\.")  # of the numbered files of a folder, the first stands for all
@@ -267,24 +235,69 @@ _SET_READERS: tuple[Callable[[Path, Path], object], ...] = (
     _samples,
 )
 
+US = {"time_unit": "us"}
 FRAMES = Format(_write_picture, _read_frames)
 MESH = Format(lambda path: trimesh.creation.box().export(path), load_asset)
 FORMATS = {
     **{name: _events_as() for name in ("e.txt", "e.csv", "e.h5", "e.npz", "e.npy", "e.raw", "e.aedat4")},
-    "e.es": _events_as(_es),
-    "e.dat": _events_as(_dat),
-    "e.bin": _events_as(_bin),
-    "e.mat": _events_as(_mat),
-    "e73.mat": _events_as(_mat73),
-    "e.txt.gz": _events_as(_gz),
-    "e.bag": _events_as(_bag),
-    "rows.hdf5": _events_as(_rows),
-    "gzip.h5": _events_as(_h5({"compression": "gzip", "shuffle": True}, {"compression": "lzf"})),
-    "zstd.h5": _events_as(_h5(dict(hdf5plugin.Zstd()), dict(hdf5plugin.LZ4()), dict(hdf5plugin.Blosc()))),
-    "flow.png": Format(lambda path: write_flow(path, *_flow()), lambda path: _sound(*read_flow_png(path))),
-    "flow.flo": Format(lambda path: write_flow(path, *_flow()), lambda path: _sound(*read_flo(path))),
+    "e.es": _events_as(fuzz_files.es),
+    "e.dat": _events_as(fuzz_files.dat),
+    "e.bin": _events_as(fuzz_files.five_bytes),
+    "e.mat": _events_as(fuzz_files.mat, **US),
+    "e73.mat": _events_as(fuzz_files.mat73, **US),
+    "e.txt.gz": _events_as(fuzz_files.gz, columns="t,x,y,p", **US),
+    "e.bag": _events_as(fuzz_files.bag),
+    "rows.hdf5": _events_as(fuzz_files.rows),
+    "gzip.h5": _events_as(fuzz_files.h5({"compression": "gzip", "shuffle": True}, {"compression": "lzf"}), **US),
+    "zstd.h5": _events_as(
+        fuzz_files.h5(dict(hdf5plugin.Zstd()), dict(hdf5plugin.LZ4()), dict(hdf5plugin.Blosc())), **US
+    ),
+    "flow.png": Format(lambda path: write_flow(path, *fuzz_files.flow()), lambda path: _sound(*read_flow_png(path))),
+    "flow.flo": Format(lambda path: write_flow(path, *fuzz_files.flow()), lambda path: _sound(*read_flo(path))),
     **{f"0.{ending}": FRAMES for ending in ("png", "jpg", "tiff", "pfm", "hdr")},
-    "frames.npy": Format(lambda path: np.save(path, np.stack([_picture()] * 2)), _read_frames),
+    "frames.npy": Format(lambda path: np.save(path, np.stack([fuzz_files.picture()] * 2)), _read_frames),
+    "3.png": Format(fuzz_files.saved, lambda path: list(open_frames(path))),
+    **{f"0.{ending}": Format(fuzz_files.saved, read_any_image) for ending in ("webp", "jp2", "tga", "bmp", "avif")},
+    "0.exr": Format(fuzz_files.exr, read_any_image),
+    "a.gif": Format(fuzz_files.saved, lambda path: list(open_frames(path))),
+    "stack.tif": Format(fuzz_files.stack, lambda path: list(open_frames(path))),
+    "frames.npz": Format(
+        lambda path: np.savez_compressed(path, frames=np.stack([fuzz_files.picture()] * 3), t_us=np.arange(3)),
+        lambda path: list(open_frames(path)),
+    ),
+    **{
+        name: Format(fuzz_files.video(*kind), lambda path: list(open_frames(path)))
+        for name, kind in (
+            ("v.mp4", ("libx264", "yuv420p")),
+            ("v.mkv", ("ffv1", "gray")),
+            ("v.avi", ("mjpeg", "yuvj420p")),
+            ("v.webm", ("libvpx-vp9", "yuv420p")),
+            ("v.mov", ("png", "rgb24")),
+        )
+    },
+    "frame set": Format(fuzz_files.frame_set, lambda path: list(open_frames(path / "images")), _below),
+    "flow.flo5": Format(fuzz_files.spring, lambda path: _sound(*read_flow(path))),
+    "flow.npy": Format(lambda path: write_flow(path, *fuzz_files.flow()), lambda path: _sound(*read_flow(path))),
+    "tum.txt": _text(fuzz_files.POSES, _poses),
+    "euroc.csv": _text(fuzz_files.EUROC, _poses),
+    "kitti.txt": _text("".join(fuzz_files.KITTI.format(k) for k in range(9)), _poses),
+    "images.txt": _text(fuzz_files.COLMAP, _poses),
+    "transforms.json": _text(json.dumps(fuzz_files.NERF), _poses),
+    "stamps.txt": _text(fuzz_files.STAMPS, read_timestamps),
+    "camchain.yaml": _text(fuzz_files.KALIBR, _camera),
+    "opencv.yaml": _text(fuzz_files.OPENCV, _camera),
+    "cameras.txt": _text(
+        "1 OPENCV 640 480 500 500 320 240 -0.1 0.01 0 0\n2 PINHOLE 640 480 500 500 320 240\n", _camera
+    ),
+    "e.db3": Format(
+        lambda path: fuzz_files.bag2("SQLITE3")(path, fuzz_files.events()),
+        lambda path: open_events(path).read(),
+        _below,
+    ),
+    "e.mcap": Format(
+        lambda path: fuzz_files.bag2("MCAP")(path, fuzz_files.events()), lambda path: open_events(path).read(), _below
+    ),
+    **{f"export {layout}": _exported(layout) for layout in ("dsec", "blinkflow", "mvsec")},
     **{f"mesh.{ending}": MESH for ending in ("obj", "ply", "stl", "glb")},
     "camera": _set_of(("dsec", "blinkflow", "mvsec", "tapvid"), "tracks={points: 20}"),
     "exposures": _set_of(("dsec", "blinkflow"), "images={exposure_us: 5000}"),
@@ -361,14 +374,14 @@ def judge(read: Callable[[Path], object], path: Path) -> str:
     return READ
 
 
-def in_a_process(read: Callable[[Path], object], path: Path) -> str:
-    """:func:`judge` in a child that may die or hang."""
+def in_a_process(read: Callable[[Path], object], path: Path, longer: int = 1) -> str:
+    """:func:`judge` in a child that may die or hang.   longer : so many times the limits of time."""
     receiver, sender = FORK.Pipe(duplex=False)
     sys.stdout.flush()
-    child = FORK.Process(target=_answer, args=(sender, read, path))
+    child = FORK.Process(target=_answer, args=(sender, read, path, CPU_S * longer))
     child.start()
     sender.close()
-    answered, text = receiver.poll(WALL_S), ""
+    answered, text = receiver.poll(WALL_S * longer), ""
     with contextlib.suppress(EOFError):  # the child has died
         text = receiver.recv() if answered else ""
     if not answered:
@@ -380,14 +393,14 @@ def in_a_process(read: Callable[[Path], object], path: Path) -> str:
     return "hangs" if killed else f"the process ends with status {child.exitcode}"
 
 
-def _answer(sender: Connection, read: Callable[[Path], object], path: Path) -> None:
+def _answer(sender: Connection, read: Callable[[Path], object], path: Path, cpu_s: int) -> None:
     """Of the child: what is said of a file."""
-    _limit()
+    _limit(cpu_s)
     sender.send(judge(read, path)[:4000])
     os._exit(0)
 
 
-def _limit() -> None:
+def _limit(cpu_s: int) -> None:
     """Of the child: silence, and no more than so much time and memory."""
     faulthandler.disable()
     null = os.open(os.devnull, os.O_RDWR)
@@ -397,7 +410,7 @@ def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (size + (MEMORY_MB << 20),) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     used = resource.getrusage(resource.RUSAGE_SELF)
-    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + 1 + CPU_S, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + 1 + cpu_s, resource.RLIM_INFINITY))
 
 
 def fuzz(name: str, indices: range | list[int], seed: int, keep: Path | None) -> Counter:
@@ -425,6 +438,25 @@ def fuzz(name: str, indices: range | list[int], seed: int, keep: Path | None) ->
     return outcomes
 
 
+def configurations(indices: range | list[int], seed: int, keep: Path | None) -> Counter:
+    """Draw configurations and run each: how many were generated and verified, refused or, by what is wrong, neither."""
+    outcomes: Counter = Counter()
+    for index in indices:
+        with tempfile.TemporaryDirectory(prefix="blinkgl-fuzz-") as folder:
+            path = Path(folder) / "run.yaml"
+            path.write_bytes(fuzz_configurations.written(seed, index))
+            outcome = in_a_process(fuzz_configurations.check, path, 10)  # a kernel may have to be compiled
+            outcomes[outcome] += 1
+            if outcome not in (READ, REFUSED):
+                print(
+                    f"{outcome}\n    python -m blinkgl.tools.fuzz configurations --seed {seed} --only {index}",
+                    flush=True,
+                )
+                if keep is not None:
+                    keep.write_bytes(path.read_bytes())
+    return outcomes
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(FORMATS)}; default: all")
@@ -436,7 +468,10 @@ def main(arguments: list[str] | None = None) -> int:
     indices = range(options.mutants) if options.only is None else [options.only]
     defects = 0
     for name in options.names or FORMATS:
-        outcomes = fuzz(name, indices, options.seed, options.keep)
+        if name == "configurations":
+            outcomes = configurations(indices, options.seed, options.keep)
+        else:
+            outcomes = fuzz(name, indices, options.seed, options.keep)
         wrong = outcomes.total() - outcomes[READ] - outcomes[REFUSED]
         defects += wrong
         print(f"{name:14} {outcomes[READ]:5} read {outcomes[REFUSED]:5} refused {wrong:5} defects", flush=True)

@@ -16,6 +16,7 @@ from blinkgl.errors import ConfigError
 STEPS = 100
 """Largest number of a solver's steps; five or six are usual, halving brackets takes about sixty where the derivative
 vanishes."""
+_LARGEST = 1e6  # of a coefficient, as in YAML: powers of it are finite
 _GRID = 33  # grid points along each side of the picture at which the magnification is computed
 
 
@@ -82,8 +83,8 @@ class DistortedModel(CameraModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.coefficients:
-            if not math.isfinite(getattr(self, name)):
-                self._refuse(name, "not a coefficient", "a finite number")
+            if not abs(getattr(self, name)) <= _LARGEST:
+                self._refuse(name, "not a coefficient", f"a finite number, at most {_LARGEST:g}")
         sides = self._border
         blind = ~np.isfinite(self.rays(sides)).all(axis=-1)
         if blind.any():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
@@ -10,6 +9,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from blinkgl.errors import ConfigError
+
+_LARGEST_SIDE, _LARGEST = 65_536, 1e9
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,15 @@ class CameraModel(ABC):
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not (isinstance(value, (int, np.integer)) and value >= 1):
-                self._refuse(name, "not a size", "a whole number of px, 1 or more")
+            if not (isinstance(value, (int, np.integer)) and 1 <= value <= _LARGEST_SIDE):
+                self._refuse(name, "not a size", f"a whole number of px, 1 or more, at most {_LARGEST_SIDE}")
         for name in ("fx", "fy", "near"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                self._refuse(name, "not a length", "a finite number above 0")
+            if not 0 < value <= _LARGEST:
+                self._refuse(name, "not a length", f"a finite number above 0, at most {_LARGEST:g}")
         for name in ("cx", "cy"):
-            if not math.isfinite(getattr(self, name)):
-                self._refuse(name, "not a position", "a finite number of px")
+            if not abs(getattr(self, name)) <= _LARGEST:
+                self._refuse(name, "not a position", f"a finite number of px, at most {_LARGEST:g}")
 
     def _refuse(self, name: str, problem: str, accepted: str) -> None:
         raise ConfigError(problem, where=f"{type(self).__name__}.{name}", value=getattr(self, name), accepted=accepted)

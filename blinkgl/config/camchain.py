@@ -39,6 +39,7 @@ from blinkgl.config.base import placed
 from blinkgl.config.poses import rigid_matrix
 from blinkgl.config.reader import parse_yaml, read_text, to_yaml
 from blinkgl.errors import ConfigError
+from blinkgl.types.numbers import is_number
 
 _RIGID = 1e-4
 _NONE = ("none", "None", "", "no", "pinhole", "no_distortion", None)
@@ -180,10 +181,7 @@ def _colmap(text: str, where: str) -> dict[str, Calibrated]:
 
 
 def _number(text: str) -> Any:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+    return float(text) if is_number(text) else None
 
 
 def read_place_on_body(path: str | Path) -> np.ndarray:

@@ -19,7 +19,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import check_assets as check_scene, panorama_of
 from blinkgl.scene.importing.mesh_files import border_of, identity_of
 from blinkgl.scene.motion.dynamics import engine_version
-from blinkgl.scene.reading import resolve
+from blinkgl.scene.reading import contents, resolve
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below
 from blinkgl.scene.worlds.random_world import forget_pools, pools
@@ -114,7 +114,7 @@ def _note(hashes: dict[str, str], name: str, value: str) -> None:
 
 def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
     def file(path: Path, name: str) -> None:
-        data = path.read_bytes()
+        data = contents(path, "file")
         _note(hashes, without_places(name), content_hash(data))
         for beside, digest in identity_of(path, data, border_of(path, base)).files.items():
             _note(hashes, without_places((Path(name).parent / beside).as_posix()), digest)
@@ -130,7 +130,7 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
             for found in (
                 files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]
             ):
-                _note(hashes, f"{without_places(name)}/{found.name}", content_hash(found.read_bytes()))
+                _note(hashes, f"{without_places(name)}/{found.name}", content_hash(contents(found, "panorama")))
     tree = {} if isinstance(scene, RandomSceneConfig) else scene.model_dump()
     for used in dict.fromkeys([*_values(tree, "file"), *_values(tree, "T_body_sensor")]):
         if isinstance(used, str) and resolve(used, base).is_file():  # a mesh, a trajectory, a clip

@@ -133,10 +133,19 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         for form in label.forms:
             if form.file(k) in manifest["files"]:
                 name = label.shard.rpartition(".")[0]
-                yield f"{key}.{name}.{form.ending}", (folder / form.file(k)).read_bytes()
+                read = form if form.read is not None else label.forms[0]
+                value = label.read(folder / read.file(k), read, manifest["height"], manifest["width"])
+                # An archive may hold more than was read.
+                anew = form.encode is not None and (form is not read or form.ending == "npz")
+                yield (
+                    f"{key}.{name}.{form.ending}",
+                    form.encode(value) if anew else (folder / form.file(k)).read_bytes(),
+                )
     for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():
         ending = "camera.png" if picture == "images" else f"camera_{picture}.png"
-        yield f"{key}.{ending}", (folder / picture_file(picture, taken[0])).read_bytes()
+        path, image = folder / picture_file(picture, taken[0]), LABELS["images"]
+        image.read(path, image.forms[0], manifest["height"], manifest["width"])
+        yield f"{key}.{ending}", path.read_bytes()
 
 
 def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from blinkgl.dataset.messages import RUN_FOLDER
 from blinkgl.dataset.plan import sequence_name
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import AssetError
+from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS
 from blinkgl.io.frame_camera import files_of
 from blinkgl.io.imu import FILES as IMU_FILES
@@ -167,7 +168,7 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
         if manifest["format"] == "blinkgl-rig":
             problems = look_at_sensors(folder, name, manifest, config)
         else:
-            problems = look_at_camera(name, manifest, config)
+            problems = look_at_camera(folder, name, manifest, config)
         # Last: other findings say more than that something was edited.
         problems = problems or manifest_problems(folder)
         if not problems:
@@ -187,17 +188,34 @@ def look_at_sensors(folder: Path, name: str, manifest: dict[str, Any], config: S
         return problems
     names = [camera.name for camera in config.cameras()]
     for name in names:
-        inside = guarded(lambda name=name: look_at_camera(name, read_manifest(folder / name), config))
+        inside = guarded(lambda name=name: look_at_camera(folder / name, name, read_manifest(folder / name), config))
         problems += [f"{name}/{line}" for line in inside]
     return problems or unlike(manifest, [("events", sum(read_manifest(folder / name)["events"] for name in names))])
 
 
-def look_at_camera(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def look_at_camera(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
     """Return the problems of the folder of a camera, of a rig's if the configuration has several sensors."""
     for camera in config.cameras():
         if camera.name == (manifest.get("sensor") or ""):
-            return bound("." if camera.name else name, manifest, camera.config, camera.gives_events)
+            problems = bound("." if camera.name else name, manifest, camera.config, camera.gives_events)
+            return problems or (events_problems(folder, manifest) if camera.gives_events else [])
     return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
+
+
+def events_problems(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    """Return the problems of the events, all of which are read: storage, order, place, time, number. Raises AssetError,
+    EventDataError: the first of them that a reader refuses."""
+    start, duration = manifest["t_offset_us"], manifest.get("duration_us") or 0
+    with DsecEventReader(folder / "events.h5", size=(manifest["height"], manifest["width"])) as reader:
+        if reader.count != manifest["events"]:
+            return [f"events.h5: holds {reader.count} events, {MANIFEST} says {manifest['events']}"]
+        for events in reader.chunks():
+            if len(events) and not start <= events.t[0] <= events.t[-1] <= start + duration:
+                return [
+                    f"events.h5: events from {events.t[0]} to {events.t[-1]} µs; the sequence: {start} to "
+                    + str(start + duration)
+                ]
+    return []
 
 
 __all__ = ["Verification", "verify_dataset"]

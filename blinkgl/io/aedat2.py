@@ -222,7 +222,7 @@ def _read_header(path: Path) -> tuple[str, int]:
 
 
 def _scale(header: str, key: str, prefix: str, usual: float) -> float:
-    said = re.search(rf'key="{key}" value="{prefix}(\d+)"', header)
+    said = re.search(rf'key="{key}" value="{prefix}(\d{{1,9}})"', header)
     return float(said.group(1)) if said else usual
 
 

@@ -28,7 +28,7 @@ _CALLED = {"events": "events", "frame": "frames", "imus": "an inertial unit"}
 
 
 _STREAM = re.compile(
-    r'<node name="(\d+)" path="/outInfo/\d+/">(.*?)(?=<node name="\d+" path="/outInfo/\d+/">|</dv>|$)', re.S
+    r'<node name="(\d{1,9})" path="/outInfo/\d+/">(.*?)(?=<node name="\d+" path="/outInfo/\d+/">|</dv>|$)', re.S
 )
 _ATTRIBUTE = re.compile(r'<attr key="(\w+)" type="string">([^<]*)</attr>')
 

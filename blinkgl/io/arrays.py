@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import struct
-import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
@@ -20,6 +19,7 @@ from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.sizes import check_claim
 from blinkgl.io.tables import (
     Candidate,
     Table,
@@ -41,8 +41,6 @@ from blinkgl.types.events import Events
 _NUMBERS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 # miMATRIX and miCOMPRESSED; then classes of arrays, mxSTRUCT_CLASS, and mxDOUBLE_CLASS to mxUINT64_CLASS.
 _MATRIX, _COMPRESSED, _STRUCT, _ARRAYS = 14, 15, 2, range(6, 16)
-_MOST_BYTES, _MOST_RATIO = 1 << 26, 100
-"""A file may unpack to so many bytes, or to so many times its own: columns of events pack a tenth of that."""
 _DAMAGE = (ValueError, LookupError, RuntimeError, StopIteration, struct.error, zlib.error)
 
 
@@ -84,21 +82,10 @@ def _unpacked(data: memoryview, path: str | os.PathLike) -> Iterator[tuple[int, 
             head = packed.decompress(body, 8)
             size = struct.unpack_from("<I", head, 4)[0]
             total += size
-            _check_ratio(total, len(data), path)
+            check_claim(total, os.fspath(path), len(data))
             yield from _elements(memoryview(head + packed.decompress(packed.unconsumed_tail, size) if size else head))
         else:
             yield kind, body
-
-
-def _check_ratio(unpacked: int, packed: int, path: str | os.PathLike) -> None:
-    """Raise AssetError for a file that unpacks to far more than events do, before it is unpacked."""
-    if unpacked > max(_MOST_BYTES, _MOST_RATIO * packed):
-        raise AssetError(
-            f"unpacks to more than {_MOST_RATIO} times its size",
-            where=os.fspath(path),
-            value=f"{unpacked} bytes",
-            accepted="a file that is not packed",
-        )
 
 
 def _matrix(body: memoryview) -> tuple[str, Any]:
@@ -154,8 +141,7 @@ class ArrayReader(TableReader):
             if path.suffix.lower() == ".npy":
                 table = _table_of_npy(read_npy(path), str(path), reading)
             else:
-                with NpzReader(path) as archive, zipfile.ZipFile(path) as members:
-                    _check_ratio(sum(one.file_size for one in members.infolist()), path.stat().st_size, path)
+                with NpzReader(path) as archive:
                     shapes, skipped = archive.shapes()
                     candidates = _candidates(shapes, archive.__getitem__, str(path), reading, skipped)
                     table = choose(candidates, reading, str(path), archive.names)

@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 
 from blinkgl.errors import ConfigError
+from blinkgl.types.numbers import exact
 
 NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 """ns in each unit, by the name that ``--time-unit`` takes."""
@@ -41,12 +42,12 @@ def named_unit(heading: str) -> str | None:
     return _UNIT_OF.get(text) if len(text) > 1 else None
 
 
-def nanoseconds(values: Sequence[str] | np.ndarray, unit: str) -> list[int]:
+def nanoseconds(values: Sequence[str | Fraction] | np.ndarray, unit: str) -> list[int]:
     """Return times as whole ns, rounded to the nearest. Texts are converted exactly: a float64 of seconds since 1970
-    holds steps of 240 ns only."""
+    holds steps of 240 ns only. Raises ValueError: a text that is no number."""
     scale = NANOSECONDS[unit]
     if isinstance(values, np.ndarray):
         if values.dtype.kind in "iu":
             return [int(value) * scale for value in values]
         return [round(Fraction(float(value)) * scale) for value in values]
-    return [round(Fraction(value) * scale) for value in values]
+    return [round((exact(value) if isinstance(value, str) else value) * scale) for value in values]

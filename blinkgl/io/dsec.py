@@ -25,7 +25,6 @@ from blinkgl.io.columns import MAX_SIDE, CheckedWriter, check_events, check_size
 from blinkgl.io.hdf5 import (
     SHUFFLE,
     Blocks,
-    attribute,
     dataset,
     growing_dataset,
     hdf5_errors,
@@ -232,13 +231,6 @@ class DsecEventReader(Closing):
         self.path, self._checked = Path(path), size is not None
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            missing = [
-                k
-                for k in ("events/x", "events/y", "events/t", "events/p")
-                if not isinstance(self._file.get(k), h5py.Dataset)
-            ]
-            if missing:
-                raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
             self._columns = {
                 k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"
             }
@@ -268,7 +260,7 @@ class DsecEventReader(Closing):
 
     def _declared(self, name: str) -> int | None:
         """Return a root attribute with the sensor's size; None without."""
-        value = attribute(self._file, name, self.path)
+        value = self._file.attribute(name)
         if value is not None and (np.ndim(value) or np.asarray(value).dtype.kind not in "iu"):
             raise AssetError(f"attribute '{name}' is no integer", where=str(self.path), value=value)
         return None if value is None else int(value)
@@ -316,11 +308,10 @@ class DsecEventReader(Closing):
             return otherwise
         if ms < 0:
             return 0
-        with hdf5_errors(self.path):
-            if ms < len(table):
-                return int(table[ms])
-            # Past the table: the end for an upper bound; for a lower one the last entry is still a safe start.
-            return self.count if otherwise else (int(table[-1]) if len(table) else 0)
+        if ms < len(table):
+            return int(table[ms])
+        # Past the table: the end for an upper bound; for a lower one the last entry is still a safe start.
+        return self.count if otherwise else (int(table[-1]) if len(table) else 0)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """Yield all events in pieces of ``size``. Raises EventDataError as :meth:`slice` does, if the sensor's size was
@@ -333,9 +324,9 @@ class DsecEventReader(Closing):
             yield events
 
     def _read(self, start: int, stop: int) -> Events:
-        with hdf5_errors(self.path):
-            columns = {k: column[start:stop] for k, column in self._columns.items()}
-        return events_of(**columns, where=str(self.path), first=start, offset=self.t_offset_us)
+        columns = {k: column[start:stop] for k, column in self._columns.items()}
+        x, y, t, p = (columns[name] for name in "xytp")
+        return events_of(x, y, t, p, where=str(self.path), first=start, offset=self.t_offset_us)
 
     def close(self) -> None:
         self._file.close()

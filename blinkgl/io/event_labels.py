@@ -19,7 +19,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import whole
-from blinkgl.io.hdf5 import Blocks, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import Blocks, Data, dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
 from blinkgl.machine.closing import Closing, Finishing
 from blinkgl.types.events import TOLD, TRUTH, Cause, Events
 
@@ -99,7 +99,7 @@ class EventLabelsReader(Closing):
     def close(self) -> None:
         self._file.close()
 
-    def _column(self, name: str, kind: np.dtype, shape: tuple[int, ...]) -> h5py.Dataset:
+    def _column(self, name: str, kind: np.dtype, shape: tuple[int, ...]) -> Data:
         return dataset(self._file, name, self.path, shape=(None, *shape), kinds="f" if kind.kind == "f" else "iu")
 
     def read(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -107,8 +107,7 @@ class EventLabelsReader(Closing):
         their causes (N,) uint8, None where the file has none. Raises AssetError: damaged; EventDataError, naming the
         event: a value that these types cannot hold."""
         rows = slice(*slice(start, stop).indices(self.count)[:2])
-        with hdf5_errors(self.path):
-            read = {name: column[rows] for name, column in self._columns.items()}
+        read = {name: column[rows] for name, column in self._columns.items()}
         truth = np.empty(max(rows.stop - rows.start, 0), TRUTH)
         where = str(self.path)
         truth["instance"] = whole(read["instance"], "instance", np.uint16, 0, 65535, where, rows.start)

@@ -186,12 +186,10 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
 def read_flo5(path: str | os.PathLike) -> np.ndarray:
     """Return flow (H, W, 2) float32 of Spring's .flo5, every second row and column: it is of twice the images' size, in
     their px. Raises AssetError."""
-    from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
+    from blinkgl.io.hdf5 import dataset, open_hdf5
 
-    with open_hdf5(path) as file, hdf5_errors(path):
-        data = file["flow"]
-        if data.ndim != 3 or data.shape[2] != 2:
-            raise AssetError("not a flow field", where=str(path), value=data.shape, accepted="(2 H, 2 W, 2)")
+    with open_hdf5(Path(path)) as file:
+        data = dataset(file, "flow", Path(path), shape=(None, None, 2), kinds="f")
         return np.ascontiguousarray(data[::2, ::2], np.float32)
 
 

@@ -349,10 +349,10 @@ def _kind(path: Path, reading: EventReading) -> str:
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
     if ending in HDF5:
-        from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
+        from blinkgl.io.hdf5 import open_hdf5
         from blinkgl.io.hdf5_tables import is_dsec
 
-        with open_hdf5(path) as file, hdf5_errors(path):
+        with open_hdf5(path) as file:
             return "dsec" if is_dsec(file, reading) else "hdf5"
     with open(path, "rb") as file:
         begin = file.read(16)

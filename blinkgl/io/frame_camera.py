@@ -13,15 +13,15 @@ import contextlib
 import csv
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
-import numpy as np
 from pydantic import ValidationError
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.reader import read_yaml
 from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.types.numbers import exact
 
 FOLDER = "frame_camera"
 STAMPS = f"{FOLDER}/images/timestamps.txt"
@@ -96,13 +96,9 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
             first, *rows = csv.reader(file)
         if first != heading or any(len(row) != len(heading) for row in rows):
             raise ValueError("not the columns " + ", ".join(heading))
-        lines = [
-            ExposureLine(float(start), float(end), float(exposure), float(row_us), float(gain_db), int(instants))
-            for start, end, exposure, row_us, gain_db, instants in rows
-        ]
-        if not np.isfinite([astuple(line) for line in lines]).all():
-            raise ValueError("a number that is not finite")
-        return lines
+        numbers = [[float(exact(field)) for field in row] for row in rows]
+        return [ExposureLine(a, b, each, row_us, gain, int(row[-1]))
+                for row, (a, b, each, row_us, gain, _) in zip(rows, numbers)]  # fmt: skip
     except FileNotFoundError:
         raise AssetError(
             "the sequence has no frame camera", where=str(path), accepted="a sequence made with images:"

@@ -69,7 +69,7 @@ class Declared:
     def __post_init__(self) -> None:
         if self.damaged not in ("refuse", "keep"):
             raise ConfigError("cannot read --damaged", where="--damaged", value=self.damaged, accepted="refuse or keep")
-        if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
+        if self.fps is not None and not 1e-6 <= self.fps <= 1e9:
             raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
         if self.time_unit != "frames":
             checked_unit(self.time_unit)
@@ -147,6 +147,13 @@ class FrameSource:
                     where=f"{self.path}: frame {count} ({name})",
                     value=f"{t_ns / 1e9:.9g} s",
                     accepted=f"more than {last / 1e9:.9g} s, or --fps instead of the stamps",
+                )
+            if abs(t_ns) >= 2**62:
+                raise EventDataError(
+                    "time beyond 2^62 ns",
+                    where=f"{self.path}: frame {count} ({name})",
+                    value=t_ns,
+                    accepted="another --time-unit",
                 )
             last = t_ns
             first = t_ns if first is None else first

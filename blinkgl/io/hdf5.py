@@ -10,17 +10,21 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import itertools
 import math
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.sizes import check_claim
+from blinkgl.machine.closing import Closing
 
 _MAX_CHUNK_BYTES = 1 << 28
 """HDF5 unpacks a whole chunk, even for a small part of it."""
@@ -35,7 +39,7 @@ _BLOSC_VALUES = 4
 _FILTERS = {1: "gzip", 2: "shuffle", 3: "Fletcher32", 32000: "lzf", 32001: "Blosc", 32004: "LZ4", 32015: "zstd"}
 """Filters that are run on files of strangers. Others that HDF5 or hdf5plugin know (szip, SZ, ZFP …) end the process on
 a damaged chunk."""
-_SUM, _SUM_BYTES = 3, 4
+_SHUFFLE, _SUM, _SUM_BYTES = 2, 3, 4
 """Fletcher32 ends the process on chunks shorter than its sum, so it has to be the last filter: their sizes show it."""
 _BLOSC, _PLUGGED = 32001, frozenset((32001, 32004, 32015))
 """Blosc, and all filters that hdf5plugin brings."""
@@ -43,8 +47,103 @@ _ECF = 0x8ECF
 """Prophesee's filter."""
 
 
-def open_hdf5(path: Path) -> h5py.File:
-    """Open a file for reading. Raises AssetError with the likely cause, also for a file that refers to other files."""
+class _Held:
+    """What a name in a file leads to, with the file's path for messages."""
+
+    def __init__(self, held: h5py.HLObject, path: Path):
+        self._held, self._path = held, path
+
+    def attribute(self, name: str) -> Any:
+        """Return an attribute, numbers or text; None where there is none.
+
+        Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type
+        that is taken for one ends the process."""
+        if name not in self._held.attrs:
+            return None
+        kind = h5py.h5a.open(self._held.id, name.encode()).get_type().get_class()
+        if kind not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING):
+            raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(self._path))
+        return self._held.attrs[name]
+
+
+class Data(_Held):
+    """A data set of a file that anybody may have written. What it says of itself is there at once; a value is decoded
+    only after its storage was checked.
+
+    name : its place in the file.   shape : None for one without values.   dtype : NumPy's."""
+
+    def __init__(self, data: h5py.Dataset, path: Path):
+        super().__init__(data, path)
+        self.name, self.shape, self.dtype, self._checked = data.name.strip("/"), data.shape, data.dtype, False
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, place: Any) -> np.ndarray:
+        """Return the values at ``place``, integers and slices. Raises AssetError: as :meth:`check`; more than fits into
+        memory; damaged."""
+        self.check()
+        with hdf5_errors(self._path):
+            count, parts = self.dtype.itemsize, place if isinstance(place, tuple) else (place,)
+            for size, part in itertools.zip_longest(self.shape, parts[: len(self.shape)], fillvalue=slice(None)):
+                count *= len(range(*part.indices(size))) if isinstance(part, slice) else 1
+            check_claim(
+                count,
+                f"{self._path}: '{self.name}'",
+                self._held.id.get_storage_size() if self._held.chunks else None,
+            )
+            return self._held[place]
+
+    def check(self) -> None:
+        """Check how it is stored, once. Raises AssetError: a type, a filter that is not run, values that were never
+        written, huge chunks, chunks that unpack to more than their values."""
+        if not self._checked:
+            with hdf5_errors(self._path):
+                _check_storage(self._held, f"dataset '{self.name}'", self._path)
+            self._checked = True
+
+
+class Group(_Held):
+    """A group of such a file: the names in it, and what they lead to, :class:`Data` or groups."""
+
+    def __contains__(self, name: str) -> bool:
+        return self.get(name) is not None
+
+    def get(self, name: str) -> Data | Group | None:
+        """Return what a name, or names with ``/`` between them, leads to; None: nothing, or a type alone."""
+        with hdf5_errors(self._path):
+            kinds = {h5py.Dataset: Data, h5py.Group: Group}
+            held = self._held.get(name)
+            return kinds[type(held)](held, self._path) if type(held) in kinds else None
+
+    def data(self) -> dict[str, Data]:
+        """Return the data sets of this group by name, those of groups in it not."""
+        held = {name: self.get(name) for name in self.names()}
+        return {name: data for name, data in held.items() if isinstance(data, Data)}
+
+    def names(self) -> list[str]:
+        """Return the names in this group."""
+        return list(self._held)
+
+    def groups(self) -> dict[str, Group]:
+        """Return this group, as "", and all groups below it by their names, with ``/`` between them."""
+        below: dict[str, Group] = {"": self}
+        self._held.visititems(
+            lambda name, held: below.update({name: Group(held, self._path)}) if isinstance(held, h5py.Group) else None
+        )
+        return below
+
+
+class Hdf5File(Group, Closing):
+    """A file that is open for reading: its first group. Use as a context manager."""
+
+    def close(self) -> None:
+        self._held.close()
+
+
+def open_hdf5(path: Path) -> Hdf5File:
+    """Open a file for reading: the only door to HDF5, behind which nothing is decoded unchecked. Raises AssetError with
+    the likely cause, also for a file that refers to other files."""
     path = Path(path)
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
@@ -71,7 +170,7 @@ def open_hdf5(path: Path) -> h5py.File:
                     where=str(path),
                     accepted="a file that holds its own data",
                 )
-    return file
+    return Hdf5File(file, path)
 
 
 def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
@@ -95,7 +194,7 @@ def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
 
 
 @contextlib.contextmanager
-def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
+def hdf5_errors(path: Path, file: h5py.File | Hdf5File | None = None) -> Iterator[None]:
     """Convert h5py's errors for invalid bytes to AssetError; ``file`` is closed on any exception."""
     try:
         yield
@@ -115,92 +214,112 @@ def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
         raise
 
 
-def dataset(
-    file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu"
-) -> h5py.Dataset:
+def dataset(file: Group, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu") -> Data:
     """Return the data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b"
     bools) as requested, and as many values stored as declared.
 
     Raises AssetError: none of that name (or a group), another shape or type, values that were never written, huge
     chunks."""
-    found = file.get(name)
-    if not isinstance(found, h5py.Dataset):
+    data = file.get(name)
+    if not isinstance(data, Data):
         raise AssetError(f"no dataset '{name}'", where=str(path))
     fits = (
-        found.shape is not None
-        and len(found.shape) == len(shape)
-        and all(b in (None, a) for a, b in zip(found.shape, shape))
+        data.shape is not None
+        and len(data.shape) == len(shape)
+        and all(b in (None, a) for a, b in zip(data.shape, shape))
     )
-    if not fits or found.dtype.kind not in kinds or found.dtype.shape:
+    if not fits or data.dtype.kind not in kinds or data.dtype.shape:
         wanted = {"iu": "integers", "iub": "integers", "f": "floats"}.get(kinds, "numbers")
         raise AssetError(
             f"dataset '{name}' has the wrong shape or type",
             where=str(path),
-            value=f"{found.dtype} {found.shape}",
+            value=f"{data.dtype} {data.shape}",
             accepted=f"{wanted} ({', '.join('N' if n is None else str(n) for n in shape)})",
         )
-    check_storage(found, name, path)
-    return found
+    data.check()
+    return data
 
 
-def check_storage(found: h5py.Dataset, name: str, path: Path) -> None:
-    """Check how a data set is stored before a value of it is read. Raises AssetError: a filter that is not run, values
-    that were never written, huge chunks, a filter without its parameters."""
-    layout = found.id.get_create_plist()
-    count = layout.get_nfilters()
-    summed = [k for k in range(count) if layout.get_filter(k)[0] == _SUM]
-    if summed and (summed != [count - 1] or _shortest_chunk(found) <= _SUM_BYTES):
-        raise AssetError(
-            f"dataset '{name}' is packed by an HDF5 filter that is not run here",
-            where=str(path),
-            value="Fletcher32 within others, or over less than its sum",
-            accepted=f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
-        )
-    for code, _, values, called in (layout.get_filter(k) for k in range(count)):
-        if code not in _FILTERS:
-            raise AssetError(
-                f"dataset '{name}' is packed by an HDF5 filter that is not run here",
-                where=str(path),
-                value=f"{code} {called.decode(errors='replace')}".strip(),
-                accepted="the camera's .raw"
-                if code == _ECF
-                else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)",
-            )
-        if code == _BLOSC and len(values) < _BLOSC_VALUES:
-            raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks data that Blosc needs", where=str(path))
-    if found.chunks is None:
-        # Compact data lie in the object's header and are always whole.
-        whole = layout.get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
-    else:
-        if math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
-            raise AssetError(
-                f"dataset '{name}' has chunks that are too large",
-                where=str(path),
-                value=found.chunks,
-                accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each",
-            )
-        # The number of chunks along each axis is the quotient, rounded up.
-        whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
-    if not whole:
-        raise AssetError(f"dataset '{name}' declares {found.size} values, but stores fewer", where=str(path))
+def _check_storage(data: h5py.Dataset, name: str, path: Path) -> None:
+    """Check how a data set is stored before a value of it is read. Raises AssetError as :meth:`Data.check`."""
+    layout = data.id.get_create_plist()
+    filters = [layout.get_filter(k) for k in range(layout.get_nfilters())]
+    codes = [code for code, *_ in filters]
+    packing = [code for code in codes if code not in (_SHUFFLE, _SUM)]
+    others = [f"{f[0]} {f[3].decode(errors='replace')}".strip() for f in filters if f[0] not in _FILTERS]
+    bare = [code for code, _, values, _ in filters if code == _BLOSC and len(values) < _BLOSC_VALUES]
+    raw = math.prod(data.chunks or ()) * data.dtype.itemsize
+    # The place and the stored size of each chunk, of which only these filters tell something.
+    chunks: list[tuple[int, int, int]] = []
+    if data.chunks and {_SUM, *_CLAIMED} & {*codes}:
+        data.id.chunk_iter(lambda c: chunks.append((c.byte_offset, c.size, c.filter_mask)))
+    if _SUM in codes and (codes[-1] != _SUM or any(size <= _SUM_BYTES for _, size, _ in chunks)):
+        others = ["Fletcher32 within others, or over less than its sum"]
+    # The number of chunks along each axis is the quotient, rounded up; compact data lie in the object's header.
+    missing = (
+        data.id.get_num_chunks() < math.prod(-(-n // c) for n, c in zip(data.shape, data.chunks))
+        if data.chunks
+        else layout.get_layout() != h5py.h5d.COMPACT and data.id.get_storage_size() < data.nbytes
+    )
+    packs = "the camera's .raw" if _ECF in codes else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)"
+    problems: list[tuple[Any, str, Any, str]] = [
+        (not _plain(data.dtype), f"{name} holds neither numbers nor text", str(data.dtype), "numbers or text"),
+        (others, f"{name} is packed by an HDF5 filter that is not run here", ", ".join(others), packs),
+        (bare, f"damaged HDF5 file: {name} lacks data that Blosc needs", bare, "its parameters"),
+        (packing[1:], f"{name} is packed twice", packing, "one filter that packs"),
+        (
+            raw > _MAX_CHUNK_BYTES,
+            f"{name} has chunks that are too large",
+            data.chunks,
+            f"{_MAX_CHUNK_BYTES} bytes",
+        ),
+        (missing, f"{name} declares {data.size} values, but stores fewer", data.id.get_storage_size(), "all of them"),
+    ]
+    for _, problem, value, accepted in (row for row in problems if row[0]):
+        raise AssetError(problem, where=str(path), value=value, accepted=accepted)
+    # HDF5 unpacks as much as a chunk itself states; Blosc ends at 2 GB, lzf at 88 times.
+    if packing and packing[0] in _CLAIMED:
+        with open(path, "rb") as file:
+            # Bits of the mask are the filters that were left out for a chunk.
+            for offset, size, mask in chunks:
+                file.seek(offset)
+                unpacked = 0 if mask >> codes.index(packing[0]) & 1 else _CLAIMED[packing[0]](file, size, raw)
+                if max(unpacked, size - raw // 128 - 64) > raw + _SUM_BYTES:
+                    problem = f"damaged HDF5 file: a chunk of {name} unpacks to more than its values"
+                    raise AssetError(problem, where=str(path), value=f"{size} bytes", accepted=f"{raw} bytes of values")
 
 
-def _shortest_chunk(found: h5py.Dataset) -> int:
-    sizes = (found.id.get_chunk_info(k).size for k in range(found.id.get_num_chunks()))
-    return min(sizes, default=_SUM_BYTES + 1)
+def _inflated(file: BinaryIO, size: int, raw: int) -> int:
+    """Return how many bytes a chunk of gzip unpacks to, at most one too many; 0 where its size cannot make a gigabyte,
+    of 1,032 a byte, or where reading says what is wrong."""
+    with contextlib.suppress(zlib.error):
+        if 1032 * size > 1 << 30:
+            return len(zlib.decompressobj().decompress(file.read(size), raw + _SUM_BYTES + 1))
+    return 0
 
 
-def attribute(file: h5py.HLObject, name: str, path: Path) -> Any:
-    """Return the attribute ``name`` of a file or an object in it, numbers or text; None where there is none.
+def _zstd_claim(file: BinaryIO, *_: int) -> int:
+    """Return the size of the content that a frame states, 0: none, which the filter refuses. (RFC 8878, 3.1.1.1)"""
+    head = file.read(18).ljust(18, b"\0")
+    flags, single = head[4], head[4] >> 5 & 1
+    # The size follows the window's byte, which a single segment lacks, and the number of a dictionary.
+    start, length = 6 - single + (0, 1, 2, 4)[flags & 3], (single, 2, 4, 8)[flags >> 6]
+    return int.from_bytes(head[start : start + length], "little") + (256 if length == 2 else 0)
 
-    Raises AssetError: of another type. h5py reads lists of any length without checking the file, and a damaged type
-    that is taken for one ends the process."""
-    if name not in file.attrs:
-        return None
-    kind = h5py.h5a.open(file.id, name.encode()).get_type().get_class()
-    if kind not in (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING):
-        raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(path))
-    return file.attrs[name]
+
+# Filters -> what a chunk unpacks to: of the file, which is at its beginning, its size, and that of its values.
+_CLAIMED: dict[int, Callable[[BinaryIO, int, int], int]] = {
+    1: _inflated,
+    32004: lambda file, *_: int.from_bytes(file.read(8), "big"),
+    32015: _zstd_claim,
+}
+
+
+def _plain(dtype: np.dtype) -> bool:
+    """Return whether a type is of numbers, of text, or a record of these: nothing that leads to other objects."""
+    if dtype.names is not None:
+        return all(_plain(dtype[name]) for name in dtype.names)
+    return dtype.base.kind in "iufbS" or h5py.check_string_dtype(dtype) is not None
 
 
 def growing_dataset(

@@ -7,17 +7,17 @@ such as MVSEC's ``davis/left/events``, or an array of records. ``t_offset`` and 
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.hdf5 import attribute, check_storage, hdf5_errors, open_hdf5
+from blinkgl.io.hdf5 import Data, Group, Hdf5File, hdf5_errors, open_hdf5
 from blinkgl.io.mvsec import EVENTS
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import (
@@ -30,7 +30,6 @@ from blinkgl.io.tables import (
     table_of_records,
     table_of_rows,
 )
-from blinkgl.types.events import Events
 
 _MILLISECONDS = ("ms_to_idx", "ms_map_idx")
 """Tables of milliseconds beside integer times, as DSEC, BlinkFlow, TUM-VIE and M3ED have them: these are µs."""
@@ -54,27 +53,20 @@ class Hdf5TableReader(TableReader):
             every = [*found[0], *found[1]]
             # A name may mean any of them; a number counts those that the refusal lists.
             candidates = every if reading.stream in dict(every) else found[0] or called or found[1]
-            table = choose(candidates, reading, str(path), self._file)
+            table = choose(candidates, reading, str(path), self._file.names())
             super().__init__(self.path, reading, table)
         self.version = "mvsec" if table.place in EVENTS else "hdf5"
-
-    def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
-        """Yield all events in pieces of ``size``."""
-        with hdf5_errors(self.path):
-            yield from super().chunks(size)
 
     def close(self) -> None:
         self._file.close()
 
 
-def _candidates(file: h5py.File, path: Path, reading: EventReading) -> tuple[list[Candidate], list[Candidate]]:
+def _candidates(file: Hdf5File, path: Path, reading: EventReading) -> tuple[list[Candidate], list[Candidate]]:
     """Return the tables of events, in the order of the groups' names, ``events`` and the root first: columns and fields
     with names, and arrays of four columns, which may be anything."""
-    groups, named, plain = [""], [], []
-    file.visititems(lambda name, found: groups.append(name) if isinstance(found, h5py.Group) else None)
-    for name in sorted(groups, key=lambda name: (name != "events", name != "", name)):
-        group = file[name] if name else file
-        held = {key: group[key] for key in group if isinstance(group[key], h5py.Dataset)}
+    named, plain = [], []
+    for name, group in sorted(file.groups().items(), key=lambda one: (one[0] != "events", one[0] != "", one[0])):
+        held = group.data()
         columns = named_columns(held, reading, f"{path}: '{name}'")
         if set("txyp") <= set(columns):
             chosen_ = {slot: held[key] for slot, key in columns.items()}
@@ -94,17 +86,17 @@ def _candidates(file: h5py.File, path: Path, reading: EventReading) -> tuple[lis
     return named, plain
 
 
-def _of_records(file: h5py.File, group: Any, data: h5py.Dataset, fields: dict[str, str], path: Path) -> Table:
-    place = data.name.strip("/")
-    check_storage(data, place, path)
-    geometry = "geometry" in data.attrs or "geometry" in file.attrs
-    layout = {"unit": "us", "layout": "Metavision's records of events: µs"} if place == "CD/events" or geometry else {}
-    return table_of_records(data, fields, place=place, size=_size(file, group, path), **layout)
+def _of_records(file: Hdf5File, group: Any, data: Data, fields: dict[str, str], path: Path) -> Table:
+    data.check()
+    geometry = any(holder.attribute("geometry") is not None for holder in (data, file))
+    known = data.name == "CD/events" or geometry
+    layout = {"unit": "us", "layout": "Metavision's records of events: µs"} if known else {}
+    return table_of_records(data, fields, place=data.name, size=_size(file, group, path), **layout)
 
 
-def _of_rows(file: h5py.File, group: Any, data: h5py.Dataset, reading: EventReading, path: Path) -> Table:
-    place = data.name.strip("/")
-    check_storage(data, place, path)
+def _of_rows(file: Hdf5File, group: Any, data: Data, reading: EventReading, path: Path) -> Table:
+    data.check()
+    place = data.name
     if place in EVENTS:
         # MVSEC's columns, in seconds, of its sensor of 346x260 px.
         return table_of_rows(
@@ -114,22 +106,21 @@ def _of_rows(file: h5py.File, group: Any, data: h5py.Dataset, reading: EventRead
 
 
 def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, path: Path) -> Table:
-    if isinstance(group.get("cause"), h5py.Dataset):
-        columns["cause"] = group["cause"]
+    if isinstance(cause := group.get("cause"), Data):
+        columns["cause"] = cause
     for data in columns.values():
         if data.dtype.shape or data.dtype.kind not in "iufb":
             raise AssetError(
                 f"dataset '{data.name}' holds no column of numbers", where=str(path), value=f"{data.dtype} {data.shape}"
             )
-        check_storage(data, data.name, path)
-    units = next((attribute(columns["t"], key, path) for key in ("unit", "units") if key in columns["t"].attrs), None)
-    place = columns["t"].parent.name.strip("/")
+        data.check()
+    units = next((u for key in ("unit", "units") if (u := columns["t"].attribute(key)) is not None), None)
+    place = columns["t"].name.rpartition("/")[0]
     layout: dict[str, Any] = {}
     if any(key in holder for key in _MILLISECONDS for holder in (file, group)) and columns["t"].dtype.kind in "iu":
         layout = {"unit": "us"}
     elif place == "events" and all(
-        name in group and isinstance(group[name], h5py.Dataset) and group[name].dtype.kind in kinds
-        for name, kinds in _EVENT_UTILS.items()
+        isinstance(data := group.get(name), Data) and data.dtype.kind in kinds for name, kinds in _EVENT_UTILS.items()
     ):
         layout = {"unit": "s", "layout": "event_utils' group of events: seconds"}
     return table_of_columns(
@@ -146,10 +137,9 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
 def _value(holder: Any, name: str, path: Path) -> np.ndarray | None:
     """Return the few numbers or the text under a name, a data set or an attribute; None: there is none."""
     data = holder.get(name)
-    if not isinstance(data, h5py.Dataset):
-        return None if (found := attribute(holder, name, path)) is None else np.asarray(found)
-    check_storage(data, name, path)
-    return np.asarray(data[()] if 0 <= (data.size or 0) <= _FEW else data.shape[:1])
+    if not isinstance(data, Data):
+        return None if (value := holder.attribute(name)) is None else np.asarray(value)
+    return np.asarray(data[()] if math.prod(data.shape or (0,)) <= _FEW else data.shape[:1])
 
 
 _FEW = 16
@@ -163,13 +153,13 @@ def _number(holder: Any, name: str, path: Path) -> Any:
     return None if value is None else value.ravel()[0].item()
 
 
-def _size(file: h5py.File, group: Any, path: Path) -> tuple[int, int] | None:
+def _size(file: Hdf5File, group: Any, path: Path) -> tuple[int, int] | None:
     """Return the (height, width) that a file states, in any of the known ways. Raises AssetError: it is none."""
     for holder in (group, file):
         height, width = (_number(holder, side, path) for side in ("height", "width"))
         if isinstance(height, int) and isinstance(width, int):
             return height, width
-    places = (holder for holder in (group, group.get("calib"), file) if isinstance(holder, h5py.Group))
+    places = (holder for holder in (group, group.get("calib"), file) if isinstance(holder, Group))
     for holder, name in itertools.product(places, _SIZES):
         if (value := _value(holder, name, path)) is None:
             continue
@@ -183,13 +173,13 @@ def _size(file: h5py.File, group: Any, path: Path) -> tuple[int, int] | None:
     return None
 
 
-def is_dsec(file: h5py.File, reading: EventReading) -> bool:
+def is_dsec(file: Hdf5File, reading: EventReading) -> bool:
     """Return whether a file has DSEC's or BlinkFlow's columns, which the slicing reader reads, and nothing is declared
     that only tables know."""
     columns: Mapping[str, Any] = {slot: file.get(f"events/{slot}") for slot in "xytp"}
     offset = file.get("t_offset")
     return (
-        all(isinstance(data, h5py.Dataset) and data.dtype.kind in "iub" for data in columns.values())
+        all(isinstance(data, Data) and data.dtype.kind in "iub" for data in columns.values())
         and columns["p"].dtype.kind in "ub"
         and "ms_to_idx" in file
         and (offset is None or getattr(offset, "shape", None) == ())

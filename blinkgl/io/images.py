@@ -21,6 +21,7 @@ from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.records import decoding, input_errors
+from blinkgl.io.sizes import check_claim, most_unpacked
 from blinkgl.machine.closing import Closing
 from blinkgl.srgb import to_srgb8
 
@@ -131,11 +132,11 @@ def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 class NpzReader(Closing):
     """The arrays of an .npz by name; each is read when requested. Never unpickles. Use as a context manager.
 
-    Raises (inside :func:`numpy_errors`) AssetError: an entry that is not a plain array of numbers, or that would not
-    fit into half of this machine's memory: a small archive can unpack to any size."""
+    Raises (inside :func:`numpy_errors`) AssetError: an entry that is not a plain array of numbers; arrays that unpack
+    to more than :func:`~blinkgl.io.sizes.check_claim` allows."""
 
     def __init__(self, path: str | os.PathLike):
-        self.path, self._archive = path, zipfile.ZipFile(path)
+        self.path, self._archive, self._unpacked = path, zipfile.ZipFile(path), 0
         self.names = [n.removesuffix(".npy") for n in self._archive.namelist()]
 
     def close(self) -> None:
@@ -164,13 +165,9 @@ class NpzReader(Closing):
         if f"{name}.npy" not in self._archive.namelist():
             raise AssetError("no such array" if name not in self.names else "is no array", where=where)
         size = self._archive.getinfo(f"{name}.npy").file_size
-        if size > memory_limit():
-            raise AssetError(
-                "array too large for this machine's memory",
-                where=where,
-                value=f"{size / 1e9:.1f} GB",
-                accepted=f"at most {memory_limit() / 1e9:.1f} GB",
-            )
+        # All arrays count: a small archive may hold many that are as large as is allowed.
+        self._unpacked += size
+        check_claim(self._unpacked, where, os.path.getsize(self.path))
         with self._archive.open(f"{name}.npy") as member:
             npy_header(member, size, where)
         with self._archive.open(f"{name}.npy") as member:
@@ -188,26 +185,24 @@ def checked_arrays(
     sizes: dict[str, int] = {}
     with numpy_errors(path), NpzReader(path) as file:
         wanted = {**shapes, **(optional or {})} if any(name in file for name in optional or ()) else shapes
+        stated, _ = file.shapes()
+        for name, (axes, kinds) in wanted.items():
+            shape, (length, dtype) = (), stated.get(name, ((), np.dtype("V")))
+            for axis, side in zip(axes, length):
+                shape += (int(axis) if axis.isdigit() else sizes.setdefault(axis, side),)
+            if name in stated and (len(length) != len(axes) or length != shape or dtype.kind not in kinds):
+                raise AssetError(
+                    f"'{name}' has the wrong shape or type",
+                    where=str(path),
+                    value=f"{dtype} {length}",
+                    accepted=f"({', '.join(axes)})" + "".join(f", {k} = {n}" for k, n in sizes.items()),
+                )
+        # Headers alone were read so far.
         arrays = {name: file[name] for name in wanted}
-    for name, (axes, kinds) in wanted.items():
-        shape, array = (), arrays[name]
-        for axis, length in zip(axes, array.shape):
-            shape += (int(axis) if axis.isdigit() else sizes.setdefault(axis, length),)
-        if array.ndim != len(axes) or array.shape != shape or array.dtype.kind not in kinds:
-            raise AssetError(
-                f"'{name}' has the wrong shape or type",
-                where=str(path),
-                value=f"{array.dtype} {array.shape}",
-                accepted=f"({', '.join(axes)})" + "".join(f", {k} = {n}" for k, n in sizes.items()),
-            )
+    for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise AssetError(f"'{name}' holds NaN or infinity", where=str(path))
     return arrays
-
-
-def memory_limit() -> int:
-    """Return the bytes that one file may use: half of the machine's memory."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
 def numpy_errors(path: str | os.PathLike) -> AbstractContextManager[None]:
@@ -287,7 +282,9 @@ def _image_problem(data: bytes) -> str | None:
                     size = opened.size
         except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged: its plug-ins raise anything; OpenCV decides
             return "cannot decode image (corrupt or truncated)" if not len(data) else None
-    return size_problem(*size) if size else "cannot decode image (no size in its header)"
+    if not size:
+        return "cannot decode image (no size in its header)"
+    return size_problem(*size, len(data), 12 if data[:2] == b"#?" else 4)
 
 
 def png_problem(data: bytes) -> str | None:
@@ -300,7 +297,9 @@ def png_problem(data: bytes) -> str | None:
         if zlib.crc32(kind + body).to_bytes(4, "big") != data[at + 8 + len(body) : at + 12 + len(body)]:
             break
         if kind == b"IEND":
-            return size_problem(*struct.unpack_from(">II", data, 16))
+            # Bit depth and colour type follow width and height; a type counts its channels by its bits.
+            width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
+            return size_problem(width, height, len(data), -(-bits // 8) * {2: 3, 4: 2, 6: 4}.get(colour, 1))
         at += 12 + len(body)
     return f"cannot decode image (corrupt or truncated at byte {at})"
 
@@ -315,10 +314,11 @@ def png_chunks(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
         at += 12 + length
 
 
-def size_problem(width: int, height: int) -> str | None:
-    """Return why an image of this size is not read, or None."""
-    return (
-        None
-        if 0 < width * height <= _MAX_PIXELS
-        else f"image of {width}x{height} px is too large (at most {_MAX_PIXELS >> 20} Mpx)"
+def size_problem(width: int, height: int, packed: int, depth: int = 4) -> str | None:
+    """Return why an image of this size, in so many bytes, is not read, or None.   depth : bytes of a pixel."""
+    most = min(_MAX_PIXELS, most_unpacked(packed) // depth)
+    if 0 < width * height <= most:
+        return None
+    return f"image of {width}x{height} px is too large (at most {most >> 20} Mpx" + (
+        f" in {packed} bytes)" if most < _MAX_PIXELS else ")"
     )

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.io.hdf5 import dataset, growing_dataset, hdf5_errors, open_hdf5, write_rows
+from blinkgl.io.hdf5 import dataset, growing_dataset, open_hdf5, write_rows
 
 SHAPES: dict[str, tuple[tuple[int | None, ...], str]] = {
     "flow": ((None, None, None, 2), "f"),
@@ -50,7 +50,7 @@ def encode_intervals(t_ns: int, interval_ns: np.ndarray, arrays: Mapping[str, np
 def intervals_in(path: str | os.PathLike) -> np.ndarray:
     """Return the intervals of the labels in a file, (K,) int64 ns. Raises AssetError."""
     path = Path(path)
-    with open_hdf5(path) as file, hdf5_errors(path):
+    with open_hdf5(path) as file:
         return _int64(dataset(file, "interval_ns", path, shape=(None,))[()], "interval_ns", path)
 
 
@@ -65,7 +65,10 @@ def read_intervals(path: str | os.PathLike, names: tuple[str, ...]) -> tuple[int
     AssetError: missing, damaged, arrays of different sizes, times beyond int64, valid flow that is no number, or
     intervals that do not increase."""
     path = Path(path)
-    with open_hdf5(path) as file, hdf5_errors(path):
+    with open_hdf5(path) as file:
+        # Shards hand on the file as a whole, so that all that it holds is checked.
+        for data in (data for group in file.groups().values() for data in group.data().values()):
+            data.check()
         from_us = int(_int64(dataset(file, "from_us", path, shape=())[()].reshape(1), "from_us", path)[0])
         interval_ns = _int64(dataset(file, "interval_ns", path, shape=(None,))[()], "interval_ns", path)
         arrays = {name: dataset(file, name, path, shape=SHAPES[name][0], kinds=SHAPES[name][1])[()] for name in names}

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from blinkgl.io.columns import events_of, microseconds
-from blinkgl.io.hdf5 import dataset
+from blinkgl.io.hdf5 import Data, Group, dataset
 from blinkgl.types.events import Events
 
 DATASET = "davis/left/events"
@@ -16,7 +15,7 @@ EVENTS = (DATASET, "davis/right/events")
 """Of both cameras: x, y, t, p; t in s."""
 
 
-def event_table(file: h5py.File, path: Path, name: str = DATASET) -> h5py.Dataset:
+def event_table(file: Group, path: Path, name: str = DATASET) -> Data:
     """Return the (N, 4) float64 data set of events. Raises AssetError."""
     return dataset(file, name, path, shape=(None, 4), kinds="f")
 

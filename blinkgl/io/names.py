@@ -13,12 +13,12 @@ from blinkgl.errors import EventDataError
 
 # A sign counts at the beginning of the name, or after something that is neither a letter nor a digit: frame-1 is not
 # minus one. An exponent has to end with the number.
-_NUMBER = re.compile(r"(?:(?<![A-Za-z0-9])[-+])?\d+(?:\.\d+)?(?:[eE][-+]?\d+(?![A-Za-z0-9.]))?")
+_NUMBER = re.compile(r"(?:(?<![A-Za-z0-9])[-+])?\d+(?:\.\d+)?(?:[eE][-+]?\d{1,2}(?![A-Za-z0-9.]))?")
 _DOTTED = re.compile(r"\d+")
 _LOSSLESS = (".exr", ".pfm", ".hdr", ".tif", ".tiff", ".png", ".bmp", ".pgm", ".ppm", ".webp")
 _MAJORITY = 0.8
 """Part of the files from which on the others count as strangers."""
-_SHOWN = 3
+_SHOWN, _MOST_PLACES = 3, 2**31
 
 
 @dataclass
@@ -40,7 +40,11 @@ class Series:
         if step <= 0 or often < 0.5 * len(steps) or often == len(steps):
             return None
         places = [(number - self.numbers[0]) / step for number in self.numbers]
-        return places if all(place == place.to_integral_value() for place in places) else None
+        return (
+            places
+            if places[-1] < _MOST_PLACES and all(place == place.to_integral_value() for place in places)
+            else None
+        )
 
     def missing(self) -> list[str]:
         """Return the lines that say which numbers are missing."""

@@ -13,6 +13,7 @@ from typing import Any
 
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.clock import checked_unit
+from blinkgl.types.numbers import is_number
 
 _MOST_SIDE = 65536
 
@@ -117,10 +118,8 @@ def _columns(columns: str | Sequence[str] | None) -> tuple[str, ...] | None:
 def _polarity(polarity: str | Sequence[float] | None) -> tuple[float, float] | None:
     if polarity is None:
         return None
-    try:
-        off, on = (float(v) for v in (polarity.split("/") if isinstance(polarity, str) else polarity))
-    except (ValueError, TypeError):
-        off = on = 0.0
+    codes = polarity.split("/") if isinstance(polarity, str) else [str(code) for code in polarity]
+    off, on = map(float, codes) if len(codes) == 2 and all(map(is_number, codes)) else (0.0, 0.0)
     if off == on:
         raise _refused("polarity", polarity, "the numbers of OFF and ON: 0/1, -1/1, 1/0 …")
     return off, on
@@ -144,7 +143,7 @@ def chosen(
     none is declared, or none of these."""
     if stream in names:
         return names.index(stream)
-    if numbered and stream is not None and stream.isdigit() and int(stream) < len(names):
+    if numbered and stream is not None and is_number(stream) and stream.isdigit() and int(stream) < len(names):
         return int(stream)
     if stream is None and len(names) == 1:
         return 0

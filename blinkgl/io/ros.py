@@ -8,9 +8,11 @@ are read. Times are the events' own: ROS time, or the camera's for EVT.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from blinkgl.io.columns import events_of, joined
 from blinkgl.io.evt import HIGH, START, UNTIMED, decode, state_lines
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen, listed
 from blinkgl.io.records import decoding
+from blinkgl.io.sizes import unpacked
 from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
 
@@ -61,6 +64,26 @@ def typestore(ros2: bool) -> Any:
     return store
 
 
+@functools.cache
+def _limited() -> None:
+    """Give the unpackers of rosbags a limit: they unpack as much as a chunk holds, in 5 kB the events of a gigabyte."""
+    import bz2
+
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags.rosbag1.reader import decompressors
+    from rosbags.rosbag2 import reader, storage_mcap
+
+    # Recorders write chunks of less than a megabyte.
+    limited = lambda make: lambda data, *_: unpacked(make, data, 1 << 26)
+    decompressors.update(bz2=limited(bz2.BZ2Decompressor), lz4=limited(LZ4FrameDecompressor))
+    # Versions without it use a library that takes the size that a chunk states.
+    library = getattr(reader, "zstd", None)
+    zstd = {} if library is None else {"zstd": limited(library.ZstdDecompressor)}
+    storage_mcap.DECOMPRESSORS.update(lz4=limited(LZ4FrameDecompressor), **zstd)
+    if library is not None:
+        reader.zstd = SimpleNamespace(decompress=zstd["zstd"], open=library.open)
+
+
 class BagReader:
     """The events of the only topic, or of the one that ``stream`` names. height, width : px, of its first message.
     notes : after reading, a line for each kind of words that were left out. Raises AssetError: no topic of events, or
@@ -90,6 +113,7 @@ class BagReader:
         store = typestore(ros2)
         from rosbags.highlevel import AnyReader
 
+        _limited()
         with decoding(self.path, "damaged bag", Damage), AnyReader([self.path], default_typestore=store) as bag:
             yield bag
 

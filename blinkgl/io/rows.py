@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import re
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?")
+from blinkgl.types.numbers import is_number
+
 _TITLE = re.compile(r"[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
-
-
-def is_number(text: str) -> bool:
-    """Return whether a field is a finite number that no text can make large to convert."""
-    return _NUMBER.fullmatch(text) is not None
 
 
 def read_rows(text: str, most: int = 5_000_000) -> tuple[str, list[tuple[int, list[str]]]]:

@@ -15,7 +15,8 @@ import numpy as np
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.clock import named_unit, nanoseconds
 from blinkgl.io.records import input_errors, read_text
-from blinkgl.io.rows import is_number, read_rows, titles_of
+from blinkgl.io.rows import read_rows, titles_of
+from blinkgl.types.numbers import exact, is_number
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ def read_timestamps(
     titles = titles_of(heading)
     columns = _time_columns(rows, titles)
     texts: list[str] = []
+    times: list[Fraction] = []
     for number, row in numbered:
         chosen = [row[k] for k in columns if k < len(row)]
         if len(chosen) < len(columns) or not all(map(is_number, chosen)):
@@ -67,22 +69,23 @@ def read_timestamps(
                 value=" ".join(row),
                 accepted="'time' or 'time name', a finite number",
             )
-        texts.append(chosen[0] if len(columns) == 1 else str(sum(map(Fraction, chosen)) / len(chosen)))
+        texts.append(chosen[0])
+        times.append(sum(map(exact, chosen), Fraction(0)) / len(chosen))
     names = _names(rows, columns, path)
     if unit == "frames":
         if fps is None:
             raise ConfigError(
                 "times in frames need a frame rate", where="--time-unit", value=unit, accepted="--fps, too"
             )
-        return Stamps([round(Fraction(text) * 10**9 / Fraction(fps)) for text in texts], names)
+        return Stamps([round(time * 10**9 / Fraction(fps)) for time in times], names)
     stated = unit or _stated(titles, columns, heading, path) or usual
     if stated is not None:
-        return Stamps(nanoseconds(texts, stated), names)
+        return Stamps(nanoseconds(times, stated), names)
     points = [_SECONDS.fullmatch(text) for text in texts]
     places = max(len(found[1]) for found in points if found) if None not in points else 0
     if places and (names is not None or places >= _PLACES) and len(columns) == 1:
         note = f"{path.name}: read as the Event Camera Dataset's and TUM's lists: seconds with a point"
-        return Stamps(nanoseconds(texts, "s"), names, note)
+        return Stamps(nanoseconds(times, "s"), names, note)
     raise _undeclared(str(path), any("." in text for text in texts))
 
 
@@ -156,7 +159,7 @@ def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[
     if len(numeric) < 2:
         # One odd line among numbers is named by its line, so the first column stays the time.
         return numeric[:1] if numeric and not is_number(rows[0][0]) else [0]
-    first = [Fraction(row[numeric[0]]) for row in rows]
+    first = [exact(row[numeric[0]]) for row in rows]
     # Numbers that count 0, 1, 2, … beside another column of numbers are no times.
     counts = len(first) > 2 and first[0] in (0, 1) and all(b - a == 1 for a, b in pairwise(first))
     return [numeric[1] if counts else numeric[0]]

@@ -17,8 +17,9 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import cv2
 import numpy as np
@@ -33,6 +34,7 @@ from blinkgl.io.records import decoding, input_errors
 SUFFIXES = frozenset(
     ".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pbm .pgm .ppm .pnm .exr .hdr .pfm .avif .jp2 .tga".split()
 )
+_KINDS = ("PNG", "JPEG", "JPEG2000", "BMP", "DIB", "WEBP", "GIF", "PPM", "AVIF", "TGA", "TIFF")
 _ANIMATED = {".gif", ".webp", ".png", ".apng"}
 _TIFF = {".tif", ".tiff"}
 _UNSTATED_MS = 100
@@ -131,7 +133,7 @@ class Stills:
             self.notes.append(note)
 
     def _animation(self, first: int) -> Iterator[np.ndarray]:
-        with _pillow(self.path) as image, _decoding(self.path):
+        with _pillow(self.path, self.path) as image, _decoding(self.path):
             for k, page in enumerate(ImageSequence.Iterator(image)):
                 if k >= first:
                     yield np.asarray(page.convert("RGBA"))
@@ -198,7 +200,9 @@ def open_stills(path: Path) -> Stills:
     if suffix in _ANIMATED:
         head = _bytes(path, 4096 if suffix in (".png", ".apng") else 64)
         # acTL is a chunk of animated PNG files; bit 1 of a WebP file's flags says that it is animated.
-        animated = suffix == ".gif" or b"acTL" in head or (head[8:16] == b"WEBPVP8X" and head[20] & 2)
+        animated = (
+            suffix == ".gif" or b"acTL" in head or (head[8:16] == b"WEBPVP8X" and head[20:21] > b"\1" and head[20] & 2)
+        )
         if animated:
             return _animated(path)
         return _png(path, head) if head[:4] == b"\x89PNG" else Stills(path)
@@ -223,7 +227,7 @@ def _png(path: Path, head: bytes) -> Stills:
     for _, kind, body in png_chunks(head):
         if kind == b"IHDR":
             # The bit depth comes after width and height, four bytes each.
-            bits = body[8]
+            bits = int.from_bytes(body[8:9])
         elif kind == b"cICP" and len(body) == 4:
             from blinkgl.io.video import TRANSFERS
 
@@ -247,8 +251,8 @@ def _png(path: Path, head: bytes) -> Stills:
 
 
 def _animated(path: Path) -> Stills:
-    with _pillow(path) as image, _decoding(path):
-        if problem := size_problem(*image.size):
+    with _pillow(path, path) as image, _decoding(path):
+        if problem := size_problem(*image.size, path.stat().st_size):
             raise AssetError(problem, where=str(path))
         delays = []
         for page in ImageSequence.Iterator(image):
@@ -267,8 +271,14 @@ def _opened_tiff(path: Path) -> Iterator[Any]:
     import tifffile
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
-    # OME-XML may name other files; what it says of its own is read from the description instead.
-    with _decoding(path), open(path, "rb") as raw, tifffile.TiffFile(raw, is_ome=False) as file:
+    # OME-XML may name other files; what it says of its own is read from the description instead. MMStack's and NDTiff's
+    # indices name those beside a file: bytes without a name and a folder have none.
+    with (
+        _decoding(path),
+        open(path, "rb") as raw,
+        mmap(raw.fileno(), 0, access=ACCESS_READ) as held,
+        tifffile.TiffFile(cast(BinaryIO, held), is_ome=False) as file,
+    ):
         yield file
 
 
@@ -279,7 +289,9 @@ def _bits(page: Any) -> int:
 def _tiff(path: Path) -> Stills:
     with _opened_tiff(path) as file:
         series, notes, page = file.series[0], [], file.series[0].keyframe
-        if problem := size_problem(page.imagewidth, page.imagelength):
+        if problem := size_problem(
+            page.imagewidth, page.imagelength, path.stat().st_size, max(1, page.samplesperpixel) * -(-_bits(page) // 8)
+        ):
             raise AssetError(problem, where=str(path))
         _check_tags(page, path)
         stated, channels = _interval_ms(file, notes)
@@ -366,9 +378,13 @@ def _by_pillow(data: bytes, path: Path, notes: list[str], index: int = 0, *, as_
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with iio.imopen(io.BytesIO(data), "r", plugin="pillow") as file:
+            # The library tries all kinds that Pillow knows, some of which run other programs.
+            with (
+                _pillow(io.BytesIO(data), path),
+                iio.imopen(io.BytesIO(data), "r", plugin="pillow") as file,
+            ):
                 meta = file.metadata(index=index, exclude_applied=False)
-                if problem := size_problem(meta["shape"][0], meta["shape"][1]):
+                if problem := size_problem(meta["shape"][0], meta["shape"][1], len(data)):
                     raise AssetError(problem, where=str(path))
                 mode = meta["mode"]
                 if mode not in _MODES:
@@ -438,7 +454,9 @@ def _decoding(path: Path) -> AbstractContextManager[None]:
     return decoding(path, "cannot decode image (corrupt or truncated)", Damage)
 
 
-def _pillow(path: Path) -> Image.Image:
+def _pillow(source: Path | io.BytesIO, path: Path) -> Image.Image:
+    """Open a picture whose bytes are one of :data:`_KINDS`, whatever its name says."""
     with _decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return Image.open(path)
+        Image.init()  # most kinds are known only then
+        return Image.open(source, formats=[kind for kind in _KINDS if kind in Image.OPEN])

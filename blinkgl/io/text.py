@@ -31,6 +31,7 @@ from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen
 from blinkgl.io.tables import slot_of, undeclared
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
+from blinkgl.types.numbers import is_number
 
 _LONGEST_LINE = 1 << 16
 _PLACES = {"t": 0, "x": 1, "y": 2, "p": 3, "_": 4}
@@ -232,10 +233,13 @@ def _names(heading: str) -> list[str]:
 def _row(line: bytes) -> list[float] | None:
     """Return the numbers of a line; None: it is not of numbers alone."""
     words = re.split(rb"[ \t,;\r]+", line.strip())
-    try:
-        return [{b"true": 1.0, b"false": 0.0}.get(word.lower()) or float(word) for word in words]
-    except ValueError:
-        return None
+    known = {"true": 1.0, "false": 0.0}
+    texts = [word.decode("latin-1").lower() for word in words]
+    return (
+        [known[text] if text in known else float(text) for text in texts]
+        if all(text in known or is_number(text) for text in texts)
+        else None
+    )
 
 
 class TextWriter(CheckedWriter):

@@ -18,7 +18,6 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,8 +29,9 @@ from blinkgl.io.atomic import write_whole
 from blinkgl.io.clock import NANOSECONDS, checked_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
-from blinkgl.io.rows import is_number, read_rows, titles_of
+from blinkgl.io.rows import read_rows, titles_of
 from blinkgl.io.stamps import read_timestamps
+from blinkgl.types.numbers import exact, is_number
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")
@@ -290,10 +290,10 @@ def _colmap(path: Path, text: str, declared: PoseFile) -> _Table:
 
 def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
     try:
-        tree = json.loads(text)
+        tree = json.loads(text, parse_int=str, parse_float=str)
         frames = tree["frames"]
         given = np.array([frame["transform_matrix"] for frame in frames], np.float64)
-        if given.ndim != 3 or given.shape[1] not in (3, 4) or given.shape[2] != 4 or not np.isfinite(given).all():
+        if given.ndim != 3 or given.shape[1] not in (3, 4) or given.shape[2] != 4 or not (np.abs(given) < 1e100).all():
             raise ValueError("transform_matrix")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split())[:80]
@@ -322,7 +322,7 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
             value = f"{len(stamps.times_ns)} times, {count} poses"
             raise AssetError("one time per pose", where=str(beside), value=value, accepted="as many, or rate:")
         notes += [stamps.note] if stamps.note else []
-        t_ns = np.array(stamps.times_ns, np.int64)
+        values = stamps.times_ns
     elif table.times is None:
         raise AssetError("poses without times", where=str(path), accepted="rate: in Hz, or times: a file of them")
     else:
@@ -330,24 +330,20 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
         for number, text in zip(table.lines, texts):
             if not is_number(text):
                 raise _no_pose(path, number, [text], "a time first, a finite number")
+        times = list(map(exact, texts))
         # Two equal times are refused in a moment, whatever the unit.
         stated = table.unit or ("s" if any(a == b for a, b in pairwise(texts)) else None)
         unit = declared.time_unit or stated
         if unit is None:
-            unit = _likely_unit(np.array([float(Fraction(text)) for text in texts]), str(path))
+            unit = _likely_unit(np.array(times, np.float64), str(path))
             others = ", ".join(other for other in NANOSECONDS if other != unit)
             notes.append(f"{path.name}: times taken as {unit} (time_unit: {others} if that is wrong)")
-        values = nanoseconds(texts, unit)
-        # The difference of any two times below 2^62 fits into an int64.
-        if max(map(abs, values)) >= 2**62:
-            value = f"{texts[-1]} {unit}"
-            raise AssetError(
-                "times are too large: another unit?",
-                where=str(path),
-                value=value,
-                accepted="time_unit: s, ms, us or ns",
-            )
-        t_ns = np.array(values, np.int64)
+        values = nanoseconds(times, unit)
+    # The difference of any two times below 2^62 fits into an int64.
+    if (most := max(map(abs, values))) >= 2**62:
+        accepted = "time_unit: s, ms, us or ns"
+        raise AssetError("times are too large: another unit?", where=str(path), value=f"{most} ns", accepted=accepted)
+    t_ns = np.array(values, np.int64)
     _check_times(t_ns, table.lines, path)
     return t_ns
 

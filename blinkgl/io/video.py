@@ -25,6 +25,7 @@ import numpy as np
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.alpha import over
 from blinkgl.io.reading import Damage, chosen
+from blinkgl.io.sizes import most_unpacked
 from blinkgl.io.ticks import frame_times
 from blinkgl.io.yuv import cut_riff, floats_of, known, orientation_of, rgb_from_yuv, samples_of
 from blinkgl.machine.closing import Finishing
@@ -34,7 +35,7 @@ from blinkgl.machine.interrupts import uninterrupted
 if TYPE_CHECKING:
     import av
 
-_MAX_PIXELS = 1 << 28
+_MAX_PIXELS, _MOST = 1 << 26, "at most 64 Mpx a frame"
 _FORMATS = frozenset(
     "mov mp4 m4a 3gp 3g2 mj2 matroska webm avi mpegts mpeg mpegvideo flv asf ogg apng ivf nut dv mxf yuv4mpegpipe h264 "
     "hevc vvc av1 obu m4v mjpeg rm wtv cine live_flv".split()
@@ -426,12 +427,10 @@ class VideoReader:
             if stream.codec_context is None:
                 raise AssetError("cannot read video: unknown codec", where=str(self.path))
             if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
-                raise AssetError(
-                    "video too large",
-                    where=str(self.path),
-                    value=f"{stream.codec_context.width}x{stream.codec_context.height}",
-                    accepted="at most 268 Mpx a frame",
-                )
+                size = f"{stream.codec_context.width}x{stream.codec_context.height}"
+                raise AssetError("video too large", where=str(self.path), value=size, accepted=_MOST)
+            # A frame may have another size than the container states.
+            stream.codec_context.options = {"max_pixels": str(_MAX_PIXELS)}
             yield file, stream
 
 
@@ -439,12 +438,15 @@ def decode_exr(data: bytes, where: str) -> np.ndarray:
     """Return (H, W, 3), (H, W, 4) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; FFmpeg
     has. Raises AssetError: undecodable."""
     av = _av(AssetError, where)
+    # Up to four channels of float32.
+    most = most_unpacked(len(data)) // 16
     try:
-        frames = av.CodecContext.create("exr", "r").decode(av.Packet(data))
-    except (av.FFmpegError, OSError, ValueError) as error:
-        raise AssetError(f"cannot decode OpenEXR image: {_gist(error)}", where=where) from error
-    except NotImplementedError as error:
-        raise AssetError("cannot decode OpenEXR image: a kind that is not read", where=where) from error
+        decoder = av.CodecContext.create("exr", "r")
+        decoder.options = {"max_pixels": str(most)}
+        frames = decoder.decode(av.Packet(data))
+    except (av.FFmpegError, OSError, ValueError, NotImplementedError) as error:
+        accepted = f"at most {most} px in {len(data)} bytes"
+        raise AssetError(f"cannot decode OpenEXR image: {_gist(error)}", where=where, accepted=accepted) from error
     if not frames or "f" not in frames[0].format.name:
         raise AssetError("cannot decode OpenEXR image: no picture of floats", where=where)
     return floats_of(frames[0])

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.errors import AssetError
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
 from blinkgl.scene.types import Scene
@@ -270,6 +272,15 @@ class Label:
             said = f" {np.dtype(self.dtype)}" if kind else ""
             return f"{array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}"
         return None
+
+    def read(self, path: Path, form: Form, height: int, width: int) -> Any:
+        """Return the value in a file of one of ``forms``, of a sequence of that size. Raises AssetError: damaged, or of
+        another size or type."""
+        assert form.read is not None, form.folder
+        value = form.read(path)
+        if (problem := self.wrong(value, height, width)) is not None:
+            raise AssetError(f"not of this sequence: {problem}", where=str(path))
+        return value
 
     def own(self, value: Any) -> Any:
         """Return a copy of a value, as it is written."""

@@ -7,7 +7,7 @@
       images/left/ev_inf/%06d.png                  what the event camera's own lens sees, at the flow's times
       disparity/event/%06d.png, timestamps.txt     of a stereo rig with depth; 000000 is empty: loaders skip it
       calibration/cam_to_cam.yaml
-      imu/imu.csv, imu.h5, imu.yaml …              of an inertial unit, as the sequence has it (EuRoC's, Kalibr's)
+      imu/imu.csv, imu.h5, imu.yaml …              of an inertial unit, as a sequence has them (EuRoC's, Kalibr's)
 
 A file's number is its line in ``images/timestamps.txt``, which begins an interval before the first label, so flow k is
 file 2k + 2, as in the published sequences: loaders count on the step of two, and on a number before each flow's.
@@ -22,9 +22,10 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectify_map
 from blinkgl.config.camchain import Calibrated, cam_to_cam_yaml
-from blinkgl.io.dsec import identity_rectify_map, write_rectify_map
+from blinkgl.io.dsec import DsecEventWriter, identity_rectify_map, write_rectify_map
 from blinkgl.io.images import encode_png
-from blinkgl.layouts.layout import Layout, Missing, copy, events_before, forward_flow, need, write_bytes, write_lines
+from blinkgl.io.imu import made_again
+from blinkgl.layouts.layout import Layout, Missing, events_before, forward_flow, need, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 
 DISPARITY_SCALE = 256.0
@@ -84,13 +85,13 @@ class Dsec(Layout):
         write_lines(folder / "images/timestamps.txt", times)
         for k, t in enumerate(source.image_times):
             if t in times:
-                copy(source.file("images", k), folder / f"images/left/ev_inf/{times.index(t):06d}.png")
+                write_bytes(folder / f"images/left/ev_inf/{times.index(t):06d}.png", source.copied("images", k))
         if source.right is not None:
             write_events(source.right, folder / "events/right")
             said += _write_disparity(source, source.right, folder / "disparity")
         if source.unit is not None:
-            for file in sorted((source.unit / "imu").iterdir()):
-                copy(file, folder / "imu" / file.name)
+            for name, content in made_again(source.unit).items():
+                write_bytes(folder / name, content)
         if source.camera is not None:
             write_bytes(folder / "calibration/cam_to_cam.yaml", cam_to_cam(source, source.camera).encode())
         return said
@@ -125,8 +126,14 @@ def image_times(source: Source) -> list[int]:
 
 
 def write_events(source: Source, folder: Path) -> None:
-    """Write ``events.h5``, which already has DSEC's layout, and ``rectify_map.h5``."""
-    copy(source.folder / "events.h5", folder / "events.h5")
+    """Write ``events.h5``, anew, since nothing but its events may be handed on, and ``rectify_map.h5``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with DsecEventWriter(
+        folder / "events.h5", source.height, source.width, source.start_us, codec=source.codec
+    ) as writer:
+        writer.t_end_us = source.end_us
+        for events in source.events():
+            writer.append(events)
     camera = source.camera
     flat = camera is None or isinstance(camera, PinHole)
     table = identity_rectify_map(source.height, source.width) if flat else rectify_map(camera)
@@ -140,7 +147,7 @@ def write_flow(source: Source, towards: str, folder: Path) -> None:
     if not times:
         return
     for k in range(len(times)):
-        copy(source.file(f"flow_{towards}", k), folder / f"{towards}/{2 * k + 2:06d}.png")
+        write_bytes(folder / f"{towards}/{2 * k + 2:06d}.png", source.copied(f"flow_{towards}", k))
     write_lines(
         folder / f"{towards}_timestamps.txt",
         ["# from_timestamp_us, to_timestamp_us", *(f"{a}, {b}" for a, b in times)],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -78,13 +77,6 @@ events_before = need(
 
 _ROWS = 1 << 16
 GZIP = packing("gzip", 0)
-
-
-def copy(source: Path, target: Path) -> None:
-    """Copy ``source``, byte for byte. Raises OutputError."""
-    with output_errors(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, target)
 
 
 def write_bytes(target: Path, data: bytes) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
-from blinkgl.layouts.layout import GZIP, Layout, append, copy, growing, images, need
+from blinkgl.layouts.layout import GZIP, Layout, append, growing, images, need, write_bytes
 from blinkgl.layouts.source import Source
 
 LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000
@@ -63,7 +63,7 @@ class MultiFlow(Layout):
             _write_events(source, t, sample / "events/events.h5")
             for clock_us in (LABEL_US, TARGET_US):
                 at = source.image_times.index(t + clock_us - LABEL_US)
-                copy(source.file("images", at), sample / f"images/{clock_us:07d}.png")
+                write_bytes(sample / f"images/{clock_us:07d}.png", source.copied("images", at))
             flows = source.flows(k)
             for clock_us, one, valid in zip(_clock_us(flows.interval_ns), flows.flow, flows.valid):
                 if clock_us is not None:

@@ -16,10 +16,12 @@ from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.hdf5 import CODECS
 from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU
 from blinkgl.io.intervals import intervals_in
 from blinkgl.io.poses import POSES, read_poses
+from blinkgl.io.reading import listed
 from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
 from blinkgl.io.tracks import TRACKS, read_tracks
@@ -110,6 +112,11 @@ class Source:
         """Return the ``k``-th file of a label, in its first format."""
         return self.folder / LABELS[label].forms[0].file(k)
 
+    def copied(self, label: str, k: int) -> bytes:
+        """Return the content of :meth:`file` once it was read as a value of this sequence. Raises AssetError."""
+        self.image(k) if label == "images" else self.value(label, k)
+        return self.file(label, k).read_bytes()
+
     def flow(self, towards: str, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Return (H, W, 2) float32 px and (H, W) bool, from the most exact format available. Raises AssetError."""
         forms = {form.ending: form for form in LABELS[f"flow_{towards}"].forms}
@@ -175,7 +182,8 @@ class Source:
     @property
     def codec(self) -> str:
         """Return the codec of its events."""
-        return str(self._configured("output", "compression") or "zstd")
+        codecs = {name: name for name in (*CODECS, "gzip")}
+        return listed(codecs, self._configured("output", "compression") or "zstd", "unknown compression", self.folder)
 
     def _configured(self, section: str, key: str) -> Any:
         path = self.folder / "config.yaml"
@@ -190,14 +198,8 @@ class Source:
         return read_label_times(self.folder / stamps, columns, self.count(label)) if self.has(stamps) else []
 
     def _read(self, label: str, k: int, form: Form | None = None) -> Any:
-        row = LABELS[label]
-        form = form or row.forms[0]
-        path = self.folder / form.file(k)
-        assert form.read is not None, form.folder
-        value = form.read(path)
-        if (wrong := row.wrong(value, self.height, self.width)) is not None:
-            raise AssetError(f"not of this sequence: {wrong}", where=str(path))
-        return value
+        form = form or LABELS[label].forms[0]
+        return LABELS[label].read(self.folder / form.file(k), form, self.height, self.width)
 
 
 def sources_of(root: Path) -> list[Source]:

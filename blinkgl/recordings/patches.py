@@ -1,4 +1,4 @@
-"""Features of patches of events (a few pixels by a time window), by which the judge (:mod:`~blinkgl.recordings.judge`)
+"""Features of patches of events (a few pixels by a time window), by which the judge (:mod:`~blinkgl.tools.judge`)
 distinguishes recordings.
 
 Some describe single pixels (rates, intervals), some neighbours (direction of motion, continuity over the patch's

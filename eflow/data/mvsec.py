@@ -14,9 +14,10 @@ import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.columns import check_events, microseconds
-from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
 from blinkgl.io.mvsec import event_table, events_of_rows
+from blinkgl.io.sizes import check_claim
 from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
 
@@ -85,6 +86,7 @@ class NpzRows:
         shape, dtype, start = self._layout[name]
         shape = shape if row is None else shape[1:]
         count = math.prod(shape)
+        check_claim(count * dtype.itemsize, str(self.path), self.path.stat().st_size)
         with numpy_errors(self.path), zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
             member.seek(start + (row or 0) * count * dtype.itemsize)
             return np.frombuffer(member.read(count * dtype.itemsize), dtype).reshape(shape)
@@ -171,7 +173,7 @@ class MvsecSource:
 class _MvsecSequence:
     def __init__(self, path: Path):
         self.path, self.name = path, path.name.removesuffix("_data.hdf5")
-        with open_hdf5(path) as file, hdf5_errors(path):
+        with open_hdf5(path) as file:
             self._count = len(event_table(file, path))
             stamps = dataset(file, "davis/left/image_raw_ts", path, shape=(None,), kinds="f")[()]
             self._inds = dataset(file, "davis/left/image_raw_event_inds", path, shape=(len(stamps),), kinds="iuf")[
@@ -194,25 +196,23 @@ class _MvsecSequence:
                     value=self._flow.shape(name),
                     accepted=str(expected),
                 )
-        self._file, self._pid = None, None
+        self._file, self._pid, self._table = None, None, None
         self._rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def __getstate__(self) -> dict:
-        return {**self.__dict__, "_file": None, "_pid": None}
+        return {**self.__dict__, "_file": None, "_pid": None, "_table": None}
 
     def window(self, t0: int, t1: int) -> Window:
         """Return the events of [t0, t1) µs. The event indices of the images are hints; times decide."""
         if self._pid != os.getpid():  # HDF5 handles do not survive a fork
             self._file, self._pid = open_hdf5(self.path), os.getpid()
-        with hdf5_errors(self.path):
-            table = event_table(self._file, self.path)
+            self._table = event_table(self._file, self.path)
         images = np.searchsorted(self.image_us, t0, side="right") - 1, np.searchsorted(self.image_us, t1)
         low, high = (int(np.clip(self._inds[min(max(k, 0), len(self._inds) - 1)], 0, self._count)) for k in images)
         margin = 4096
         while True:
             i, j = max(low - margin, 0), min(high + margin, self._count)
-            with hdf5_errors(self.path):
-                rows = table[i : max(i, j)]
+            rows = self._table[i : max(i, j)]
             t = microseconds(rows[:, 2] - self.t0_s, str(self.path), i)
             enough = len(t) and (i == 0 or t[0] < t0) and (j == self._count or t[-1] >= t1)
             if enough or (i == 0 and j == self._count):

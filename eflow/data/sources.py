@@ -27,7 +27,7 @@ from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_npy, read_flow_png
-from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS
@@ -135,7 +135,7 @@ class FolderSource:
 
     def _map(self, path: Path) -> np.ndarray:
         if path not in self._maps:
-            with open_hdf5(path) as file, hdf5_errors(path):
+            with open_hdf5(path) as file:
                 rectify_map = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(
                     np.float32
                 )

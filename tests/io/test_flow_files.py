@@ -68,8 +68,9 @@ def png(width: int, height: int, cut: int | None = None) -> bytes:
         (png(5, 5).replace(b"IHDR", b"IHDX"), "cannot decode image (corrupt or truncated)"),
         (png(5, 5)[:-1] + b"x", "corrupt or truncated at byte 33"),
         (b"\xff\xd8 \xff\xda \xff\xd9", "a JPEG, where pictures without loss are read"),
-        (b"#?RADIANCE\n\n-Y 16384 +X 16384\n", None),
-        (b"#?RADIANCE\n\n-Y 16384 +X 16385\n", "image of 16385x16384 px is too large"),
+        # 12 bytes a pixel, of at most 2^28.
+        (b"#?RADIANCE\n\n-Y 4729 +X 4729\n", None),
+        (b"#?RADIANCE\n\n-Y 4730 +X 4730\n", "image of 4730x4730 px is too large (at most 21 Mpx in "),
         (b"#?RADIANCE\n\n", "no size in its header"),
         (b"", "cannot decode image (corrupt or truncated)"),
         (b"unknown", None),

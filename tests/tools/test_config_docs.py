@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from pinned import only_with_pinned
 
-from blinkgl.tools import command_docs
+from blinkgl.config.reader import to_yaml
+from blinkgl.errors import BlinkGLError
+from blinkgl.tools import command_docs, fuzz_configurations
 from blinkgl.tools.config_docs import eflow_page, page
 
 PAGES = {
@@ -38,3 +40,22 @@ def test_no_format_has_a_defect():
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count(" 0 defects") == len(SHORT)
+
+
+def test_configurations_that_are_drawn_run_or_are_one_line():
+    """Generated, verified and looked at; of the thousand that `make fuzz` draws, a few."""
+    command = [sys.executable, "-m", "blinkgl.tools.fuzz", "configurations", "--mutants", "6", "--seed", "5"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0 and " 0 defects" in done.stdout, done.stdout + done.stderr
+    small = fuzz_configurations.SMALL
+    drawn = [fuzz_configurations.drawn(0, k) for k in range(200)]
+    changed = {key for tree in drawn for key in tree if tree[key] != small.get(key)}
+    assert {"events", "labels", "scene", "timeline", "images", "camera", "time"} <= changed
+
+
+def test_a_panorama_that_is_missing_is_one_line(tmp_path):
+    """Found by a configuration that was drawn: it was read without a look at whether it is there."""
+    scene = {**fuzz_configurations.SMALL["scene"], "sky": {"panoramas": ["no.hdr"]}}
+    (tmp_path / "run.yaml").write_text(to_yaml({**fuzz_configurations.SMALL, "scene": scene}))
+    with pytest.raises(BlinkGLError, match=r"no.hdr: cannot read the panorama: No such file"):
+        fuzz_configurations.check(tmp_path / "run.yaml")

@@ -326,7 +326,8 @@ class DsecEventReader(Closing):
     def _read(self, start: int, stop: int) -> Events:
         columns = {k: column[start:stop] for k, column in self._columns.items()}
         x, y, t, p = (columns[name] for name in "xytp")
-        return events_of(x, y, t, p, where=str(self.path), first=start, offset=self.t_offset_us)
+        cause, where = columns.get("cause"), str(self.path)
+        return events_of(x, y, t, p, where=where, first=start, cause=cause, offset=self.t_offset_us)
 
     def close(self) -> None:
         self._file.close()

@@ -134,10 +134,22 @@ def places(flags: Tensor) -> Tensor:
     return torch.nonzero(flags >= 0).view(-1)
 
 
+def _there(device: Any) -> torch.device:
+    """Return a torch device with its number, as tensors have it ("cuda" becomes "cuda:0"), so that frames' devices
+    compare equal. Raises EventDataError: this machine, or this torch, has none such."""
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError):
+        cards = [f"cuda:{k}" for k in range(torch.cuda.device_count())]
+        raise EventDataError(
+            "there is no such device", where="device", value=str(device), accepted=" or ".join(["cpu", *cards])
+        ) from None
+
+
 class Batch(ABC):
     """Emulators of ``envs`` environments of one size and configuration; environment k draws from ``seed + k``.
 
-    device : torch's.   Raises EventDataError: a size or a number of environments that does not fit."""
+    device : torch's.   Raises EventDataError: a size or a number of environments that does not fit, no such device."""
 
     _state: tuple[str, ...] = ()
     """Names of the tensors that make up the state, besides times."""
@@ -155,8 +167,7 @@ class Batch(ABC):
                 accepted=f"sides of 1 to {MAX_SIDE - 1}, fewer than 2^31 pixels in all",
             )
         self.height, self.width, self.envs = int(height), int(width), int(envs)
-        # "cuda" becomes "cuda:0", so that frames' devices compare equal.
-        self.device = torch.empty(0, device=device).device  # with its number, as tensors say it
+        self.device = _there(device)
         self.seed = int(seed) & (2**64 - 1)
         self.seeds = tuple((self.seed + k) & (2**64 - 1) for k in range(self.envs))
         """Seed of each environment: that of the single emulator that it equals."""

@@ -208,3 +208,11 @@ def test_every_summary_fits_80_columns(program, capsys, monkeypatch):
     out = capsys.readouterr().out
     assert "Commands:" in out and "..." not in out.partition("Commands:")[2]
     assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("words", ["", "generate", "simulate", "shader probe", "verify", "compare"])
+def test_the_short_word_for_help_is_help(capsys, words):
+    assert cli.run([*words.split(), "-h"]) == 0
+    short = capsys.readouterr().out
+    assert cli.run([*words.split(), "--help"]) == 0
+    assert short == capsys.readouterr().out and "-h, --help" in short

@@ -17,7 +17,7 @@ import typer
 
 HEADER = """# Commands
 
-Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `--help` prints the same.
+Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `-h` prints the same.
 
 `--debug`, before or after a command, shows the traceback of an error. Exit status: 0 done; 1 `shader diff` or
 `shader check` found something wrong; 2 your input or the machine (`error: …`, one line); 3 done but for

@@ -47,7 +47,13 @@ def _global_options(
 
 def new_app(name: str, about: str) -> typer.Typer:
     """Return a command without commands, with the options that every command line has. about : its help."""
-    app = typer.Typer(name=name, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app = typer.Typer(
+        name=name,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
     app.callback(help=about, epilog=f"\b\ndocs/… in a message is a page below\n{pages()}")(_global_options)
     return app
 

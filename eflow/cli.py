@@ -265,20 +265,20 @@ def predict(
     method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     reading = EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort)
     file = infer.open_sized(events, reading)
-    for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
+    height, width = infer.sensor_of(file)
+    for line in doubts(next(iter(file.chunks()), Events.empty()), height, width):
         typer.echo(f"{events}: {line}", err=True)
-    shape = (file.height, file.width)
-    outputs = Outputs(out, video, npy, infer.read_truth(truth, *shape) if truth else None, at_events)
+    outputs = Outputs(out, video, npy, infer.read_truth(truth, height, width) if truth else None, at_events)
 
     def predictor_of(name: str, **options) -> infer.Predictor:
         model, own = network_of(name, device, raw, precision, iterations, options.get("warm_start", False))
-        return infer.Predictor(model, *shape, precision=own, empty=empty, **options)
+        return infer.Predictor(model, height, width, precision=own, empty=empty, **options)
 
     if checkpoint == AUTO and not Path(AUTO).exists():
         checkpoint, why = chosen(file, asked, predictor_of)
         typer.echo(f"network: {why}")
     if method is not None:
-        predictor, reads = infer.MethodPredictor(method, *shape, empty=empty), ("old", "new")
+        predictor, reads = infer.MethodPredictor(method, height, width, empty=empty), ("old", "new")
     else:
         predictor = predictor_of(checkpoint, warm_start=warm_start, sharpen=sharpen)
         reads = predictor.model.reads

@@ -66,9 +66,8 @@ def evaluate(
     if out is not None:
         refuse_existing(out)
     out = Path(out) if out is not None else None
-    method = None if isinstance(model, FlowModel) else model
-    representation = model.representation if method is None else PICTURED
-    reads = model.reads if method is None and not sharpen else ("old", "new")
+    representation = model.representation if isinstance(model, FlowModel) else PICTURED
+    reads = model.reads if isinstance(model, FlowModel) and not sharpen else ("old", "new")
     dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads, option="--empty skip")
     indices = evenly(len(dataset), limit or len(dataset))
     shown = {indices[k] for k in evenly(len(indices), pictures)}
@@ -81,12 +80,12 @@ def evaluate(
         batch = collate([sample])
         raw, scene = batch["raw"][0], batch["scene"][0]
         began = time.perf_counter()
-        if method is None:
+        if isinstance(model, FlowModel):
             flow = warm.predict(model, batch, (scene, raw.new.t0), (scene, raw.new.t1), precision)
             if sharpen:
                 flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow)[0])
         else:
-            flow = method(raw.old, raw.new, raw.height, raw.width)
+            flow = model(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began
         truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
         scores.add(scene, flow, truth, valid)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.formats import EventFile
 from eflow import infer
-from eflow.data.window import Window, hit_pixels
+from eflow.data.window import hit_pixels
 from eflow.infer import StreamWindow
 from eflow.methods.contrast import LEAST_EVENTS, ContrastMaximisation
 from eflow.methods.iwe import flow_warp_loss
@@ -82,7 +82,7 @@ def show_flows(
             writer = opened.enter_context(infer.flow_folder(outputs.folder, npy=outputs.npy))
         if outputs.video:
             fps = min(20.0, 1e6 / span)  # windows per second of video: real time, but at most 20
-            shown = opened.enter_context(flow_video(outputs.video, file.height, file.width, fps))
+            shown = opened.enter_context(flow_video(outputs.video, *infer.sensor_of(file), fps))
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
@@ -144,8 +144,8 @@ def _second_opinion(file, predictor, span: int, start: int, reads: Sequence[str]
     if flow_warp_loss(window.new, flow) < 1:
         say("  the flow makes the events in the middle no sharper: nothing moves there, or many things move at once")
     mine = np.median(flow[window.new.y, window.new.x], axis=0)
-    nothing = (getattr(window.new, k)[:0] for k in "xytp")
-    old = window.old if len(window.old) else Window(*nothing, window.new.t0 - span, window.new.t0)
+    none = window.new.take(np.zeros(len(window.new), bool))
+    old = window.old if len(window.old) else replace(none, t0=window.new.t0 - span, t1=window.new.t0)
     try:
         other = ContrastMaximisation("translation")(old, window.new, file.height, file.width)[0, 0]
     except BlinkGLError:
@@ -159,9 +159,9 @@ def _second_opinion(file, predictor, span: int, start: int, reads: Sequence[str]
 
 def _beside_truth(flow: np.ndarray, truth: np.ndarray, window: StreamWindow) -> str:
     """Return two lines: errors over all pixels with truth, and over those with events."""
-    valid, hit, lines = np.isfinite(truth).all(-1), hit_pixels((window.old, window.new), *truth.shape[:2]), ""
+    valid, hit, lines = np.all(np.isfinite(truth), axis=-1), hit_pixels((window.old, window.new), *truth.shape[:2]), ""
     for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
         m, zero = frame_metrics(flow, truth, mask), frame_metrics(np.zeros_like(flow), truth, mask)
-        if m:
+        if m and zero:
             lines += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
     return lines

@@ -123,10 +123,10 @@ def windows(
     The file is streamed: two windows and a chunk are in memory.
     Raises EventDataError: :data:`JUMP` windows in a row have no event; a clock that jumps would give billions."""
     pending, t, skipped = Events.empty(), None, span_us if "old" in reads else 0
-    last = None
+    last = 0
     for chunk in file.chunks():
         pending = Events.concatenate([pending, chunk])
-        if t is None:
+        if t is None or start_us is None:
             start_us = int(pending.t[0]) if start_us is None else start_us
             t = start_us + skipped
         last = int(chunk.t[-1])
@@ -168,7 +168,8 @@ def likely_span(
         raise EventDataError("holds no events", where=str(file.path))
     first, last = ends
     longest = max((last + 1 - first) // (2 if "old" in reads else 1), 1000)
-    span, before = min(30_000, longest), None
+    span = min(30_000, longest)
+    before: tuple[int, float] | None = None
     for _ in range(4):
         speeds = []
         for window in at_places(file, span, first, last, reads):
@@ -185,7 +186,7 @@ def likely_span(
         # longer ones: the last length stays for which it grew at least by half of what the length did. Where hardly
         # anything moves this says nothing.
         grows = before is None or span < before[0] or speed >= 0.5 * before[1] * (1 + span / before[0])
-        if not grows and before[1] > LIKELY_PX / 10:
+        if before is not None and not grows and before[1] > LIKELY_PX / 10:
             return before[0], longest
         before = span, speed
         # Not more at once: the speed was measured at another length of window.
@@ -260,7 +261,9 @@ class WarmStart:
     ``count`` : windows that did."""
 
     def __init__(self, on: bool):
-        self.on, self._end, self._low, self.count = on, None, None, 0
+        self.on, self.count = on, 0
+        self._end: Hashable = None
+        self._low: torch.Tensor | None = None
 
     def predict(self, model: FlowModel, batch: dict, start: Hashable, end: Hashable, precision: str) -> np.ndarray:
         """Return the flow (H, W, 2) px of a window, :func:`predict` of a batch of one.
@@ -337,6 +340,12 @@ def open_sized(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Even
     return open_events(path, reading).sized()
 
 
+def sensor_of(file: EventFile) -> tuple[int, int]:
+    """Return (height, width) px of a file that :func:`open_sized` opened."""
+    assert file.height is not None and file.width is not None
+    return file.height, file.width
+
+
 def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
     """Return the ground truth of one window, (H, W, 2) px, NaN where there is none.
 
@@ -387,7 +396,7 @@ class FlowWriter:
     ) -> None:
         """Write one window.   flow : (H, W, 2) px.   tensor : the new window's events, as a predictor returns them.
         at_events : flow of pixels without events nearby is not valid, NaN in ``npy/``."""
-        name, valid, flow = f"{self.count:06d}", np.isfinite(flow).all(-1), flow.astype(np.float32, copy=False)
+        name, valid, flow = f"{self.count:06d}", np.all(np.isfinite(flow), axis=-1), flow.astype(np.float32, copy=False)
         near = near_events(tensor)
         if at_events:
             valid &= near
@@ -396,7 +405,7 @@ class FlowWriter:
             if self.npy:
                 values = np.where(valid[..., None], flow, np.float32(np.nan)) if at_events else flow
                 self._part("npy", f"{name}.npy").write_bytes(encode_npy(values))
-            where = None if truth is None else np.isfinite(truth).all(-1)
+            where = None if truth is None else np.all(np.isfinite(truth), axis=-1)
             strip = comparison(events_of(tensor), flow, truth, where, near=near)
             write_picture(self._part("pictures", f"{name}.png"), strip)
         self.lines.append(f"{window.new.t0}, {window.new.t1}")

@@ -44,8 +44,9 @@ def load_train_config(
     path = Path("train.yaml" if path is None else path)
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p is unchanged
     tree = apply_overrides(tree, overrides)
-    if tree.get("model") is None and isinstance(tree.get("init_from"), str):
-        tree = {**tree, "model": config_of(_start(tree["init_from"], absolute))}
+    own = tree.get("init_from")
+    if tree.get("model") is None and isinstance(own, str) and (start := _start(own, absolute)) is not None:
+        tree = {**tree, "model": config_of(start)}
     config = validate(TrainConfig, tree)
     sources = {
         k: tuple(

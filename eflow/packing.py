@@ -41,7 +41,7 @@ def pack(
             value=name,
             accepted="small letters, digits, _ and -; not the name of a method or an architecture",
         )
-    text = validate(CardText, read_table(card), where=str(card))
+    text = validate(CardText, read_table(os.fspath(card)), where=str(card))
     final = Path(out) / name
     refuse_existing(final)
     model = load_model(checkpoint, averaged=averaged)

@@ -106,7 +106,7 @@ def flow_video(path: str | os.PathLike, height: int, width: int, fps: float) -> 
     fps : windows per second of video. Raises OutputError: the video cannot be written."""
     factor, still = 2 if height < 200 else 1, np.zeros((height, width, 2), np.float32)
     blank = _fitted(comparison(np.zeros((height, width, 3), np.uint8), still), factor)
-    with atomic_file(path, overwrite=False) as final, VideoWriter(final, *blank.shape[:2], fps) as video:
+    with atomic_file(path, overwrite=False) as final, VideoWriter(final, blank.shape[0], blank.shape[1], fps) as video:
         yield FlowVideo(video, factor)
 
 

@@ -47,7 +47,9 @@ class TrainProgress:
         clock: Callable[[], float] = time.monotonic,
     ):
         self.steps, self.batch, self.enabled, self._clock = steps, batch, enabled, clock
-        self.rate, self._loss, self._epe = 0.0, None, None
+        self.rate = 0.0
+        self._loss: float | None = None
+        self._epe: float | None = None
         self._step, self._time, self._said = start, clock(), -float("inf")
         began = self._time if began is None else began
         self._deadline = None if minutes is None else began + 60 * minutes

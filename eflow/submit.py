@@ -87,6 +87,7 @@ def _dsec_png(flow: np.ndarray, name: str) -> bytes:
             accepted="finite flow within ±256 px",
         )
     raw = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert raw is not None
     raw[..., 0] = 0  # BGR: blue is the third channel on disk
     return encode_png(raw)
 
@@ -189,7 +190,9 @@ def _flows(
     flow."""
     dataset, warm = FlowDataset([source], model.representation, raw=True, reads=model.reads), WarmStart(warm_start)
     for i in range(len(dataset)):
-        batch = collate([dataset[i]])
+        sample = dataset[i]
+        assert sample is not None  # empty windows are an error
+        batch = collate([sample])
         raw = batch["raw"][0]
         yield i, warm.predict(model, batch, (raw.scene, raw.new.t0), (raw.scene, raw.new.t1), precision)
         if progress is not None:

@@ -142,7 +142,7 @@ class Training:
             ckpt.load_weights(self.model, *weights_of(config))
         self.model.to(self.device)
         if config.run.channels_last:
-            self.model.to(memory_format=torch.channels_last)
+            self.model.to(memory_format=torch.channels_last)  # type: ignore[no-matching-overload]
         self.optimizer = _optimizer(self.model, config.optim, self.device)
         self.ema = {k: v.detach().clone() for k, v in self.model.state_dict().items()} if config.optim.ema else None
         if self.saved is None:
@@ -176,8 +176,9 @@ class Training:
     def _parallel(self) -> torch.nn.Module:
         """Return the network, compiled or wrapped to average gradients over processes if the configuration asks for
         it."""
-        if self.config.run.compile and hasattr(self.model, "update"):
-            self.model.update.compile()
+        update = getattr(self.model, "update", None)
+        if self.config.run.compile and isinstance(update, torch.nn.Module):
+            update.compile()
         if self.world == 1:
             return self.model
         return DistributedDataParallel(
@@ -264,8 +265,12 @@ class Training:
         done = []
         for first in range(0, len(batch["name"]), size):
             part = {k: v[first : first + size] for k, v in batch.items()}
-            later = self.world > 1 and first + size < len(batch["name"])
-            with self.net.no_sync() if later else contextlib.nullcontext():
+            later = first + size < len(batch["name"])  # several processes add up their gradients once, at the end
+            with (
+                self.net.no_sync()
+                if later and isinstance(self.net, DistributedDataParallel)
+                else contextlib.nullcontext()
+            ):
                 done.append(_forward(self.net, part, self.config, count))
                 done[-1][0].backward()
         losses, errors, flows = zip(*((loss.detach(), error, flow) for loss, error, flow in done), strict=True)

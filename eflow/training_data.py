@@ -28,7 +28,9 @@ def training_sets(
 
     ``stack`` ends the rendering processes. Each rank renders its own sequences, different from those of other ranks."""
     data = config.data
-    sources = {k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if not s.online}
+    sources: dict[int, Source] = {
+        k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if s.path is not None
+    }
     sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
     mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
     for k, s in enumerate(data.train):
@@ -67,14 +69,14 @@ def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, Fl
     """Return (name, set, indices of the samples to score) for every set of ``data.validate_on``."""
     sets = []
     for s in config.data.validate_on:
-        if s.online:
+        if s.path is None:
             from eflow.data.online import held
 
             source = held(s, config.data.validate_samples)
         else:
             source = open_source(s.path, s.format, dt=s.dt)
         dataset = FlowDataset([source], model.representation, empty=config.data.empty, reads=model.reads)
-        title = Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
+        title = Path(s.path or str(s.recipe)).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
         sets.append((title, dataset, evenly(len(dataset), config.data.validate_samples)))
     return sets
 
@@ -114,7 +116,7 @@ def validate(
                 truths, valids = batch["flow"].permute(0, 2, 3, 1).numpy(), (batch["valid"] & batch["mask"]).numpy()
                 for flow, truth, valid in zip(flows, truths, valids, strict=True):
                     metrics, zero = frame_metrics(flow, truth, valid), frame_metrics(np.zeros_like(flow), truth, valid)
-                    if metrics:
+                    if metrics and zero:
                         rows.append((metrics["AEE"], zero["AEE"]))
             scores[f"{name}/AEE"], scores[f"{name}/zero"] = (
                 (float(v) for v in np.mean(rows, axis=0)) if rows else (float("nan"),) * 2

@@ -137,10 +137,11 @@ def passes(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
         render = config.render.model_copy(update={"antialiasing": antialiasing})
         return stack.enter_context(Renderer(gl, scene, render))
 
-    drawn = {kind: renderer(kind) for kind in ("none", "edges", "ssaa2")}
-    return {
-        kind: lambda one=one: [one.luminance(next(times)).read() for _ in range(4)] and 4 for kind, one in drawn.items()
-    }
+    def frames(kind: str) -> Callable[[], float]:
+        drawn = renderer(kind)
+        return lambda: len([drawn.luminance(next(times)).read() for _ in range(4)])
+
+    return {kind: frames(kind) for kind in ("none", "edges", "ssaa2")}
 
 
 def labels(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
@@ -196,8 +197,11 @@ def start(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
         "eflow --help": "import eflow.cli, sys; sys.argv[1:] = ['--help']; eflow.cli.main()",
     }
     here = f"import sys; sys.path.insert(0, {sys.path[0]!r}); "
-    run = lambda text: subprocess.run([sys.executable, "-c", here + text], capture_output=True, check=False) and None
-    return {name: lambda text=text: run(text) for name, text in programs.items()}
+
+    def run(text: str) -> None:
+        subprocess.run([sys.executable, "-c", here + text], capture_output=True, check=False)
+
+    return {name: partial(run, text) for name, text in programs.items()}
 
 
 def pace(recipe: str, workers: int, step_ms: float, samples: int) -> dict[str, float]:

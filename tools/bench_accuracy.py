@@ -45,7 +45,7 @@ def compare(gl, template, index: int) -> dict[str, float]:
     same = (ours.ids == exact.instance) & (exact.instance > 0)
     inside = same & ~band
     norm = lambda v: np.hypot(v[..., 0], v[..., 1])
-    result = {
+    result: dict[str, float] = {
         "sequence": index,
         "triangles": triangles,
         "pixels": int(same.size),

@@ -16,7 +16,6 @@ from typing import Any
 import annotated_types
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
 from blinkgl.config.base import is_model, members, tag_of
 from blinkgl.config.primitives import PRIMITIVES
@@ -197,7 +196,7 @@ def _name(annotation: Any) -> str:
 def _default(info: FieldInfo) -> str:
     if info.is_required():
         return "required"
-    value = info.default if info.default is not PydanticUndefined else info.default_factory()
+    value = info.get_default(call_default_factory=True)
     if isinstance(value, BaseModel):
         tag = tag_of(type(value))
         return f"`{tag[0]}: {tag[1]}`" if tag and len(_models(info.annotation)) > 1 else "see below"

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -210,8 +211,8 @@ def shapes() -> dict[str, Any]:
     said = {kind: told_mesh(BUILDERS[kind](**keys)) for kind, keys in other.items()}
     for kind in ("cuboid", "sphere", "prism", "torus"):
         mesh = BUILDERS[kind](**other[kind])
-        for name, keys in {"creased": {}, "tiled": {"uv_size": 0.37}}.items():
-            said[f"{kind} {name}"] = told_mesh(make_mesh(mesh.vertices, mesh.faces, **keys))
+        for name, make in {"creased": make_mesh, "tiled": partial(make_mesh, uv_size=0.37)}.items():
+            said[f"{kind} {name}"] = told_mesh(make(mesh.vertices, mesh.faces))
     return said
 
 
@@ -257,7 +258,7 @@ def events() -> dict[str, Any]:
     frames, times = clip()
     said = {}
     for name, config in EMULATORS.items():
-        emulator = make_emulator(config, *frames.shape[1:], 9)
+        emulator = make_emulator(config, frames.shape[1], frames.shape[2], 9)
         chunks = [emulator.step(f, int(t)) for f, t in zip(frames, times)]
         said[name] = told_events(Events.concatenate(chunks))
         bus = Readout(ReadoutConfig(events_per_second=100_000, queue_events=50, row_ns=300))

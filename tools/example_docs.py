@@ -85,6 +85,7 @@ in their docstrings (`help(blinkgl.Scene)`).
 def load(name: str, root: Path = ROOT) -> ModuleType:
     """The example as a module."""
     spec = importlib.util.spec_from_file_location(f"example_{name}", root / f"{name}.py")
+    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -111,7 +112,9 @@ def cells(notebook: Path) -> list[str]:
 def section(name: str, output: str, root: Path = ROOT) -> str:
     """The example's part of the page."""
     source = (root / f"{name}.py").read_text(encoding="utf-8")
-    title = re.match(r'"""(.*?)"""', source, re.S)[1].strip()
+    docstring = re.match(r'"""(.*?)"""', source, re.S)
+    assert docstring is not None
+    title = docstring[1].strip()
     picture = f"\n![{PICTURES[name][2]}](images/{PICTURES[name][1]})\n" if name in PICTURES else ""
     return (
         f'## {name}\n\n{title}\n\n???+ example "examples/{name}.py"\n\n    ``` {{.python}}\n'

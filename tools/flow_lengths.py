@@ -41,6 +41,7 @@ def of_pool(path: str) -> Iterator[tuple[StreamWindow, np.ndarray]]:
     source = open_source(path)
     for i in range(len(source)):
         sample = source[i]
+        assert sample.flow is not None and sample.valid is not None
         yield (
             StreamWindow(sample.new.t0, sample.old, sample.new),
             np.where(sample.valid[..., None], sample.flow, np.nan),
@@ -87,7 +88,7 @@ def of_views(model: FlowModel, path: str, limit: int) -> list[list[list[object]]
     tripled, by the length of the flow before it: whether they are worse than others with such flow."""
     source = open_source(path)
     samples = [source[int(i)] for i in np.linspace(0, len(source) - 1, min(limit, len(source))).round().astype(int)]
-    samples = [s for s in samples if s.valid.any()]
+    samples = [s for s in samples if s.valid is not None and s.valid.any()]
     errors = {name: np.array([_error(model, view(s)) for s in samples]) for name, view in VIEWS.items()}
     plain, thin, tripled = (errors[name] for name in ("as it is", THINNED, TRIPLED))
     share = lambda of: float(of[:, 0].mean() / of[:, 1].mean()) if len(of) else float("nan")
@@ -105,6 +106,7 @@ def of_views(model: FlowModel, path: str, limit: int) -> list[list[list[object]]
 def _error(model: FlowModel, s: RawSample) -> tuple[float, float, float]:
     """Error of a sample, and zero flow's, px; events per pixel of the new window."""
     predictor = Predictor(model, s.height, s.width, empty="zero")
+    assert s.flow is not None and s.valid is not None
     flow, true = predictor(StreamWindow(s.new.t0, s.old, s.new))[0][s.valid], s.flow[s.valid]
     return np.hypot(*(flow - true).T).mean(), np.hypot(*true.T).mean(), len(s.new) / (s.height * s.width)
 
@@ -123,7 +125,8 @@ def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -
         for sharpen in (False, True):
             flow = Predictor(model, height, width, empty="zero", sharpen=sharpen)(pair)[0][hit]
             row += [np.hypot(*flow.T).sum() / size.sum(), np.hypot(*(flow - true).T).sum() / size.sum()]
-        yield float(np.median(size)), *map(float, row)
+        share, error, sharp_share, sharp_error = map(float, row)
+        yield float(np.median(size)), share, error, sharp_share, sharp_error
 
 
 def rows_of(found: list[Judged], edges: Iterable[tuple[float, float]]) -> list[list[object]]:

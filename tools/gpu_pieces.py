@@ -26,7 +26,7 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
-from blinkgl.events.table import emulator_of
+from blinkgl.events.table import emulator_of, make_emulator
 from blinkgl.gl import Target, create_context
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.render.renderer import Renderer
@@ -129,7 +129,7 @@ def overrides(*pairs: str) -> list[str]:
 
 def only(*groups: str) -> list[str]:
     """Return overrides that leave these groups of blinkflow.yaml."""
-    known = load_run(resources.files("blinkgl.configs") / "blinkflow.yaml").groups
+    known = load_run(str(resources.files("blinkgl.configs") / "blinkflow.yaml")).groups
     return [f"groups.{group.name}.enabled={str(group.name in groups).lower()}" for group in known]
 
 
@@ -192,8 +192,10 @@ def arrays_of(name: str) -> dict[str, np.ndarray]:
                 array = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             else:
                 with DsecEventReader(path) as reader:
+                    assert reader.height is not None and reader.width is not None
                     events, sides = reader.slice(0, 2**40), (range(reader.height + 1), range(reader.width + 1))
                 array = np.histogram2d(events.y, events.x, sides)[0].astype(np.uint16)
+            assert array is not None
             found[f"{name}/{path.relative_to(out).as_posix()}"] = array
     return found
 
@@ -256,7 +258,7 @@ def _kernel_speed(options: Namespace, height: int, width: int, density: float, e
     clip = noise(height, width, density, 3)[1:]  # there and back again, for ever
     frames = torch.from_numpy(clip).to(options.device)[:, None].expand(2, envs, height, width).contiguous()
     batch = TensorEsim(height, width, config, envs=envs, device=options.device)
-    single = emulator_of(config)(height, width, config)
+    single = make_emulator(config, height, width)
     seconds, made = timed(lambda k: len(batch.step(frames[k % 2], k * STEP_NS)), 0.06 if options.small else 1.5)
     numba_s, numba_made = timed(lambda k: len(single.step(clip[k % 2], k * STEP_NS)), 0.06 if options.small else 0.5)
     state = sum(t.numel() * t.element_size() for t in vars(batch).values() if isinstance(t, torch.Tensor))

@@ -72,6 +72,7 @@ def read(path: Path) -> tuple[Events, int, int]:
     if path.suffix != ".mat":
         with open_events(path) as file:
             sized = file.sized()
+            assert sized.height is not None and sized.width is not None
             return sized.read(), sized.height, sized.width
     from scipy.io import loadmat
 
@@ -205,7 +206,7 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
     (height, width), (t0, middle, t1) = truth.shape[:2], known.times
     # A method's flow is over its new window, which must lie behind an old one.
     whole, halves = cut(events, t0, t1 - t0), cut(events, middle, t1 - middle)
-    valid, hit = np.isfinite(truth).all(-1), hit_pixels([whole.new], height, width)
+    valid, hit = np.all(np.isfinite(truth), axis=-1), hit_pixels([whole.new], height, width)
     flows = best_of(truth, valid)
     for name in names:
         if name in METHODS:
@@ -292,8 +293,11 @@ def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float
     """The same of a data set with labels: its samples as pairs of windows, at most ``most``, evenly spaced."""
     source = open_source(path)
     samples = (source[int(i)] for i in np.unique(np.linspace(0, len(source) - 1, most).round().astype(int)))
-    told = (s for s in samples if s.flow is not None and s.valid is not None and s.valid.any())
-    pairs = ((StreamWindow(s.new.t0, s.old, s.new), np.where(s.valid[..., None], s.flow, np.nan)) for s in told)
+    pairs = (
+        (StreamWindow(s.new.t0, s.old, s.new), np.where(s.valid[..., None], s.flow, np.nan))
+        for s in samples
+        if s.flow is not None and s.valid is not None and s.valid.any()
+    )
     return of_pairs(pairs, names, str(path))
 
 
@@ -305,7 +309,7 @@ def of_pairs(
     judged: dict[str, list] = {}
     for pair, flow in pairs:
         size = flow.shape[:2]
-        valid = np.isfinite(flow).all(-1)
+        valid = np.all(np.isfinite(flow), axis=-1)
         for name in names:
             answers.setdefault(name, answer_of(name, *size))
         hit, truth = hit_pixels((pair.old, pair.new), *size), np.where(valid[..., None], flow, 0.0).astype(np.float64)
@@ -340,7 +344,7 @@ def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
         for k in range(int(13 / speed * fps) + 1):
             x, y = DIRECTION * speed * k / fps - 40
             moved = cv2.warpAffine(
-                soft, np.float32([[1, 0, x], [0, 1, y]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+                soft, np.array([[1, 0, x], [0, 1, y]], np.float32), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
             )
             frames.append(0.9 * moved**2.2 + 0.02)
         events = Events.concatenate([*frames_to_events(frames, fps=fps, emulator=emulator_config(emulator))])

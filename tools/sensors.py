@@ -124,7 +124,9 @@ def kick_of(clip: Clip, config: EmulatorConfig) -> float:
 
 def noise(camera: str, emulator: str) -> dict[str, Any]:
     """The emulator's noise of single pixels, which is not fitted."""
-    leak = {"k4": load_sensor(camera).leak_rate_hz * 1e-6, "k5": 0.0}
+    leak_hz = load_sensor(camera).leak_rate_hz
+    assert leak_hz is not None
+    leak = {"k4": leak_hz * 1e-6, "k5": 0.0}
     return {"v2e": NOISE_ELSEWHERE, "voltmeter": leak}.get(emulator, {})
 
 
@@ -186,7 +188,9 @@ def lines(found: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterat
                 kick = kick_of(clip, config) if len(clip.bursts) and said == "all" else KICK
                 rows.append([f"{camera}, {emulator}", name, said, *row(clip, config, kick)])
                 if len(clip.bursts) and said == "all":
-                    every = resets(clip, kick).frame_resets.interval_ms
+                    readout = resets(clip, kick)
+                    assert readout is not None and readout.frame_resets is not None
+                    every = readout.frame_resets.interval_ms
                     yield f"{camera}, {name}, {emulator}: resets every {every:.1f} ms by {kick:.2f} thresholds"
     yield table("camera, emulator", heads, rows)
 
@@ -202,7 +206,8 @@ def picture(found: dict[str, dict[str, MakeClip]], emulators: list[str], path: P
         middle_us = int(clip.edges_us[0] + clip.edges_us[-1]) // 2
         streams = {f"{name}, recorded": clip.events}
         for emulator in emulators:
-            readout = resets(clip, sensor.readout.frame_resets.kick) if sensor.readout.frame_resets else None
+            kicked = sensor.readout.frame_resets if sensor.readout is not None else None
+            readout = resets(clip, kicked.kick) if kicked else None
             streams[f"sensor: {camera}, {emulator}"] = clip.simulate(sensor.emulator(emulator), 1, readout=readout)
         for axis, (title, events) in zip(row_of, streams.items()):
             shown = events.window(middle_us - 12_500, middle_us + 12_500)

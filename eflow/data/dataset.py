@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol, TypeGuard
 
 import numpy as np
 import torch
@@ -20,6 +21,9 @@ from eflow.config import AugmentConfig
 from eflow.data.representation import Representation
 from eflow.data.sources import Source
 from eflow.data.window import RawSample
+
+if TYPE_CHECKING:
+    from blinkgl.online.stream import StreamStats
 
 ENDLESS = 4096
 """Number of samples of an endless source in an epoch."""
@@ -233,9 +237,16 @@ def evenly(of: int, count: int) -> list[int]:
     return [int(k) for k in np.linspace(0, of - 1, min(count, of)).round()]
 
 
-def is_endless(source: Source) -> bool:
-    """Whether a source is endless: its samples can be taken once, in order
-    (:class:`~eflow.data.online.OnlineSource`)."""
+class Endless(Source, Protocol):
+    """A source whose samples can be taken once, in order (:class:`~eflow.data.online.OnlineSource`)."""
+
+    stats: StreamStats
+
+    def first(self) -> RawSample: ...
+
+
+def is_endless(source: Source) -> TypeGuard[Endless]:
+    """Whether a source is endless."""
     return getattr(source, "endless", False)
 
 

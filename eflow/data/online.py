@@ -45,10 +45,10 @@ class OnlineSource(Closing):
     def __len__(self) -> int:
         raise TypeError("an online source is endless")
 
-    def __getitem__(self, n: int) -> RawSample:
+    def __getitem__(self, index: int) -> RawSample:
         if self._uses == 1:
-            return _windows(self.stream.take(n))
-        newest, age = divmod(n, self._uses)
+            return _windows(self.stream.take(index))
+        newest, age = divmod(index, self._uses)
         if age == 0 and (gone := newest - self._uses * self._apart) >= self.stream.first:
             self.stream.drop(gone)
         wanted = newest - age * self._apart

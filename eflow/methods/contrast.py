@@ -266,7 +266,9 @@ class ContrastMaximisation:
 
     def _family(self, height: int, width: int):
         if self.field == "rotation":
-            return lambda x, y: rotation_field(x, y, height, width, self.focal)
+            focal = self.focal
+            assert focal is not None
+            return lambda x, y: rotation_field(x, y, height, width, focal)
         if self.field == "translation":
             return lambda x, y: affine_field(x, y, height, width).first(2)
         return lambda x, y: affine_field(x, y, height, width)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from blinkgl.config.base import Config, tag_of
+from blinkgl.config.base import Config
 from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
 from eflow.config import ModelConfig
@@ -21,7 +21,8 @@ from eflow.models.spike_flownet import SpikeFlowNet
 from eflow.models.ste_flownet import SteFlowNet
 
 NETWORKS: dict[str, type[FlowModel]] = {
-    tag_of(model.Config)[1]: model for model in (EFlowFormer, Eraft, SteFlowNet, EvFlowNet, SpikeFlowNet)
+    model.Config.model_fields["name"].default: model
+    for model in (EFlowFormer, Eraft, SteFlowNet, EvFlowNet, SpikeFlowNet)
 }
 """The networks by the key ``name`` of their configuration: the only list of networks."""
 SIZES = ("base", "small", "tiny")

@@ -39,12 +39,12 @@ class Mlp(nn.Sequential):
             nn.Linear(MLP_RATIO * dim, dim),
         )
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, input: Tensor) -> Tensor:
         # Gradients need the hidden layers anyway, and a GPU is faster without blocks.
-        if torch.is_grad_enabled() or x.device.type != "cpu" or torch.compiler.is_compiling():
-            return super().forward(x)
-        blocks = x.reshape(-1, x.shape[-1]).split(_TOKENS)
-        return torch.cat([super(Mlp, self).forward(block) for block in blocks]).view(x.shape)
+        if torch.is_grad_enabled() or input.device.type != "cpu" or torch.compiler.is_compiling():
+            return super().forward(input)
+        blocks = input.reshape(-1, input.shape[-1]).split(_TOKENS)
+        return torch.cat([super(Mlp, self).forward(block) for block in blocks]).view(input.shape)
 
 
 class EnhancementLayer(nn.Module):
@@ -126,6 +126,7 @@ class EFlowFormer(Eraft):
         if config.quick:
             self.project = nn.Conv2d(self.widths.trunk[-1], dim, 1)
             initialise(self.project)
+            assert isinstance(self.context, QuickContext)
             nn.init.normal_(self.context.flow.weight, std=1e-3)  # its flow is near zero at the start
         elif config.init == "match" and config.match_prior is not None:
             # A displacement of match_prior cells lowers the logit by 1/2: the factor is 1 / (2 sigma^2).
@@ -148,17 +149,17 @@ class EFlowFormer(Eraft):
         both = self.features(torch.cat([batch["old"], batch["new"]]))
         correlation = self._correlation(*self.enhance(*self.project(both).chunk(2)))
         old, new = both.chunk(2)
-        still = pixel_grid(*old.shape[-2:], old).expand(len(old), -1, -1, -1)
+        still = pixel_grid(old.shape[-2], old.shape[-1], old).expand(len(old), -1, -1, -1)
         seen, flow = self.context(old, new, correlation.lookup(still))
         first, warm = bilinear_upsample(flow) if self.training else None, batch.get("flow_init")
         return correlation, seen, flow if warm is None else warm, first
 
     def enhance(self, f1: Tensor, f2: Tensor) -> tuple[Tensor, Tensor]:
-        if not len(self.layers):
+        if self.norm is None:
             return f1, f2
         x = torch.cat([f1, f2])
         # Channels last for attention, after the position code is added.
-        x = (x + sine_position(*x.shape[-2:], x.shape[1], x).to(x.dtype)).permute(0, 2, 3, 1)
+        x = (x + sine_position(x.shape[-2], x.shape[-1], x.shape[1], x).to(x.dtype)).permute(0, 2, 3, 1)
         for layer in self.layers:
             x = layer(x)
         return self.norm(x).permute(0, 3, 1, 2).chunk(2)
@@ -174,7 +175,7 @@ class EFlowFormer(Eraft):
         """Return the cost of a displacement and the gain of the logits, both learnt: without them the softmax of
         features that know nothing yet is flat, and its expectation the middle of the image, far worse than no
         flow at all."""
-        if self.log_prior is None:
+        if self.log_prior is None or self.log_gain is None:
             return None, None
         # Logarithms keep both positive.
         return (RATE * self.log_prior.float()).exp(), (RATE * self.log_gain.float()).exp()

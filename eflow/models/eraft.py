@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from eflow.config import EraftConfig
+from eflow.config import EFlowFormerConfig, EraftConfig
 from eflow.data.representation import VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
 from eflow.ops.correlation import DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, channels_of, pixel_grid
@@ -39,7 +39,7 @@ SIZES = {
 }
 
 
-def widths_of(config: EraftConfig) -> Widths:
+def widths_of(config: EraftConfig | EFlowFormerConfig) -> Widths:
     """Return the widths of a configuration: those of its size, unless it sets them."""
     own = {f.name: getattr(config, f.name) for f in fields(Widths)}
     return replace(SIZES[config.size], **{k: v for k, v in own.items() if v is not None})
@@ -126,12 +126,14 @@ class SepConvGru(nn.Module):
         ready, first, last = [], self.hidden, 2 * self.hidden
         # Slices of each weight: [hidden | context | motion].
         for conv in (c for pair in zip(self.gates, self.candidates, strict=True) for c in pair):
+            assert isinstance(conv, nn.Conv2d)
             weight = torch.cat([conv.weight[:, :first], conv.weight[:, last:]], 1)
             ready.append((weight, F.conv2d(context, conv.weight[:, first:last], conv.bias, padding=conv.padding)))
         return ready
 
     def forward(self, h: Tensor, ready: list[tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
         for i, gate in enumerate(self.gates):
+            assert isinstance(gate, nn.Conv2d)
             (w_gate, c_gate), (w_new, c_new) = ready[2 * i], ready[2 * i + 1]
             # Update gate z, reset gate r; the candidate sees the reset state (Cho et al. 2014).
             z, r = torch.sigmoid(F.conv2d(torch.cat([h, motion], 1), w_gate, padding=gate.padding) + c_gate).chunk(2, 1)
@@ -171,7 +173,7 @@ class Eraft(FlowModel):
 
     Config = EraftConfig
 
-    def __init__(self, config: EraftConfig):
+    def __init__(self, config: EraftConfig | EFlowFormerConfig):
         super().__init__()
         self.config, self.widths = config, widths_of(config)
         w = self.widths
@@ -187,7 +189,9 @@ class Eraft(FlowModel):
         self.update = Update(channels_of(w.levels, w.radius), w.hidden)
         initialise(self)
         # The first Δflow is near zero.
-        nn.init.normal_(self.update.flow_head[-1].weight, std=1e-3)
+        last = self.update.flow_head[-1]
+        assert isinstance(last, nn.Conv2d)
+        nn.init.normal_(last.weight, std=1e-3)
 
     def forward(self, batch: dict) -> FlowPrediction:
         """Return the flow of a batch. Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution
@@ -199,7 +203,7 @@ class Eraft(FlowModel):
         h, c = torch.tanh(h), F.relu(c)
         flows = [] if first is None or not self.training else [first]
 
-        grid = pixel_grid(*h.shape[-2:], h)
+        grid = pixel_grid(h.shape[-2], h.shape[-1], h)
         context = self.update.gru.prepare(c)
         iterations = self.config.train_iterations if self.training else self.config.iterations
         h, flow = self._burn_in(h, flow, context, correlation, grid) if self.training else (h, flow)

@@ -39,9 +39,10 @@ class EvFlowNet(FlowModel):
                 for c, c_out in ((16 * w, 4 * w), (8 * w + 2, 2 * w), (4 * w + 2, w), (2 * w + 2, w // 2))
             ]
         )
-        self.heads = nn.ModuleList([ScaledTanh(c) for c in (4 * w, 2 * w, w, w // 2)])
+        heads = [ScaledTanh(c) for c in (4 * w, 2 * w, w, w // 2)]
+        self.heads = nn.ModuleList(heads)
         initialise(self)
-        for head in self.heads:
+        for head in heads:
             head.calm()
 
     def forward(self, batch: dict) -> FlowPrediction:

@@ -26,7 +26,7 @@ class _Fire(torch.autograd.Function):
         return spikes
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):
+    def backward(ctx, gradient: Tensor):  # type: ignore[bad-override]
         # The surrogate gradient of Lee et al. 2020: 1 / threshold where a spike was.
         return gradient * ctx.saved_tensors[0] / ctx.threshold, None
 
@@ -86,7 +86,9 @@ class SpikeFlowNet(FlowModel):
             flow, up = decoder(x)
             flows.append(flow)
             if up is not None:
-                x = torch.cat([currents[2 - scale].to(up.dtype), up, flow.to(up.dtype)], 1)
+                skip = currents[2 - scale]
+                assert isinstance(skip, Tensor)
+                x = torch.cat([skip.to(up.dtype), up, flow.to(up.dtype)], 1)
         # Flow of a scale is in its own px.
         full = [to_size(f * (height / f.shape[-2]), height, width) for f in (flows if self.training else flows[-1:])]
         return FlowPrediction(full, kind="scales")

@@ -165,4 +165,5 @@ class ScaledTanh(nn.Module):
     def calm(self) -> None:
         """Initialise with small weights: a saturated tanh would not learn."""
         nn.init.normal_(self.conv.weight, std=1e-4)
+        assert self.conv.bias is not None
         nn.init.zeros_(self.conv.bias)

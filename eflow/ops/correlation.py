@@ -71,7 +71,7 @@ class DenseCorrelation:
         taps = []
         # Coordinates of a level are those of full resolution divided by its scale.
         for level, volume in enumerate(self.levels):
-            index, inside, fraction = patch_index(flat / 2**level, *volume.shape[-2:], self.radius)
+            index, inside, fraction = patch_index(flat / 2**level, volume.shape[-2], volume.shape[-1], self.radius)
             # ``inside`` sets taps outside the image to 0: their clamped index reads another pixel.
             patch = volume.flatten(1).gather(1, index.flatten(1)).view_as(inside) * inside
             taps.append(lerp_patch(patch, fraction))
@@ -109,7 +109,7 @@ class OnDemandCorrelation:
                 part, taps = slice(start, start + _CHUNK), []
                 for level, f2 in enumerate(self.levels):
                     at = flat[:, part].reshape(-1, 2) / 2**level
-                    index, inside, fraction = patch_index(at, *f2.shape[-2:], self.radius)
+                    index, inside, fraction = patch_index(at, f2.shape[-2], f2.shape[-1], self.radius)
                     tokens = f2.flatten(2).transpose(1, 2)  # (N, cells, D)
                     picked = torch.stack(
                         [

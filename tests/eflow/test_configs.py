@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from blinkgl.errors import ConfigError
 from eflow.cli import run
 from eflow.load_config import load_train_config
 from eflow.models import model_config
@@ -65,3 +66,10 @@ def test_a_training_that_was_said_in_part(words, said, tmp_path, monkeypatch, ca
     assert run(["train", *words]) == 2
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_an_empty_start_without_a_network_is_a_missing_network(tmp_path):
+    path = tmp_path / "train.yaml"
+    path.write_text('init_from: ""\ndata: {train: [{path: set}], crop: [64, 64]}\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match="model: is required; expected a table of keys"):
+        load_train_config(path)

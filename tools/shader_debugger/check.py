@@ -26,7 +26,7 @@ from blinkgl.tools.shader_debugger.session import LOOKUPS, Inspection, files_of,
 
 SURFACES = (("TINTED", "EMISSIVE"), ("EMISSIVE", "EMISSION_MAP"), ("GLOSSY",), ("BUMPED",), MORE)
 """Material features besides a base colour: each of MORE alone, where it is possible, and all of them."""
-KINDS = [Kind(*switches) for switches in product((False, True), repeat=3)]
+KINDS = [Kind(textured, lit, both) for textured, lit, both in product((False, True), repeat=3)]
 
 
 def kinds() -> list[Kind]:

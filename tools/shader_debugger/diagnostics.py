@@ -69,7 +69,7 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
     said = str(error).removeprefix(f"{error.where}: ")
     if error.log and sources:  # linking: names, but no lines
         # The later stage first: it uses what the earlier one does not provide.
-        for stage in reversed(sources):
+        for stage in reversed(list(sources)):
             for name in _QUOTED.findall(said):
                 if place := _declaration(sources[stage], name):
                     return [Diagnostic(*place, "error", said, stage, excerpt(folder, *place))]

@@ -4,8 +4,9 @@ area (``edges.glsl``), and the picture of a lens (``gather.glsl``)."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from scipy import ndimage
@@ -17,12 +18,21 @@ from blinkgl.render import lens
 from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.casting import pixel_grid
 from blinkgl.render.contours import Lines
+from blinkgl.render.frames import Frame
 from blinkgl.render.passes import Colour, Edged, Gather, Luminance, Pass
 from blinkgl.render.passes.edged import SKY
+from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.types import Scene
 
-if TYPE_CHECKING:
-    from blinkgl.render import Renderer
+
+class _Renderer(Protocol):
+    """What is used here of :class:`~blinkgl.tools.shader_debugger.session.DebugRenderer`, whose module needs this
+    one."""
+
+    scene: Scene
+    maps: tuple[ShadowMap, ...]
+    draw: Callable[[Pass, int], Frame]
+    at_pixels: Callable[[np.ndarray], np.ndarray]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -310,26 +320,26 @@ def places_of(camera: CameraModel) -> np.ndarray | None:
     return np.floor(lens.places_of(camera, flat, camera.width, camera.height).places).astype(np.intp)
 
 
-def pass_of(renderer: Renderer, what: str, samples: Samples = Samples()) -> Pass:
+def pass_of(renderer: _Renderer, what: str, samples: Samples = Samples()) -> Pass:
     """Return the pass that draws "luminance" or "colour"."""
     return {"luminance": Luminance, "colour": Colour}[what](samples, renderer.maps)
 
 
-def _parts(renderer: Renderer, name: str) -> tuple[str, Pass, Pass]:
+def _parts(renderer: _Renderer, name: str) -> tuple[str, Pass, Pass]:
     """Return (what the picture is of, the pass that draws it before, the pass that makes ``name`` from it)."""
     what, of_lens = name.partition("_")[0], name in LENSED
     of = pass_of(renderer, what, Samples() if of_lens else samples_of("edges"))
     return what, of, Gather(of, renderer.scene.camera, True) if of_lens else Edged(of)
 
 
-def drawn(renderer: Renderer, name: str, t_ns: int) -> np.ndarray:
+def drawn(renderer: _Renderer, name: str, t_ns: int) -> np.ndarray:
     """Return the program's result, (H, W) or (H, W, 3) float32; behind a lens ``edges`` makes a flat picture. name : of
     :data:`FILTERED`, here and below."""
     what, _, pass_ = _parts(renderer, name)
     return renderer.draw(pass_, t_ns).read(what)
 
 
-def reference_of(renderer: Renderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+def reference_of(renderer: _Renderer, name: str, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (the picture that the program reads, float32; its expected result, float64)."""
     written = drawn(renderer, name, t_ns)
     what, of, _ = _parts(renderer, name)

@@ -83,7 +83,7 @@ def levels(points: np.ndarray, texels: np.ndarray, xy: np.ndarray, camera: Camer
         # Lower and upper bound over both rows and both columns.
         low = np.maximum(along.min(axis=0), down.min(axis=0)).max(axis=1)
         high = np.maximum(along.max(axis=0), down.max(axis=0)).sum(axis=1)
-        usual = np.hypot(*np.moveaxis([along, down], -1, 0)).mean(axis=1).max(axis=0)
+        usual = np.hypot(*np.moveaxis(np.array([along, down]), -1, 0)).mean(axis=1).max(axis=0)
         # The sign says which side of the plane is visible; different signs mean that the horizon lies between.
         whole = np.abs(sides)[:, None] == 4
         return np.log2(np.where(whole, np.stack([low, usual, high], axis=1), [0.0, np.inf, np.inf]))
@@ -102,7 +102,7 @@ def needles(points: np.ndarray, camera: CameraModel) -> np.ndarray:
     points : (N, 3, 3) corners, camera axes.
     If a corner is wrong by e, barycentric coordinates are wrong by e / height, and the surface by that times the
     longest side. Triangles through the near plane are clipped; they have 1."""
-    whole = (points[..., 2] > camera.near).all(axis=1)
+    whole = np.all(points[..., 2] > camera.near, axis=1)
     # A corner behind the camera has no pixel: use any point in front, since the result is not used.
     px = camera.project(np.where(whole[:, None, None], points, [0.0, 0.0, 1.0]))
     sides = px - np.roll(px, 1, axis=1)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -25,7 +25,13 @@ from blinkgl.tools.shader_debugger.lamps import map_of, near_an_edge
 from blinkgl.tools.shader_debugger.mipmaps import levels, mipmapped_albedo, needles
 from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
 
-_T = TypeVar("_T")
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+_T = TypeVar("_T", bound=_Named)
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     exact = info.kind in ("mask", "ids")
     apart = None if exact else ulps(g, r)
     distance = float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if apart else 0.0
-    row = {
+    row: dict[str, object] = {
         "name": name,
         "title": info.title,
         "unit": info.unit,

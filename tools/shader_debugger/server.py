@@ -68,7 +68,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "BlinkGL", ""
     timeout = SILENT_S
-    server: _Server
+    server: _Server  # type: ignore[bad-override-mutable-attribute]
 
     def do_GET(self) -> None:
         self.close_connection = True
@@ -80,7 +80,9 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             if parts.path in PAGE:
                 name, kind = PAGE[parts.path]
-                return self._send(200, resources.files(__package__).joinpath("page", name).read_bytes(), kind)
+                return self._send(
+                    200, resources.files("blinkgl.tools.shader_debugger").joinpath("page", name).read_bytes(), kind
+                )
             if parts.path not in ROUTES:
                 return self._error(404, "no such page")
             route, query = parts.path[1:], read_query(parts.path, parts.query)
@@ -126,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(body)
 
-    def log_message(self, *arguments) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         """Write no log."""
 
 

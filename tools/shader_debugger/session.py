@@ -186,7 +186,7 @@ class Inspection(ScenePass):
     number of the part + 1, an index into ``casting.scene_parts``."""
 
     program: ClassVar[str] = DEBUG_PROGRAM
-    outputs: ClassVar[tuple[Output, ...]] = (
+    outputs: ClassVar[tuple[Output, ...]] = (  # type: ignore[bad-override]
         Output("TRIANGLE", "R32UI"),
         Output("LOCAL", "RGBA32F"),
         Output("WINDOW", "RGBA32F"),
@@ -210,7 +210,7 @@ class LuminanceLookup(Luminance):
     still: ClassVar[bool] = False
 
     @property
-    def outputs(self) -> Any:
+    def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
         return (*super().outputs, *SHOWN)
 
     def defines(self, kind: Any) -> Any:
@@ -259,6 +259,7 @@ class DebugRenderer(Renderer):
     @property
     def unused(self) -> set[tuple[str, str]]:
         """(program, name) of what was set so far and is not used by the edited shaders."""
+        assert isinstance(self._painter, DebugPainter)
         return self._painter.unused
 
     def use_shaders(self, loader: ShaderLoader) -> None:

@@ -199,8 +199,8 @@ class Measured:
     wall_s: list[float] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
     flow: dict[str, float] = field(default_factory=dict)
-    events: Events | None = field(default=None, repr=False)
-    errors: EventErrors | None = None
+    events: Events = field(init=False, repr=False)  # of the first round
+    errors: EventErrors = field(init=False, repr=False)  # by Bench.judge
     moved: dict[str, float] = field(default_factory=dict)
     """Last change of the reference, as a fraction of this setting's errors."""
 
@@ -253,11 +253,10 @@ class Level:
 
     @property
     def ratio(self) -> dict[str, float]:
-        return (
-            {k: self.movement[k] / self.smallest[k] if self.smallest[k] else float("inf") for k in JUDGED}
-            if self.movement
-            else {}
-        )
+        movement, smallest = self.movement, self.smallest
+        if not movement or smallest is None:
+            return {}
+        return {k: movement[k] / smallest[k] if smallest[k] else float("inf") for k in JUDGED}
 
     @property
     def converged(self) -> bool:

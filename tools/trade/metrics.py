@@ -108,7 +108,8 @@ def event_errors(
 
 def _spread(values: np.ndarray) -> tuple[float, float]:
     """Return the median and the 95th percentile; NaN for no values."""
-    return tuple(float(v) for v in np.percentile(values, (50, 95))) if len(values) else (float("nan"),) * 2
+    middle, high = np.percentile(values, (50, 95)) if len(values) else (np.nan, np.nan)
+    return float(middle), float(high)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -132,6 +133,7 @@ def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int, see
     exact = casting.flow_to(scene, hits, t_next_ns)
     flow, valid = exact.flow.reshape(PIXELS, len(_AROUND), 2)[:, 0], exact.valid.reshape(PIXELS, -1)[:, 0]
     ours = renderer.labels(t_ns, LabelRequest("ids", "flow_forward"), t_next_ns)
+    assert ours.forward is not None
     x, y = xy.T
     counts = (
         (ids == ids[:, :1]).all(axis=1)

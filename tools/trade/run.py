@@ -7,7 +7,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ COLUMNS = (
 )
 
 
-def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ()) -> tuple[Setting, ...]:
+def chosen(settings: tuple[Setting, ...], only: list[str], skip: Sequence[str] = ()) -> tuple[Setting, ...]:
     """Return the settings whose name contains one of ``only`` (default: all) and none of ``skip``. Raises ConfigError
     when none is left."""
     has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)

@@ -96,14 +96,14 @@ def run_suite(
 
     A scene that cannot be measured has a line with the reason. Raises BlinkGLError when none can."""
     out = Path(out)
-    settings = chosen(settings or suite_design(), list(only), list(skip))
-    asked = {"settings": [s.name for s in settings], "overrides": list(overrides), "cost": cost}
+    measured = chosen(settings or suite_design(), list(only), list(skip))
+    asked = {"settings": [s.name for s in measured], "overrides": list(overrides), "cost": cost}
     done: dict[str, dict] = {}
     began, failed = time.perf_counter(), []
     for scene in scenes:
         say(f"{scene.name}: {scene.what}")
         try:
-            done[scene.name] = _measured(scene, options, settings, overrides, cost, say)
+            done[scene.name] = _measured(scene, options, measured, overrides, cost, say)
         except BlinkGLError as error:
             failed.append(error)
             done[scene.name] = {"what": scene.what, "error": str(error)}

@@ -12,7 +12,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,7 +65,17 @@ _RANGES = {"figure.build": _PART, "figure.legs": _PART, "figure.arms": _PART, "f
 _RANGES |= {"fish.deep": (0.6, 1.6), "phase": (0.0, 1.0), "tempo": (0.1, 4.0), "wind": (0.1, 4.0)}
 
 
-BUILDERS: dict[str, Callable[..., Mesh]] = {}
+class Builder(Protocol):
+    """Builds the mesh of a primitive. ``checked`` binds its parameters without building; ``at_level`` builds a coarser
+    mesh, None for a primitive without levels of detail."""
+
+    checked: Callable[..., inspect.BoundArguments]
+    at_level: Callable[..., Mesh] | None
+
+    def __call__(self, **parameters: Any) -> Mesh: ...
+
+
+BUILDERS: dict[str, Builder] = {}
 """Builders by kind."""
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """positions (V, 3), normals (V, 3), uvs (V, 2), faces (F, 3)"""
@@ -150,10 +160,10 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
         return at_level(0, **parameters)
 
     made.__signature__ = signature  # type: ignore[attr-defined]
-    made.checked = checked  # type: ignore[attr-defined]
-    made.at_level = at_level if whole != signature else None  # type: ignore[attr-defined]
-    BUILDERS[build.__name__] = made
-    return made
+    builder = cast(Builder, made)
+    builder.checked, builder.at_level = checked, at_level if whole != signature else None
+    BUILDERS[build.__name__] = builder
+    return builder
 
 
 def register(build: Callable[..., Surface]) -> Callable[..., Mesh]:

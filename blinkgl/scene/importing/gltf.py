@@ -277,7 +277,8 @@ class Document:
     def morph_weights(self, node: int, count: int) -> np.ndarray:
         """Return the morph weights of a node's mesh at rest, (count,). Raises AssetError where their number differs."""
         mesh = item(self.tree, "meshes", self.nodes[node].mesh, self.where)
-        given = self.nodes[node].weights if self.nodes[node].weights is not None else mesh.get("weights", [0.0] * count)
+        own = self.nodes[node].weights
+        given = mesh.get("weights", [0.0] * count) if own is None else own
         if len(given) != count:
             raise AssetError(
                 "a mesh does not have one weight per morph target",
@@ -312,7 +313,8 @@ class Document:
         index = primitive["attributes"]["COLOR_0"]
         width = _WIDTHS[item(self.tree, "accessors", index, self.where)["type"]]
         given = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)
-        known = np.isfinite(given).all(axis=1)
+        assert given is not None
+        known = np.all(np.isfinite(given), axis=1)
         if not known.all() or given.min(initial=0) < 0 or given.max(initial=0) > 1:
             self.omissions.add("colours beyond 0 to 1 (white where they are no numbers, else the nearest)")
         if width == 4 and (given[:, 3] < 1).any() and self.materials.mode(primitive.get("material")) != "OPAQUE":

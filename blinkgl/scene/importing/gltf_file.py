@@ -205,15 +205,15 @@ def nodes_of(tree: dict, where: str) -> dict[int, Node]:
         n = raw[index_of(i, len(raw), "node", where)]
         # The file has the matrix column by column.
         matrix = np.array(n["matrix"], float).reshape(4, 4).T if n.get("matrix") else None
-        rest = [
+        translation, rotation, scale = (
             tuple(map(float, n.get(k, d)))
             for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))
-        ]
+        )
         own = tuple(n["weights"]) if "weights" in n else None
         name = str(n.get("name") or f"node-{i}")
         visible = n.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True) is not False
         visible = visible and (parent is None or nodes[parent].visible)
         skin, camera = n.get("skin"), n.get("camera")
-        nodes[i] = Node(name, parent, n.get("mesh"), camera, *rest, matrix, skin=skin, weights=own, visible=visible)
+        nodes[i] = Node(name, parent, n.get("mesh"), camera, translation, rotation, scale, matrix, skin, own, visible)
         stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
     return nodes

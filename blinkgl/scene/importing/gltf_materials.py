@@ -67,9 +67,10 @@ class Materials:
             pbr = m.get("pbrMetallicRoughness", {})
             info = pbr.get("baseColorTexture") or {}
             base = _Place.of(info)
+            red, green, blue = pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]
             material = Material(
                 texture=self._texture(info["index"]) if info and self.wanted else None,
-                base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
+                base_color=(float(red), float(green), float(blue)),
                 unlit="KHR_materials_unlit" in m.get("extensions", {}),
                 both_sides=m.get("doubleSided", False),
             )
@@ -102,7 +103,8 @@ class Materials:
         if not info:
             base = _Place.of(next((one for one in (rough, bumps, emissive) if one), {}))
         strength = m.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        emission = tuple(float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
+        red, green, blue = (float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
+        emission = red, green, blue
         if any(emission):
             material = replace(material, emission=emission, emission_map=self._map(emissive, base, "colour"))
         # The standard's defaults are a rough metal: metallic is 1 unless given.

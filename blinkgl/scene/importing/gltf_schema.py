@@ -42,7 +42,7 @@ def _part(name: str, effectless: str = "", **fields: Any) -> Any:
     """Return the schema of a part of a file: type and default of each property, ... for one that must be there.
     effectless : names of properties that change nothing of what is drawn."""
     plain = {"name": (Any, None), "extras": (Any, None)} | dict.fromkeys(effectless.split(), (Any, None))
-    return create_model(name, __base__=_Part, **plain, **fields)
+    return create_model(name, __base__=_Part, **plain, **fields)  # type: ignore[no-matching-overload]
 
 
 # The closed list of glTF 2.0: every property of the specification, its type, its default. `extensions` are listed where

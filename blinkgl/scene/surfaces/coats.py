@@ -175,7 +175,7 @@ COATS: dict[str, Callable[[int], np.ndarray]] = {"figure": clothes, "flag": bunt
 """By kind of primitive."""
 
 
-def coat(kind: str, seed: int = 0) -> Texture:
+def coat(kind: str, seed: float = 0) -> Texture:
     """Return the default texture of a primitive of this kind."""
     image = COATS[kind](int(seed))
     return Texture(image, f"{kind} coat {seed}", content_hash(image.tobytes()))

@@ -134,7 +134,7 @@ def _objects(
             assets[key] = _asset(*given, animation, f"{where}.animation")
             log += [line for line in assets[key].log if line not in log]
             omissions.update(dict.fromkeys(assets[key].omissions))
-        parts = _parts(assets[key], item, None if own else materials[item.material], config)
+        parts = _parts(assets[key], item, None if item.material is None else materials[item.material], config)
         if item.deform is not None:
             if animation is not None:
                 raise ConfigError(
@@ -216,12 +216,12 @@ def motion_path(
     sequence's clock) or a file's poses. Raises ConfigError and AssetError."""
     if config.trajectory is not None:
         return trajectory_path(config.trajectory, t0_ns, t1_ns, f"{where}.trajectory", base, log)
-    turned = next((k for k in (config, *config.keyframes) if k.euler is not None), None)
-    if camera and turned and log is not None:
-        x, y, z, w = (Rotation.from_euler("xyz", turned.euler, degrees=True) * _LEVEL_CAMERA).as_quat().round(7) + 0.0
+    euler = next((k.euler for k in (config, *config.keyframes) if k.euler is not None), None)
+    if camera and euler is not None and log is not None:
+        x, y, z, w = (Rotation.from_euler("xyz", euler, degrees=True) * _LEVEL_CAMERA).as_quat().round(7) + 0.0
         log.append(
             f"{where}: euler turns OpenCV's axes (x right, y down, z forward), as quaternion does; "
-            f"up to version 0.2 it turned a camera that looks along +x, whose euler {list(turned.euler)} is "
+            f"up to version 0.2 it turned a camera that looks along +x, whose euler {list(euler)} is "
             f"quaternion [{w}, {x}, {y}, {z}]"
         )
     if not config.keyframes:
@@ -320,6 +320,7 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
 
 def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
     """Return the primitive of ``scene.meshes.name``. Raises ConfigError for a bad parameter."""
+    assert config.primitive is not None
     with _parameters_of(name):
         return BUILDERS[config.primitive](**config.parameters)
 
@@ -352,9 +353,13 @@ def _asset(
         )
     if name in memory or config.primitive is not None:
         mesh = memory[name] if name in memory else primitive_mesh(config, name)
-        wears = own_materials and name not in memory and config.primitive in COATS
-        material = Material(coat(config.primitive, config.parameters.get("coat", 0))) if wears else Material()
+        material = Material()
+        if own_materials and name not in memory and config.primitive is not None and config.primitive in COATS:
+            seed = config.parameters.get("coat", 0)
+            assert isinstance(seed, (int, float))  # as the builder has checked
+            material = Material(coat(config.primitive, seed))
         return Asset(name, mesh.source_hash, (Part(mesh, material),))
+    assert config.file is not None
     file = existing(config.file, base, f"scene.meshes.{name}.file", "a mesh file")
     return load_asset(
         file,
@@ -419,9 +424,9 @@ def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping
 def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Mask | None:
     """Return the mask; None where nothing of it is below the cutoff. Raises ConfigError where all is."""
     alpha = maps.get("mask")
-    if alpha is None and config.mask is None:
-        return None
     if alpha is None:
+        if config.mask is None:
+            return None
         data = contents(existing(config.mask, base, f"{where}.mask", _IMAGE), "image")
         said = f"{where}.mask: {config.mask}"
         alpha = decode_alpha(data, config.max_size, said)

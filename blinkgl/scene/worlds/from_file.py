@@ -189,7 +189,9 @@ def _animation(document: gltf.Document, given: str | int | AnimationConfig | Non
         return None
     if len(names) > 1 and given == 0:
         document.omissions.add(f"animations beside '{names[0]}' (scene.animation chooses one of: {', '.join(names)})")
-    return play(document, animation_of(given, loop=False), base, "scene.animation")
+    animation = animation_of(given, loop=False)
+    assert animation is not None
+    return play(document, animation, base, "scene.animation")
 
 
 def _beyond_a_path(animation: Animation, node: int, t0_ns: int, t1_ns: int) -> bool:
@@ -250,24 +252,24 @@ def _with_lights(
 
 
 def _camera_node(document: gltf.Document, name: str | int | None) -> int:
-    found = {i: n for i, n in document.nodes.items() if n.camera is not None}
-    if not found:
+    holders = {i: (n.name, n.camera) for i, n in document.nodes.items() if n.camera is not None}
+    if not holders:
         raise ConfigError(
             "the file has no camera", where="scene.pose", accepted="a camera pose here, or a file with a camera"
         )
     names = {}
-    for i, n in found.items():
+    for i, (own_name, camera) in holders.items():
         cameras = document.tree.get("cameras", [])
-        if n.camera >= len(cameras):
+        if camera >= len(cameras):
             raise AssetError(
                 "the file is no valid glTF (a reference to cameras that does not exist)",
                 where=document.where,
-                value=n.camera,
+                value=camera,
             )
         # A camera may be asked for by its own name or its node's; the first of several wins.
-        names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
-        names.setdefault(n.name, i)
-    order = list(found)
+        names.setdefault(str(cameras[camera].get("name", own_name)), i)
+        names.setdefault(own_name, i)
+    order = list(holders)
     if name is None:
         if len(order) > 1:
             document.omissions.add(

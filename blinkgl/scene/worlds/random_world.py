@@ -11,13 +11,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.base import tag_of
 from blinkgl.config.camera import camera_radius
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
@@ -48,6 +47,7 @@ _PLACEMENTS = 300  # positions tried for an object before it is left out
 _CAMERA_PATHS = 6  # camera paths tried until one is free of collisions; the last is cut at its collision
 _GAP = 0.05  # m between bounding spheres at t0
 _STAND_OFF = 0.8  # m beyond the clearance that waypoints keep from the camera, so that nothing fills the view
+_Item = tuple[str, Literal["object", "ground", "sky"], tuple[Part, ...], PosePath]
 
 
 def random_world(
@@ -72,7 +72,7 @@ def random_world(
     T_cam, target = _viewpoint(config, rng, floor)
     clearance = _clearance(config, camera)
     backdrop, panorama = _backdrop(config, textures, rng, rng_texture, split, floor, base, log)
-    items = [(name, category, parts, StaticPath(T, t0_ns, t1_ns)) for name, category, parts, T in backdrop]
+    items: list[_Item] = [(name, category, parts, StaticPath(T, t0_ns, t1_ns)) for name, category, parts, T in backdrop]
 
     dice = rng, rng_texture, rng_shape
     placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
@@ -336,14 +336,16 @@ def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str
     if config.share == 0 or rng.random() >= config.share or any(p.mesh.deformer is not None for p in asset.parts):
         return asset, ""
     kinds = config.kinds or tuple(DeformConfig.members)
-    model = DeformConfig.members[kinds[int(rng.integers(len(kinds)))]]
-    drawn = model.drawn(rng, float(rng.uniform(*config.strength)), _log_uniform(rng, config.period))
+    kind = kinds[int(rng.integers(len(kinds)))]
+    drawn = DeformConfig.members[kind].drawn(
+        rng, float(rng.uniform(*config.strength)), _log_uniform(rng, config.period)
+    )
     parts = deforming(asset.parts, drawn)
     reach = max(
         float(np.linalg.norm(points, axis=1).max()) + margin for points, margin in (filled(p.mesh) for p in parts)
     )
     smaller = [replace(part, mesh=scale_mesh(part.mesh, 1 / reach)) for part in asset.parts]
-    return replace(asset, parts=deforming(smaller, drawn)), f"deforms: {tag_of(model)[1]}"
+    return replace(asset, parts=deforming(smaller, drawn)), f"deforms: {kind}"
 
 
 def _lowest(mesh: Mesh, up: np.ndarray) -> float:
@@ -400,8 +402,10 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
 
 def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[str, BodyConfig]:
     """Return the falling objects by name. The same number of values is drawn for each object, falling or not."""
-    found = {}
-    for name in names if config is not None else ():
+    if config is None:
+        return {}
+    falling: dict[str, BodyConfig] = {}
+    for name in names:
         # All numbers of a body are drawn whether it falls or not: a changed share leaves the others' as they are.
         falls, thrown, around, axis = rng.random(), rng.random(), rng.uniform(0, 2 * math.pi), rng.normal(size=3)
         elevation, speed, spin = rng.uniform(0, math.pi / 3), rng.uniform(*config.speed), rng.uniform(*config.spin)
@@ -412,7 +416,7 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
         if thrown >= config.thrown:
             speed = spin = 0.0
         flat = speed * math.cos(elevation)
-        found[name] = BodyConfig(
+        falling[name] = BodyConfig(
             density=density,
             friction=friction,
             rolling=config.rolling,
@@ -420,7 +424,7 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
             velocity=(flat * math.cos(around), flat * math.sin(around), speed * math.sin(elevation)),
             spin=tuple(spin * axis / np.linalg.norm(axis)),
         )
-    return found
+    return falling
 
 
 def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:

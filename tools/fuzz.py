@@ -33,7 +33,7 @@ from functools import partial
 from importlib import resources
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import hdf5plugin
@@ -64,7 +64,7 @@ from eflow.data.sources import open_source
 CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048
 READ, REFUSED = "read", "refused"
 FORK = multiprocessing.get_context("fork")
-CONFIG = resources.files("blinkgl.configs") / "demo.yaml"
+CONFIG = str(resources.files("blinkgl.configs") / "demo.yaml")
 
 
 class Format(NamedTuple):
@@ -77,7 +77,7 @@ class Format(NamedTuple):
 
 def _events_as(
     make: fuzz_files.Make = lambda path, events: write_events(path, events, fuzz_files.HEIGHT, fuzz_files.WIDTH),
-    **declared: str,
+    **declared: Any,
 ) -> Format:
     """Events, written by ``make`` (as the ending says), are read; the whole parts of a damaged file, too.   declared :
     what the file does not say, as options of the commands."""
@@ -305,7 +305,7 @@ FORMATS = {
         ("dsec", "blinkflow", "mvsec"),
         "sensors=[{name: left, imu: {rate: 200}, events: {}}, {name: right, place: {position: [0.1, 0, 0]}}]",
     ),
-    "run.yaml": Format(lambda path: path.write_text(CONFIG.read_text()), lambda path: load_run(path).sequence(0)),
+    "run.yaml": Format(lambda path: path.write_text(Path(CONFIG).read_text()), lambda path: load_run(path).sequence(0)),
 }
 
 
@@ -334,9 +334,9 @@ def cut(rng: np.random.Generator, data: bytes) -> bytes:
 
 def number(rng: np.random.Generator, data: bytes) -> bytes:
     """A count, offset or value becomes an extreme one, of any width and byte order."""
-    width, order = int(rng.choice([1, 2, 4, 8])), str(rng.choice(["little", "big"]))
+    width, little = int(rng.choice([1, 2, 4, 8])), str(rng.choice(["little", "big"])) == "little"
     at, value = _at(rng, data, width), NUMBERS[int(rng.integers(len(NUMBERS)))]
-    new = (value % (1 << 8 * width)).to_bytes(width, order)
+    new = (value % (1 << 8 * width)).to_bytes(width, "little" if little else "big")
     if width >= 4 and rng.random() < 0.3:
         new = struct.pack("<f" if width == 4 else "<d", float(rng.choice([np.nan, np.inf, -np.inf, -1.0, 1e30])))
     return data[:at] + new + data[at + width :]

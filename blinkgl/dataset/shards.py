@@ -103,7 +103,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     called = folder.name if "sensor" not in manifest else f"{folder.parent.name}-{folder.name}"
     key = f"{called}_{k:06d}"
     count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
-    start, end = read_label_times(folder / _FLOW.stamps, 2, count)[k]
+    start, end = read_label_times(folder / str(_FLOW.stamps), 2, count)[k]
     about: dict[str, Any] = {
         "sequence": called,
         "label": k,
@@ -132,16 +132,17 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     ):
         for form in label.forms:
             if form.file(k) in manifest["files"]:
-                name = label.shard.rpartition(".")[0]
+                name = str(label.shard).rpartition(".")[0]
                 read = form if form.read is not None else label.forms[0]
                 value = label.read(folder / read.file(k), read, manifest["height"], manifest["width"])
+                data: bytes | tuple[bytes, int] = (folder / form.file(k)).read_bytes()
                 # An archive may hold more than was read.
-                anew = form.encode is not None and (form is not read or form.ending == "npz")
-                yield (
-                    f"{key}.{name}.{form.ending}",
-                    form.encode(value) if anew else (folder / form.file(k)).read_bytes(),
-                )
-    for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():
+                if form.encode is not None and (form is not read or form.ending == "npz"):
+                    data = form.encode(value)
+                yield f"{key}.{name}.{form.ending}", data if isinstance(data, bytes) else data[0]
+    if taken is None:
+        return
+    for picture in manifest["frame_camera"]["pictures"]:
         ending = "camera.png" if picture == "images" else f"camera_{picture}.png"
         path, image = folder / picture_file(picture, taken[0]), LABELS["images"]
         image.read(path, image.forms[0], manifest["height"], manifest["width"])

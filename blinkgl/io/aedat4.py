@@ -49,7 +49,7 @@ class Aedat4Reader:
         self._about = _descriptions(self.path)
         events, frames = self._of("events"), self._of("frame")
         # The number of a stream of frames means the events of the same camera.
-        self._frame = int(reading.stream) if reading.stream in map(str, frames) else None
+        self._frame = next((number for number in frames if str(number) == reading.stream), None)
         if self._frame is not None:
             events = [n for n in events if self._source(n) == self._source(self._frame)] or events
         asked = None if self._frame is not None else reading.stream

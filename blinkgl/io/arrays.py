@@ -278,8 +278,9 @@ class ArrayWriter(CheckedWriter):
                     columns |= {"height": self._size[0], "width": self._size[1]}
                 np.savez_compressed(file, **columns, time_unit="us")
             else:
-                table = np.empty(len(e), DTYPE if e.cause is None else [*DTYPE.descr, ("cause", "u1")])
-                for k in table.dtype.names:
+                dtype = DTYPE if e.cause is None else np.dtype([*DTYPE.descr, ("cause", "u1")])
+                table = np.empty(len(e), dtype)
+                for k in dtype.names or ():
                     table[k] = getattr(e, k)
                 np.save(file, table, allow_pickle=False)
 

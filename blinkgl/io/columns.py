@@ -173,7 +173,8 @@ class CheckedWriter(Finishing):
     limits: tuple[int, int, str] | None = None
 
     def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
-        self.path, self._size, self.count, self._last = Path(path), (height, width), 0, None
+        self.path, self._size, self.count = Path(path), (height, width), 0
+        self._last: int | None = None
         self._file: Any = None
         self.t_end_us: int | None = None
 
@@ -255,8 +256,10 @@ def whole(
         good = (column >= low) & (column <= high)
         _refuse(column, good, name, accepted or f"{low} to {high}", where, first)
     out = column.astype(dtype, copy=False)
-    if column.dtype.kind == "f" and not (good := out == column).all():
-        _refuse(column, good, name, "whole numbers", where, first)
+    if column.dtype.kind == "f":
+        whole = out == column
+        if not whole.all():
+            _refuse(column, whole, name, "whole numbers", where, first)
     return out
 
 

@@ -179,7 +179,7 @@ def read_flow(path: str | os.PathLike, form: str | None = None) -> tuple[np.ndar
         flow = read_flo5(path)
     else:
         flow, stated = read_flow_npy(path)
-    valid = stated & np.isfinite(flow).all(-1)
+    valid: np.ndarray = np.logical_and(stated, np.isfinite(flow).all(-1))
     return np.where(valid[..., None], flow, np.float32(0)), valid
 
 

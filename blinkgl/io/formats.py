@@ -181,7 +181,7 @@ class EventFile(Closing):
             except EventDataError as error:
                 raise self._with_remedy(error) from None
             count += len(events)
-            if flipped:
+            if flipped and self.height is not None:
                 events = replace(events, y=(self.height - 1 - events.y.astype(np.int32)).astype(np.uint16))
             if len(events):
                 yield events

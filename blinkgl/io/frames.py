@@ -300,7 +300,8 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
             try:
                 for image in one.iterate(background):
                     image = np.repeat(image[..., None], 3, axis=2) if mixed and image.ndim == 2 else image
-                    yield image, own and own[number], path.name if one.pages == 1 else f"{path.name} page {number}"
+                    time = own[number] if own else None
+                    yield image, time, path.name if one.pages == 1 else f"{path.name} page {number}"
                     number += 1
             except Damage as error:
                 if declared.damaged != "keep":
@@ -322,10 +323,9 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
         top = max(int(one.max()) for path in chosen for one in open_stills(path).iterate(background))
         # PNG's sBIT allows codes of the full scale, too.
         levels = levels if levels is not None and top <= levels[1] else _white_of(top, notes)
-    size = image.shape[:2]
-    has = own is not None
+    (height, width), has = image.shape[:2], own is not None
     return FrameSource(
-        where, *size, pages, frames, has, transfer=first.transfer, levels=levels, notes=notes, times_ns=times
+        where, height, width, pages, frames, has, transfer=first.transfer, levels=levels, notes=notes, times_ns=times
     )
 
 
@@ -392,12 +392,13 @@ def _video(path: Path, declared: Declared) -> FrameSource:
         stream=declared.stream,
     )
     frames = lambda: ((frame, t_ns, f"#{i}") for i, (frame, t_ns) in enumerate(reader))
-    size, timed = (reader.height, reader.width), None not in reader.times_ns
+    timed = None not in reader.times_ns
     # Some packets hold no picture, so a list of times is compared at the end.
     count = reader.count if declared.timestamps is None else None
     return FrameSource(
         path,
-        *size,
+        reader.height,
+        reader.width,
         count,
         frames,
         timed,
@@ -451,8 +452,8 @@ def _array(path: Path, declared: Declared) -> FrameSource:
                 notes.extend([note] if note and note not in notes else [])
             yield np.asarray(frame, np.float32 if frame.dtype.kind == "f" else None), None, f"#{i}"
 
-    size, has = frames.shape[1:3], own is not None
-    return FrameSource(path, *size, len(frames), read, has, levels=levels, notes=notes, times_ns=own)
+    (height, width), has = frames.shape[1:3], own is not None
+    return FrameSource(path, height, width, len(frames), read, has, levels=levels, notes=notes, times_ns=own)
 
 
 def _recording(path: Path, declared: Declared) -> FrameSource:
@@ -464,4 +465,5 @@ def _recording(path: Path, declared: Declared) -> FrameSource:
     if first is None:
         raise EventDataError("events need at least two frames", where=str(path), value="0 frames")
     frames = lambda: ((frame.image, frame.t_us * 1000, f"#{i}") for i, frame in enumerate(file.frames()))
-    return FrameSource(path, *first.image.shape[:2], None, frames, True, "camera", "linear")
+    height, width = first.image.shape[:2]
+    return FrameSource(path, height, width, None, frames, True, "camera", "linear")

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import cv2
 import numpy as np
@@ -169,7 +169,7 @@ class NpzReader(Closing):
         self._unpacked += size
         check_claim(self._unpacked, where, os.path.getsize(self.path))
         with self._archive.open(f"{name}.npy") as member:
-            npy_header(member, size, where)
+            npy_header(cast(BinaryIO, member), size, where)
         with self._archive.open(f"{name}.npy") as member:
             return np.lib.format.read_array(member, allow_pickle=False)
 

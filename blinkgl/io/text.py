@@ -56,7 +56,8 @@ class TextReader:
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path, self._reading, self.notes, self.unread = Path(path), reading, [], 0
-        self.height = self.width = None
+        self.height: int | None = None
+        self.width: int | None = None
         self._start = self._lines = 0  # bytes and lines before the first event
         self._order: tuple[str, ...] = ()
         self._unit: str | None = None

@@ -197,10 +197,10 @@ class VideoReader:
         stated = _RANGES[int(frame.color_range)]
         # Codes of grey and RGB stay as they are; YUV is converted with its range.
         self._by_levels = self._grey or frame.format.is_rgb or frame.format.name == "pal8"
-        self.levels = None
+        self.levels: tuple[float, float] | None = None
         if self._by_levels and (self._range or (stated if self._grey else None)) == "limited":
             # Black and white of 8 bits, 16 and 235, shifted to the frame's number of bits.
-            self.levels = tuple(code << self._bits - 8 for code in (16, 235))
+            self.levels = 16 << self._bits - 8, 235 << self._bits - 8
         elif self._by_levels and 8 < self._bits < 16 and not self._alpha:
             self.levels = 0, 2**self._bits - 1
         matrix = int(frame.colorspace)

@@ -9,12 +9,13 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.columns import check_events, microseconds
-from blinkgl.io.hdf5 import dataset, open_hdf5
+from blinkgl.io.hdf5 import Data, Hdf5File, dataset, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
 from blinkgl.io.mvsec import event_table, events_of_rows
 from blinkgl.io.sizes import check_claim
@@ -68,7 +69,7 @@ class NpzRows:
             for name in names:
                 with archive.open(f"{name}.npy") as member:
                     shape, fortran, dtype = npy_header(
-                        member, archive.getinfo(f"{name}.npy").file_size, f"{path}: '{name}'"
+                        cast(BinaryIO, member), archive.getinfo(f"{name}.npy").file_size, f"{path}: '{name}'"
                     )
                     if fortran or not shape or dtype.kind not in "fiu":
                         raise AssetError(
@@ -196,8 +197,10 @@ class _MvsecSequence:
                     value=self._flow.shape(name),
                     accepted=str(expected),
                 )
-        self._file, self._pid, self._table = None, None, None
-        self._rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._file: Hdf5File | None = None
+        self._pid: int | None = None
+        self._table: Data | None = None
+        self._rows: dict[int, np.ndarray] = {}
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_file": None, "_pid": None, "_table": None}
@@ -212,6 +215,7 @@ class _MvsecSequence:
         margin = 4096
         while True:
             i, j = max(low - margin, 0), min(high + margin, self._count)
+            assert self._table is not None
             rows = self._table[i : max(i, j)]
             t = microseconds(rows[:, 2] - self.t0_s, str(self.path), i)
             enough = len(t) and (i == 0 or t[0] < t0) and (j == self._count or t[-1] >= t1)

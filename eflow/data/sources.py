@@ -162,9 +162,9 @@ class FolderSource:
     @staticmethod
     def _size(sequence: Sequence, reader: DsecEventReader, flow, rectify) -> tuple[int, int]:
         sizes = {
-            tuple(map(int, s))
+            (int(s[0]), int(s[1]))
             for s in (
-                (reader.height, reader.width) if reader.height else None,
+                (reader.height, reader.width) if reader.height and reader.width else None,
                 flow.shape[:2] if flow is not None else None,
                 rectify.shape[:2] if rectify is not None else None,
             )
@@ -219,7 +219,7 @@ def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
     if not (folder / "events.h5").is_file():
         return None
     there, back = LABELS["flow_forward"], LABELS["flow_backward"]
-    stamps = inside(folder, there.stamps)
+    stamps = inside(folder, str(there.stamps))
     forward, backward = (numbered(inside(folder, label.forms[0].folder), "png") for label in (there, back))
     # Generated without flow: nothing to learn from, but not an error.
     if not forward and not stamps.exists():
@@ -339,7 +339,7 @@ def read_submission_times(path: Path) -> list[tuple[int, int, int]]:
     try:
         with open(path, newline="", encoding="utf-8") as file:
             rows = [
-                tuple(int(v) for v in row[:3])
+                [int(v) for v in row[:3]]
                 for row in csv.reader(file)
                 if row and not row[0].lstrip().startswith(("#", "from"))
             ]
@@ -351,7 +351,7 @@ def read_submission_times(path: Path) -> list[tuple[int, int, int]]:
         raise AssetError(
             "not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index"
         )
-    return rows
+    return [(start, end, number) for start, end, number in rows]
 
 
 def _same_count(folder: Path, files: Sized, times: Sized) -> None:

@@ -466,4 +466,4 @@ def _recording(path: Path, declared: Declared) -> FrameSource:
         raise EventDataError("events need at least two frames", where=str(path), value="0 frames")
     frames = lambda: ((frame.image, frame.t_us * 1000, f"#{i}") for i, frame in enumerate(file.frames()))
     height, width = first.image.shape[:2]
-    return FrameSource(path, height, width, None, frames, True, "camera", "linear")
+    return FrameSource(path, height, width, None, frames, True, origin="camera", transfer="linear")

@@ -214,6 +214,18 @@ def nodes_of(tree: dict, where: str) -> dict[int, Node]:
         visible = n.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True) is not False
         visible = visible and (parent is None or nodes[parent].visible)
         skin, camera = n.get("skin"), n.get("camera")
-        nodes[i] = Node(name, parent, n.get("mesh"), camera, translation, rotation, scale, matrix, skin, own, visible)
+        nodes[i] = Node(
+            name,
+            parent,
+            mesh=n.get("mesh"),
+            camera=camera,
+            translation=translation,
+            rotation=rotation,
+            scale=scale,
+            matrix=matrix,
+            skin=skin,
+            weights=own,
+            visible=visible,
+        )
         stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
     return nodes

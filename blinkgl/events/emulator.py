@@ -171,7 +171,8 @@ class Emulator(ABC):
     def _checked_frame(self, luminance: np.ndarray) -> np.ndarray:
         frame = np.asarray(luminance)
         if frame.shape != (self.height, self.width):
-            colours = ": luminance, for linear colours frame @ [0.2126, 0.7152, 0.0722]" if frame.ndim == 3 else ""
+            grey = f": luminance, numpy.{frame.dtype}(frame @ [0.2126, 0.7152, 0.0722])"
+            colours = grey if frame.ndim == 3 and frame.shape[2] == 3 else ""
             raise EventDataError(
                 "a frame of another shape than the emulator's",
                 where=f"frame {self.frames}",

@@ -16,8 +16,8 @@ from blinkgl.events.philox import Stream, pixel_counters, uniform2
 from blinkgl.types.events import Cause, Events
 
 _BATCH = 1024
-_LEAST_HZ = 1e-6
-"""Rate that stands for none where logarithms are interpolated."""
+_LEAST_HZ = 1e-12
+"""Rate that stands for none where logarithms are interpolated: an event of a megapixel in eleven days."""
 _STREAM = np.uint64(Stream.LIGHT_NOISE)
 _FROZEN, _WHEN, _WHICH = np.uint64(0), np.uint64(1), np.uint64(2)
 

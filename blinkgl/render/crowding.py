@@ -45,7 +45,8 @@ def _masked(moment: Moment, items: list[DrawItem], width: int, height: int) -> f
     of which all corners are in front of it, hidden ones included."""
     area = 0.0
     for item in items:
-        if item.material.mask is None:
+        mask = item.material.mask
+        if mask is None or mask.alpha.min() >= 255 * mask.threshold:  # exporters give masks to what has no hole
             continue
         vertices = item.mesh.vertices
         clip = vertices @ moment.mvp[item.object_index][:, :3].T + moment.mvp[item.object_index][:, 3]

@@ -102,6 +102,12 @@ def test_bad_curves_are_one_line(tree, message):
     assert len(str(error.value).splitlines()) == 1
 
 
+def test_no_rate_is_no_event():
+    config = ReadoutConfig(light_noise=LightNoiseConfig(lux=(1, 1000), on_hz=(0, 0), off_hz=(0, 0)))
+    clean = load_sensor("imx636").emulator("v2e")
+    assert not len(still(EventCamera(clean, config, 720, 1280, 3), 0.5, 1000.0, 3))
+
+
 def test_all_pixels_are_alike_without_a_shape():
     config = ReadoutConfig(light_noise=LightNoiseConfig(lux=(1,), on_hz=(2.0,), off_hz=(0,)))
     known = load_sensor("imx636")

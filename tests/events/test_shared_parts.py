@@ -117,10 +117,12 @@ def test_frames_and_times_that_an_emulator_takes():
         esim.step(frame, esim.t_ns)
     with pytest.raises(EventDataError, match="frame 1: a frame of another shape"):
         esim.step(frame[:1], 0)
-    with pytest.raises(
-        EventDataError, match=r"frame 0: a frame of another shape .* frame @ \[0.2126, 0.7152, 0.0722\]"
-    ):
-        Esim(2, 2, EsimConfig(), 0).step(np.ones((2, 2, 3), np.float32), 0)
+    for colours in (np.ones((2, 2, 3), np.float32), np.full((2, 2, 3), 200, np.uint8)):
+        with pytest.raises(EventDataError, match="frame 0: a frame of another shape") as failed:
+            Esim(2, 2, EsimConfig(), 0).step(colours, 0)
+        remedy = f"numpy.{colours.dtype}(frame @ [0.2126, 0.7152, 0.0722])"
+        assert remedy in str(failed.value)
+        Esim(2, 2, EsimConfig(), 0).step(getattr(np, str(colours.dtype))(colours @ [0.2126, 0.7152, 0.0722]), 0)
     longest = (2**30 - 1) * 1000
     esim.step(frame, esim.t_ns + longest)
     with pytest.raises(

@@ -35,10 +35,10 @@ def rods(count, radius):
     ]
 
 
-def leaves(count, size):
-    rng, coverage = np.random.default_rng(6), np.zeros((16, 16), np.uint8)
+def leaves(count, size, least=0):
+    rng, coverage = np.random.default_rng(6), np.full((16, 16), least, np.uint8)
     coverage[4:12, 4:12] = 255
-    leaf = Material(base_color=(0.2, 0.5, 0.2), mask=Mask(coverage, 0.5))
+    leaf = Material(base_color=(0.2, 0.5, 0.2), mask=Mask(coverage))
     place = lambda: (*rng.uniform(-1, 1, 1), 3.0, *rng.uniform(-0.8, 0.8, 1))
     return [(quad(size, size), leaf, still(place(), LEVEL)) for _ in range(count)]
 
@@ -51,10 +51,20 @@ def leaves(count, size):
         (rods(3, 0.3), ""),
         (leaves(12, 0.2), "masked surfaces fill "),
         (leaves(1, 0.1), ""),
+        (leaves(12, 0.2, least=200), ""),
         ([(cube(0.3), Material(), still((0, 3, 0)))], ""),
         ([], ""),
     ],
-    ids=["many rods", "two rods", "three thick ones", "leaves", "one small leaf", "a cube", "nothing"],
+    ids=[
+        "many rods",
+        "two rods",
+        "three thick ones",
+        "leaves",
+        "one small leaf",
+        "leaves without holes",
+        "a cube",
+        "nothing",
+    ],
 )
 def test_outlines_that_crowd_are_drawn_with_samples(bodies, words):
     with create_context() as gl:

@@ -134,8 +134,12 @@ def _is_offered(name: Any) -> Any:
     return name
 
 
-Antialiasing = Annotated[Literal["none", "taps4", "edges", "edges2", "ssaa2", "ssaa4"], BeforeValidator(_is_offered)]
-ImageAntialiasing = Annotated[Literal["none", "edges", "edges2", "ssaa2", "ssaa4"], BeforeValidator(_is_offered)]
+Antialiasing = Annotated[
+    Literal["none", "taps4", "edges", "edges2", "ssaa2", "ssaa4", "ssaa8"], BeforeValidator(_is_offered)
+]
+ImageAntialiasing = Annotated[
+    Literal["none", "edges", "edges2", "ssaa2", "ssaa4", "ssaa8"], BeforeValidator(_is_offered)
+]
 
 
 class RenderConfig(Config):
@@ -145,8 +149,8 @@ class RenderConfig(Config):
         "none",
         description="event frames. taps4: filters textures (4 lookups per pixel); edges: filters silhouettes, "
         "too, by surface area, and its lookups follow the foreshortening; edges2: edges at 2 x 2 "
-        "resolution; both are ssaa4 in a scene whose outlines crowd; ssaa2 and ssaa4: averages 2 x 2 and 4 x 4 "
-        "samples. Labels are never filtered. "
+        "resolution; in a scene whose outlines crowd they are ssaa4 and ssaa8; ssaa2, ssaa4, ssaa8: averages of "
+        "2 x 2, 4 x 4, 8 x 8 samples. Labels are never filtered. "
         "Costs: docs/trade.md",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")

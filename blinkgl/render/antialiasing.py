@@ -40,6 +40,7 @@ ANTIALIASING = {
     "edges2": Samples(grid=2, taps=4, edges=True),
     "ssaa2": Samples(grid=2),
     "ssaa4": Samples(grid=4),
+    "ssaa8": Samples(grid=8),
 }
 
 

@@ -13,12 +13,22 @@ if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.moment import Moment
 
-CROWDED_AS = "ssaa4"
-"""Anti-aliasing of such a scene; at equal cost it has less error there than either ``edges`` or ``edges2``."""
+_CROWDED_AS = {"edges": "ssaa4", "edges2": "ssaa8"}
+"""Anti-aliasing of such a scene: at equal cost ``ssaa4`` has less error there than either, and what ``edges2`` is asked
+for, less error than ``edges``, takes more samples."""
+_LARGEST = 2**20, 2048
+"""Pixels of a picture, and of one side, up to which 8 x 8 samples fit the memory and the textures of every OpenGL."""
 _TANGLED, _HOLED = 0.03, 0.03
 """Shares of the picture from which on outlines crowd: pixels with the lines of several surfaces, and masked surfaces.
 Scenes that ``edges`` draws well have at most 0.025 tangled pixels, those that it draws badly 0.05 and more."""
 _SKY = 2
+
+
+def crowded_as(antialiasing: str, width: int, height: int) -> str:
+    """Return the anti-aliasing that a crowded scene has in place of ``edges`` or ``edges2``, in a picture of this size,
+    px."""
+    fits = width * height <= _LARGEST[0] and max(width, height) <= _LARGEST[1]
+    return _CROWDED_AS[antialiasing] if fits else _CROWDED_AS["edges"]
 
 
 def crowding(moments: Sequence[Moment], lines: Lines, width: int, height: int) -> str:

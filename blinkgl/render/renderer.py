@@ -27,7 +27,7 @@ from blinkgl.machine.closing import Releasing
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, StillCanvas
-from blinkgl.render.crowding import CROWDED_AS, crowding
+from blinkgl.render.crowding import crowded_as, crowding
 from blinkgl.render.draw_items import DrawItem
 from blinkgl.render.frames import Frame
 from blinkgl.render.labels import DrawnLabel, Seen
@@ -120,9 +120,12 @@ class Renderer(Releasing):
 
     @property
     def antialiasing(self) -> str:
-        """Return the anti-aliasing of event frames: the configured one, but :data:`CROWDED_AS` for ``edges`` and
-        ``edges2`` where outlines crowd."""
-        return CROWDED_AS if self.crowded else self.config.antialiasing
+        """Return the anti-aliasing of event frames: the configured one, but that of :func:`crowded_as` for ``edges``
+        and ``edges2`` where outlines crowd."""
+        if not self.crowded:
+            return self.config.antialiasing
+        seen = self.scene.camera if self._painter.lens is None else self._painter.lens.flat
+        return crowded_as(self.config.antialiasing, seen.width, seen.height)
 
     @cached_property
     def crowded(self) -> str:

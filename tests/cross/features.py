@@ -22,6 +22,7 @@ from blinkgl.config.quality import QUALITIES
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 
 WIDTH, HEIGHT, FPS = 32, 24, 100
+FILTERS = ("none", "edges", "edges2", "ssaa2", "ssaa4", "ssaa8")
 OF_PAIRS = ("disparity",)
 """Labels of stereo pairs: tests/dataset/test_rig_runs.py."""
 _POOLS = {
@@ -180,11 +181,9 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             }
         },
     },
-    "anti-aliasing": {
-        name: {"render": {"antialiasing": name}} for name in ("none", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
-    },
+    "anti-aliasing": {name: {"render": {"antialiasing": name}} for name in ("taps4", *FILTERS)},
     "images": {
-        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "edges", "edges2", "ssaa2", "ssaa4")},
+        **{name: {"render": {"image_antialiasing": name}} for name in FILTERS},
         "no images": {"labels": {"images": False}},
     },
     "frame camera": {

@@ -18,6 +18,7 @@ COLOURS = {
     "edges2": "#6b4a2b",
     "ssaa2": "#3d6bd6",
     "ssaa4": "#2a9d8f",
+    "ssaa8": "#8a7a2a",
 }
 COSTS = {"wall_s": "seconds of computing per simulated second", "cpu_s": "processor seconds per simulated second"}
 PANELS = (

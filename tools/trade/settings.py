@@ -27,7 +27,7 @@ SAMPLINGS = {
     },
 }
 ANTIALIASINGS = {
-    name: (f"render.antialiasing={name}",) for name in ("none", "taps4", "edges", "edges2", "ssaa2", "ssaa4")
+    name: (f"render.antialiasing={name}",) for name in ("none", "taps4", "edges", "edges2", "ssaa2", "ssaa4", "ssaa8")
 }
 OTHERS = {
     "": (),
@@ -107,7 +107,7 @@ def suite_design() -> tuple[Setting, ...]:
     points += [Setting(s, "edges", sharp) for s in _displacement(4, 3, 1.5, 0.5)]
     points += [Setting(s, a, sharp) for s in _displacement(2, 1, 0.5) for a in ("ssaa2", "edges2")]
     points += [Setting(s, "edges2", sharp) for s in _displacement(3, 1.5)]
-    points += [Setting(_displacement(0.5)[0], "ssaa4", sharp)]
+    points += [Setting(s, "ssaa4", sharp) for s in _displacement(3, 1.5, 1, 0.5)]
     points += [Setting(f"brightness {c} C", "edges", sharp) for c in (4, 2, 1)]
     return tuple(dict.fromkeys(points))
 

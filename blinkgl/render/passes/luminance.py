@@ -155,4 +155,4 @@ class Mean(ScreenPass):
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
 
-        return (cls(Colour(Samples(grid=factor))) for factor in (2, 4))
+        return (cls(Colour(Samples(grid=factor))) for factor in (2, 4, 8))

@@ -21,7 +21,7 @@ def test_everything_compiles(shader):
     assert result["programs"] == {
         "colour.glsl": 138,
         "debug.glsl": 14,
-        "downsample.glsl": 2,
+        "downsample.glsl": 3,
         "edges.glsl": 2,
         "gather.glsl": 3,
         "label.glsl": 140,

@@ -26,7 +26,7 @@ from blinkgl.tools.trade.settings import Setting, excess, suite_design
 from blinkgl.tools.trade.suite import Trial, clips, preset_names, run_suite, standing
 from blinkgl.tools.trade.suite_command import show
 
-SAMPLES = {"none": 1, "taps4": 2, "edges2": 8, "edges": 2.5, "ssaa2": 4, "ssaa4": 16}
+SAMPLES = {"none": 1, "taps4": 2, "edges2": 8, "edges": 2.5, "ssaa2": 4, "ssaa4": 16, "ssaa8": 64}
 """What a frame costs, in frames without a filter, about (docs/trade.md)."""
 WORLD = {
     "seed": 5,
@@ -157,7 +157,7 @@ def test_bad_input(arguments, message, tmp_path, capsys):
 # --- The presets of ``quality:``: what they were chosen by is what is recorded, and a small suite measured here
 # agrees.
 
-SAMPLES_PRESETS = {"none": 1, "taps4": 4, "edges2": 10, "edges": 4, "ssaa2": 4, "ssaa4": 16}
+SAMPLES_PRESETS = {"none": 1, "taps4": 4, "edges2": 10, "edges": 4, "ssaa2": 4, "ssaa4": 16, "ssaa8": 64}
 OF_ALL = 0.75
 BEATEN_BY = 0.1
 NOISE = 0.05

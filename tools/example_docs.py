@@ -47,6 +47,7 @@ ORDER = (
     "scene_in_python",
     "living_scene",
     "star_field",
+    "optical_marker",
     "frame_with_labels",
     "own_label",
     "own_trajectory",

@@ -47,14 +47,14 @@ def available() -> str:
     do."""
     chosen = interpreter()
     if chosen == sys.executable:
-        found = importlib.util.find_spec("bpy") is not None
+        there = importlib.util.find_spec("bpy") is not None
     else:
         probe = "import importlib.util, sys; sys.exit(importlib.util.find_spec('bpy') is None)"
         try:
-            found = subprocess.run([chosen, "-c", probe], capture_output=True).returncode == 0
+            there = subprocess.run([chosen, "-c", probe], capture_output=True).returncode == 0
         except OSError:
             return f"{ENVIRONMENT} names no interpreter that runs: {chosen}"
-    return "" if found else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
+    return "" if there else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
 
 
 def require() -> None:
@@ -66,10 +66,10 @@ def require() -> None:
 def environment(home: Path) -> dict[str, str]:
     """Return the environment of Blender's process: ``home``, an empty folder, replaces all of the user's folders."""
     # Blender reads add-ons, scripts and presets wherever variables point it: only these are passed on.
-    given = {key: value for key, value in os.environ.items() if key.startswith(_HANDED_ON + _CARDS)}
+    handed_on = {key: value for key, value in os.environ.items() if key.startswith(_HANDED_ON + _CARDS)}
     for key in ("HOME", "TMPDIR", "BLENDER_USER_RESOURCES", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
-        given[key] = str(home)
-    return given
+        handed_on[key] = str(home)
+    return handed_on
 
 
 class Blender(Closing):

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, Removed, one_of, rule
 from blinkgl.config.materials import Radiance
+from blinkgl.config.poses import KeyedMotionConfig
 from blinkgl.config.values import (
     Color,
     Fraction,
@@ -17,6 +18,7 @@ from blinkgl.config.values import (
     PositiveRange,
     Vector3,
 )
+from blinkgl.config.waveforms import OVER_TIME, WaveformConfig
 
 MAX_LIGHTS = 31  # plus the sun
 
@@ -28,6 +30,7 @@ class _LampConfig(Config):
         "falling with the square of the distance",
     )
     color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
+    over_time: WaveformConfig | None = OVER_TIME
 
 
 class SunLampConfig(_LampConfig):
@@ -40,12 +43,22 @@ class SunLampConfig(_LampConfig):
 
 
 class _PlacedLampConfig(_LampConfig):
-    position: Position = Field(description="m")
+    position: Position | None = Field(None, description="m; or a motion")
+    motion: KeyedMotionConfig | None = Field(
+        None,
+        description="its pose, key frames or trajectory, instead of position and look_at; it shines along the z "
+        "axis, as a camera looks",
+    )
     reach: Positive | None = Field(
         None,
         description="distance, m, at which it has faded to zero, by 1 - (distance / reach)^4; null: it falls "
         "only with the square of the distance",
     )
+
+    @rule("position", "?motion")
+    def _a_place(position, motion):
+        if (position is None) == (not motion):
+            raise Refused("a lamp has a position or a motion", where="position", value=position)
 
 
 class PointLampConfig(_PlacedLampConfig):
@@ -58,14 +71,16 @@ class SpotLampConfig(_PlacedLampConfig):
     """Shines in a cone."""
 
     kind: Literal["spot"]
-    look_at: Position = Field(description="a point on the axis of the cone, m")
+    look_at: Position | None = Field(None, description="a point on the axis of the cone, m; with a motion: null")
     angle: float = Field(60.0, ge=0.5, le=170, description="full angle of the cone, degrees")
     edge: Fraction = Field(0.2, description="fraction of the half angle over which it fades out")
     size: float = Field(0.1, ge=0, le=1e3, description="diameter, m: softens soft shadows")
 
     @rule("look_at", "position")
     def _some_direction(look_at, position):
-        if max(abs(a - b) for a, b in zip(look_at, position)) < 1e-9:
+        if (look_at is None) != (position is None):
+            raise Refused("a spot light has a position and look_at, or a motion", where="look_at", value=look_at)
+        if look_at is not None and max(abs(a - b) for a, b in zip(look_at, position)) < 1e-9:
             raise Refused("must differ from the position", where="look_at", value=list(look_at))
 
 
@@ -92,6 +107,11 @@ class LightConfig(Config):
 
     sun: float = Field(0.6, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.4, ge=0, le=1e9, description="strength of the sky")
+    over_time: WaveformConfig | None = Field(
+        None,
+        description="factor over time on the sun, the sky or the environment: sine, pwm, code or keys (docs/light.md); "
+        "null: constant",
+    )
     sun_elevation: float | None = Field(
         None,
         ge=-90,
@@ -131,9 +151,10 @@ class LightConfig(Config):
         if (given := len([*lights])) > MAX_LIGHTS:
             raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
 
-    @rule("unlit", "#lights", "?environment", "shadows")
-    def _lit(unlit, lights, environment, shadows):
-        for where, given in (("lights", [*lights]), ("environment", environment), ("shadows", shadows != "off")):
+    @rule("unlit", "#lights", "?environment", "?over_time", "shadows")
+    def _lit(unlit, lights, environment, over_time, shadows):
+        effects = {"lights": [*lights], "environment": environment, "over_time": over_time, "shadows": shadows != "off"}
+        for where, given in effects.items():
             if unlit and given:
                 raise Refused("these lights have no effect", where=where, value="unlit: true", accepted="unlit: false")
 

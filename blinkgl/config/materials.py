@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.waveforms import OVER_TIME, WaveformConfig
 
 TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
@@ -48,6 +49,7 @@ class MaterialConfig(Config):
     )
     emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="emitted radiance, linear")
     emission_map: str | None = Field(None, description="image file, sRGB, times emission")
+    emission_over_time: WaveformConfig | None = OVER_TIME
     mask: str | None = Field(
         None,
         description="image file: the surface has holes where its opacity (its grey value if it has none) is "
@@ -77,6 +79,15 @@ class MaterialConfig(Config):
                 where="emission",
                 value=list(emission),
                 accepted="a radiance above 0, such as [1, 1, 1]",
+            )
+
+    @rule("?emission_over_time", "emission", "unlit")
+    def _something_changes(over_time, emission, unlit):
+        if over_time and (unlit or not any(emission)):
+            raise Refused(
+                "nothing emits that could change over time: " + ("unlit is true" if unlit else "emission is 0"),
+                where="emission_over_time",
+                accepted="unlit: false, and an emission above 0, such as [1, 1, 1]",
             )
 
     @rule("unlit", "normal_map", "metallic_roughness_map", "emission_map")

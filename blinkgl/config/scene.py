@@ -440,3 +440,15 @@ class FileSceneConfig(Config):
 
 
 SceneConfig = one_of("kind", RandomSceneConfig, ExplicitSceneConfig, FileSceneConfig, default="random")
+
+
+def lights_change(scene: RandomSceneConfig | ExplicitSceneConfig | FileSceneConfig) -> bool:
+    """Return whether any light of a scene changes over time, of a lamp or of a material."""
+    light = scene.light
+    materials = scene.materials.values() if isinstance(scene, ExplicitSceneConfig) else ()
+    waves = [
+        light.over_time,
+        *(lamp.over_time for lamp in light.lights),
+        *(one.emission_over_time for one in materials),
+    ]
+    return any(wave is not None for wave in waves)

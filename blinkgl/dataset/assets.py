@@ -86,9 +86,9 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
     """Yield configurations that represent the scenes and frame folders that can be drawn; each once."""
     seen = set()
     for config in template.corners()[:_ASSET_CORNERS]:
-        said = repr((config.scene, config.frames))
-        if said not in seen:
-            seen.add(said)
+        recipe = repr((config.scene, config.frames))
+        if recipe not in seen:
+            seen.add(recipe)
             yield config
 
 
@@ -127,10 +127,10 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
                 _note(hashes, posixpath.normpath(f"{folder}/{Path(entry.name).parent.as_posix()}/{beside}"), digest)
         for name in scene.sky.panoramas if scene.sky else ():
             path = resolve(name, base)
-            for found in (
+            for paths in (
                 files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]
             ):
-                _note(hashes, f"{without_places(name)}/{found.name}", content_hash(contents(found, "panorama")))
+                _note(hashes, f"{without_places(name)}/{paths.name}", content_hash(contents(paths, "panorama")))
     tree = {} if isinstance(scene, RandomSceneConfig) else scene.model_dump()
     for used in dict.fromkeys([*_values(tree, "file"), *_values(tree, "T_body_sensor")]):
         if isinstance(used, str) and resolve(used, base).is_file():  # a mesh, a trajectory, a clip

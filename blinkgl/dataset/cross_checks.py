@@ -169,8 +169,8 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     result.dropped = len(dropped)
     missing, more = _missing(plan, here | dropped.keys(), _MOST_MISSING)
     for task in missing:
-        said = f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"
-        result.add(task.name, [said])
+        why = f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"
+        result.add(task.name, [why])
     if more:
         problems.append(f"and {more} more sequences that the recipe asks for are missing")
     if record.get("mixed"):
@@ -203,8 +203,8 @@ def _missing(plan: Plan, here: Set[str], most: int) -> tuple[list[Task], int]:
     """Return up to ``most`` tasks that are not among the names ``here``, and the number of further ones."""
     # A record may ask for millions: the work grows with what is here.
     count = len(plan.tasks) - sum(plan.tasks.number(name) is not None for name in here)
-    found = list(islice((task for task in plan.tasks if task.name not in here), min(count, most)))
-    return found, count - len(found)
+    missing = list(islice((task for task in plan.tasks if task.name not in here), min(count, most)))
+    return missing, count - len(missing)
 
 
 def lost(root: Path, folders: list[Path]) -> list[str]:

@@ -46,14 +46,14 @@ def drop(root: str | Path, names: Sequence[str] = (), where: Sequence[str] = (),
         plan, dropped = plan_of(root), folder.dropped
         here = {made.relative_to(root).as_posix(): made for made in made_folders(root)}
         chosen = {}
-        for given in names:
-            name = given.rstrip("/")
+        for text in names:
+            name = text.rstrip("/")
             with suppress(ValueError):
                 name = Path(name).resolve().relative_to(root.resolve()).as_posix() if name not in here else name
             planned = plan is not None and plan.tasks.number(name) is not None
             if name not in dropped if undo else not planned and name not in here:
                 problem = "was not dropped" if undo else "no such sequence"
-                raise AssetError(problem, where=str(root), value=given, accepted="SPLIT/NAME_000000 of this data set")
+                raise AssetError(problem, where=str(root), value=text, accepted="SPLIT/NAME_000000 of this data set")
             chosen[name] = "by name"
         # Of tens of thousands of sequences the index is read in a second, their manifests in minutes.
         lines = read_index(root) if (root / INDEX).is_file() else []

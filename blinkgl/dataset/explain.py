@@ -165,8 +165,8 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
                 _left_out(own, seen, one)
             _join(result, name, one)
         # What only making it shows, such as motion too fast for the shortest step.
-        if told := [line for line in costs[0].notes if line not in (*scene.log, *scene.omissions)]:
-            result.scene["when made"] = "; ".join(told)
+        if notes := [line for line in costs[0].notes if line not in (*scene.log, *scene.omissions)]:
+            result.scene["when made"] = "; ".join(notes)
         return _priced(result, costs, config, (scene.t1_ns - scene.t0_ns) * 1e-9)
 
 
@@ -206,8 +206,8 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path, cost: Cost, 
         "not used": "camera, time, timeline, scene and render: nothing is rendered",
     }
     result.frames, rate = cost.frames, cost.events / duration
-    said = f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
-    result.add("frames and event kernel", said, result.frames)
+    words = f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
+    result.add("frames and event kernel", words, result.frames)
     request = asked_for(config.labels)
     result.leave_out(
         ("images", "images" in request, "labels.images: false"),
@@ -304,8 +304,8 @@ def _passes(config: SequenceConfig, scene: Scene, renderer: Renderer, rate: floa
     _over_time(config, scene, result)
     if config.images is not None:
         result.passes.append(_frame_camera(config.images, renderer, scene))
-    said = f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
-    result.add("event kernel", said, result.frames)
+    words = f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
+    result.add("event kernel", words, result.frames)
 
 
 def _pictures(config: SequenceConfig, duration: float, result: Explanation) -> None:
@@ -328,13 +328,13 @@ def _over_time(config: SequenceConfig, scene: Scene, result: Explanation) -> Non
     """Add the inertial unit and the point tracks."""
     if config.imu is not None:
         count = imu_count(config.imu.rate, scene.t0_ns, scene.t1_ns)
-        said = f"{count} measurements at {config.imu.rate:g} Hz, {'noisy and ' if config.imu.noisy else ''}ideal"
-        result.add("inertial unit", said, count)
+        words = f"{count} measurements at {config.imu.rate:g} Hz, {'noisy and ' if config.imu.noisy else ''}ideal"
+        result.add("inertial unit", words, count)
     if config.tracks is not None:
         ends = config.time.label_times_ns[0], config.time.t1_ns, config.time.interval_ns
         moments = track_times(config.tracks.rate, *ends)
-        said = f"at most {config.tracks.points} points ({config.tracks.choose}) at {len(moments)} times, float64"
-        result.add("point tracks", said, len(moments))
+        words = f"at most {config.tracks.points} points ({config.tracks.choose}) at {len(moments)} times, float64"
+        result.add("point tracks", words, len(moments))
 
 
 def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
@@ -346,16 +346,16 @@ def _over_intervals(request: LabelRequest, config: SequenceConfig) -> str:
         len(request.within(time.t0_ns - t, time.t1_ns - t).intervals_ns) == len(intervals)
         for t in time.label_times_ns[: time.label_count]
     )
-    said = ", ".join(f"{ns * 1e-9:.6g}" for ns in intervals)
-    return f" (flow over {said} s: all of them inside the sequence for {whole} of {time.label_count} labels)"
+    seconds = ", ".join(f"{ns * 1e-9:.6g}" for ns in intervals)
+    return f" (flow over {seconds} s: all of them inside the sequence for {whole} of {time.label_count} labels)"
 
 
 def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pass:
     """Return the pass of its images."""
     camera = FrameCamera(renderer, images, 0, (scene.t0_ns, scene.t1_ns))
     shutter = f"rows {images.row_us:g} µs apart" if images.row_us else "all rows at once"
-    said = [f"{len(camera)} images, exposed {images.exposure_us:g} µs, {shutter}"]
-    said += [
+    words = [f"{len(camera)} images, exposed {images.exposure_us:g} µs, {shutter}"]
+    words += [
         name
         for name, on in (
             ("automatic exposure", images.auto_exposure is not None),
@@ -368,7 +368,7 @@ def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pas
         )
         if on
     ]
-    return Pass("frame camera", ", ".join(said), len(camera))
+    return Pass("frame camera", ", ".join(words), len(camera))
 
 
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:

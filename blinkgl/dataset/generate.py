@@ -19,6 +19,7 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.exposure import decibels
 from blinkgl.io.frame_camera import ExposureLine
+from blinkgl.io.lights import LIGHTS
 from blinkgl.io.poses import POSES
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS
@@ -220,6 +221,8 @@ def write_end(writer: SequenceWriter, sequence: SensorSimulation) -> None:
             writer.imu(sequence.config.imu, vars(inertial))
         if (tracks := sequence.tracks()) is not None:
             writer.arrays(TRACKS, **vars(tracks))
+        if lights := sequence.lights():
+            writer.arrays(LIGHTS, **lights)
         writer.t_end_us = sequence.t1_ns // 1000
         writer.info.update(manifest_info(sequence))
 

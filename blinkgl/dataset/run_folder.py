@@ -116,9 +116,9 @@ class RunFolder:
         if before is not None and before != assets:
             changed = sorted(n for n in before.keys() | assets.keys() if before.get(n) != assets.get(n))
             how = ["changed" if n in before and n in assets else "gone" if n in before else "new" for n in changed]
-            said = ", ".join(f"{n} ({h})" for n, h in list(zip(changed, how))[:3]) + (" …" if len(changed) > 3 else "")
+            words = ", ".join(f"{n} ({h})" for n, h in list(zip(changed, how))[:3]) + (" …" if len(changed) > 3 else "")
             raise OutputError(
-                f"the pools have changed since the run began: {said}",
+                f"the pools have changed since the run began: {words}",
                 where=str(self.out),
                 accepted="the same files, or --mixed to continue with these",
             )
@@ -356,13 +356,13 @@ class RunFolder:
 
     def costs(self) -> list[dict[str, Any]]:
         """Return the last line of each sequence; a line cut by a crash is left out."""
-        found: dict[str, dict[str, Any]] = {}
+        costs: dict[str, dict[str, Any]] = {}
         with contextlib.suppress(FileNotFoundError, AssetError):
             for line in read_text(self.record("costs.jsonl")).splitlines():
                 with contextlib.suppress(ValueError):
                     entry = parse(line, _COST)
-                    found[entry["name"]] = entry
-        return list(found.values())
+                    costs[entry["name"]] = entry
+        return list(costs.values())
 
     def read(self, name: str) -> dict[str, Any] | None:
         """Return a JSON file of the folder, checked; None when there is none. Raises OutputError when it is damaged."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from blinkgl.config.images import exposure_starts
 from blinkgl.config.run import load_run
+from blinkgl.config.scene import lights_change
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.cross_checks import (
     Known,
@@ -33,6 +34,7 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS
 from blinkgl.io.frame_camera import files_of
 from blinkgl.io.imu import FILES as IMU_FILES
+from blinkgl.io.lights import LIGHTS
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS, asked_for
@@ -60,18 +62,18 @@ def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: b
     """Return where the folder's name, the manifest and the sequence's own configuration disagree, and missing or extra
     files.
     events : whether there are some."""
-    said = [*said_of(config), ("emulator", config.events.emulator if events else None)]
+    fields = [*said_of(config), ("emulator", config.events.emulator if events else None)]
     if config.frames is None:
-        said += [
+        fields += [
             ("height", config.camera.height),
             ("width", config.camera.width),
             *times_of(config),
             ("labels", config.time.label_count),
         ]
-    told = events and bool(getattr(config.events, "causes", False))
-    if ("events_by_cause" in manifest) != told:
-        said.append(("events_by_cause", "that there are some" if told else None))
-    problems = [*unlike(manifest, said), *misnamed(name, manifest, config)]
+    causes = events and bool(getattr(config.events, "causes", False))
+    if ("events_by_cause" in manifest) != causes:
+        fields.append(("events_by_cause", "that there are some" if causes else None))
+    problems = [*unlike(manifest, fields), *misnamed(name, manifest, config)]
     if config.frames is None and not problems:
         problems += not_asked_for(set(files_of_sequence(config, events)), manifest)
     return problems
@@ -130,6 +132,8 @@ def files_of_sequence(config: SequenceConfig, events: bool = True) -> Iterator[s
         yield from IMU_FILES
     if config.tracks is not None:
         yield TRACKS
+    if config.frames is None and lights_change(config.scene):
+        yield LIGHTS
     if config.frames is None and config.camera.lens != "pinhole":  # a lens with distortion
         yield from LENS_FILES
     if config.images is not None:
@@ -148,7 +152,7 @@ _REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "la
 def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
     """Return the problems of a folder. ``name``: path below the data set, "." where the sequence is checked alone and
     may have any name."""
-    found: list[Known] = []
+    known: list[Known] = []
 
     def check() -> list[str]:
         if problems := verify_sequence(folder):
@@ -172,18 +176,18 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
         # Last: other findings say more than that something was edited.
         problems = problems or manifest_problems(folder)
         if not problems:
-            found.append(Known(folder, manifest, config))
+            known.append(Known(folder, manifest, config))
         return problems
 
-    return guarded(check), found[0] if found else None
+    return guarded(check), known[0] if known else None
 
 
 def look_at_sensors(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
     """Return the problems of a rig's folder whose files are complete: its own, and those of each camera's folder."""
     if config.sensors is None:
         return ["config.yaml: a single camera's, but the manifest is a rig's"]
-    said = [("sensors", [one.name for one in config.sensors]), *said_of(config), *times_of(config)]
-    problems = [*unlike(manifest, said), *misnamed(name, manifest, config)]
+    fields = [("sensors", [one.name for one in config.sensors]), *said_of(config), *times_of(config)]
+    problems = [*unlike(manifest, fields), *misnamed(name, manifest, config)]
     if problems := problems or not_asked_for(set(files_of_sensors(config)), manifest):
         return problems
     names = [camera.name for camera in config.cameras()]
@@ -246,10 +250,10 @@ def verify_dataset(
         name = folder.relative_to(root).as_posix()
         if progress:
             progress(number, shown(name))
-        problems, found = look(folder, name)
+        problems, sequences = look(folder, name)
         result.add(name, problems)
-        if found is not None:
-            known[name] = found
+        if sequences is not None:
+            known[name] = sequences
     result.sequences = len(folders)
     if not (root / MANIFEST).is_file():
         result.add(".", guarded(lambda: strangers(root, folders)))

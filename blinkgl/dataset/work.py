@@ -273,13 +273,13 @@ def _code() -> dict[str, str]:
     rooms += [(f"configs/{name}", tables / name) for name in SHIPPED_TABLES]
     sums: dict[str, Any] = {}
     for name, place in rooms:
-        found = sums.setdefault(
+        digest = sums.setdefault(
             f"code of {name.rpartition('/')[0] if name.endswith('.py') else name}", hashlib.sha256()
         )
         for path in [place] if place.is_file() else sorted(place.rglob("*")):
             if path.suffix in (".py", ".glsl", ".yaml"):
-                found.update(path.name.encode() + b"\0" + path.read_bytes())
-    return {"blinkgl": __version__, **{name: found.hexdigest()[:12] for name, found in sums.items()}}
+                digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return {"blinkgl": __version__, **{name: digest.hexdigest()[:12] for name, digest in sums.items()}}
 
 
 def _disk_is_full(error: BaseException) -> bool:

@@ -109,8 +109,8 @@ def _checked(emulator: Any) -> str:
     for sensor in _SOME_SENSORS:
         values = result("Config.from_sensor", model.from_sensor, sensor)
         unless(isinstance(values, dict), "Config.from_sensor", f"gives {values!r} and not a table of keys")
-        said = {key: value for key, value in values.items() if value is not None}
-        result("Config.from_sensor", validate, model, said)
+        values_set = {key: value for key, value in values.items() if value is not None}
+        result("Config.from_sensor", validate, model, values_set)
     config = result("Config", model)
 
     for part in sorted(emulator.__abstractmethods__):

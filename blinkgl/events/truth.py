@@ -74,22 +74,22 @@ class SurfaceTruth:
         x, y = events.x.astype(np.intp), events.y.astype(np.intp)
         height, width = after.ids.shape
         pixel = y * width + x
-        found = _where(late, _looked_up(after, pixel), _looked_up(before, pixel))
+        speeds = _where(late, _looked_up(after, pixel), _looked_up(before, pixel))
         # found[1] is the depth, and the nearest surface wins.
-        best = found[1].copy()
+        best = speeds[1].copy()
         for surfaces in (before, after):
             for dy, dx in self._offsets:
                 place = np.clip(y + dy, 0, height - 1) * width + np.clip(x + dx, 0, width - 1)
                 other = _looked_up(surfaces, place)
                 # another part of the same instance counts only at the pixel itself
                 jump = other[1] < best * (1 - _JUMP) if dy == dx == 0 else False
-                passes = (other[1] < best) & ((other[0] != found[0]) | jump)
-                found, best = _where(passes, other, found), np.where(passes, other[1], best)
+                passes = (other[1] < best) & ((other[0] != speeds[0]) | jump)
+                speeds, best = _where(passes, other, speeds), np.where(passes, other[1], best)
         if self._left is not None:
             left = _looked_up(self._left, pixel)
             follows = (1000 * events.t <= self._until_ns.reshape(-1)[pixel]) & (left[1] < best)
-            found = _where(follows & (left[0] != found[0]), left, found)
-        truth["instance"], truth["depth"], truth["velocity"] = found
+            speeds = _where(follows & (left[0] != speeds[0]), left, speeds)
+        truth["instance"], truth["depth"], truth["velocity"] = speeds
         return truth
 
 

@@ -286,9 +286,9 @@ class V2e(Emulator):
         self._shots_per_ns = self._shot_unit * float(self._shot_table[:, -1:].sum())  # if all pixels were dark
         self._inverse_threshold = 1.0 / float(min(self._on.min(), self._off.min()))
         self._scale = np.float32(config.full_scale)
-        told = pixels if config.causes else 0
-        self._since_ns, self._noise_then = np.zeros(told, np.int64), frame(config.causes)
-        self._hot = draw_hot(height, width, config, self.seed) if told else np.empty(0, np.uint8)
+        explained = pixels if config.causes else 0
+        self._since_ns, self._noise_then = np.zeros(explained, np.int64), frame(config.causes)
+        self._hot = draw_hot(height, width, config, self.seed) if explained else np.empty(0, np.uint8)
         self._tables_changed()
 
     def _tables_changed(self) -> None:

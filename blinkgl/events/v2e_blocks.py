@@ -233,7 +233,7 @@ def emit(
     upper, lower, constants, leaks, release = p.upper, p.lower, p.constants, p.leak, p.release
     since, noise_at_reference, hot = p.since_ns, p.noise_then, p.hot
     low_pass, leaking = lag_before.size > 0, leaks.size > 0
-    dead_time, told = release.size > 0, since.size > 0
+    dead_time, causes = release.size > 0, since.size > 0
     intensity_now, x_now, lag_now, noise_now = now
     # Start of the interval after the microsecond base, 0 to 999 ns.
     start_ns = v.t0_ns - 1000 * v.base_us
@@ -269,7 +269,7 @@ def emit(
         end = base + drift + dx + lag_end
         up, down = np.float64(upper[i]), np.float64(lower[i])
         noise_then, since_ns = 0.0, np.int64(0)
-        if told:
+        if causes:
             noise_then, since_ns = np.float64(noise_at_reference[i]), since[i] - v.t0_ns
         # Start of the comparison: as a fraction of the interval, and in ns from its start.
         s, now_ns = 0.0, np.int64(0)
@@ -296,7 +296,7 @@ def emit(
             if emitted < cap:
                 # A packed word (packing.py); the time is added below.
                 word = bits | polarity
-                if told:
+                if causes:
                     # Parts of the change since the reference was taken, from which the cause is decided.
                     by_leak = leak * ((at_ns - since_ns) * 1e-9)
                     by_noise = noise + noise_change * s - noise_then
@@ -332,7 +332,7 @@ def emit(
             release[i] = v.t0_ns + now_ns
         if v.leak_jitter > 0.0:
             leaks[i] = np.float32(leak)
-        if told:
+        if causes:
             since[i], noise_at_reference[i] = v.t0_ns + since_ns, np.float32(noise_then)
     return out, cut
 

@@ -36,11 +36,15 @@ class Exposure:
         """Return the middle of the image's exposure: that of the middle row."""
         return (self.start_ns + self.end_ns) // 2
 
-    def cells(self, count: int) -> tuple[list[int], np.ndarray]:
-        """Return the times, ns, of ``count`` instants, and (count, rows) float64 weights: each row's sum to 1."""
+    def cells(self, count: int) -> tuple[list[tuple[int, int, int]], np.ndarray]:
+        """Return the begin, middle and end, ns, of ``count`` instants, and (count, rows) float64 weights: each row's
+        sum to 1."""
         span = float(self.end_ns - self.start_ns)
         edges = np.linspace(0.0, span, count + 1)
-        times = [self.start_ns + math.floor(middle) for middle in (edges[1:] + edges[:-1]) / 2]
+        cells = np.stack([edges[:-1], (edges[1:] + edges[:-1]) / 2, edges[1:]], axis=1)
+        times = [
+            (begin, middle, end) for begin, middle, end in (self.start_ns + np.floor(cells).astype(np.int64)).tolist()
+        ]
         # begins: when each row's exposure starts; the last row's ends with the span.
         begins = np.linspace(0.0, span - self.exposure_ns, self.rows) if self.rows > 1 else np.zeros(1)
         # overlap: the time that cell and exposure have in common, (count, rows); below 0 where they do not meet.
@@ -49,14 +53,23 @@ class Exposure:
         return times, weights / weights.sum(axis=0)
 
 
-def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: int) -> int:
+def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: int, changes: float = 0.0) -> int:
     """Return the number of instants of an image: enough that nothing moves farther than ``max_px`` between two at
-    ``speed`` px/s, and that every row's exposure has ``lens`` of them; at most ``most``, at least 1."""
+    ``speed`` px/s, and that every row's exposure has ``lens`` of them; at most ``most``, at least 1.   changes : of
+    light, per second: each instant has the mean light of its cell, so only rows that are exposed at other times need
+    cells of a fraction of them."""
     span_ns = exposure.end_ns - exposure.start_ns
     moving = speed * span_ns * 1e-9 / max_px
     focusing = lens * span_ns / exposure.exposure_ns if lens > 1 else 1.0
+    flickering = min(_PER_CHANGE * changes * span_ns * 1e-9, 1e9) if exposure.row_ns else 0.0
     # 1e-6, so that a rounding error adds no instant.
-    return int(min(most, max(1.0, math.ceil(min(moving, 1e9) - 1e-6), math.ceil(focusing - 1e-6))))
+    return int(
+        min(most, max(1.0, math.ceil(min(moving, 1e9) - 1e-6), *(math.ceil(n - 1e-6) for n in (focusing, flickering))))
+    )
+
+
+_PER_CHANGE = 8
+"""Instants of a rolling shutter for each jump or turn of the light."""
 
 
 @kernel

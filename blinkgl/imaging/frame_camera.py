@@ -161,13 +161,16 @@ class FrameCamera:
         config, draw = self.config, self.renderer
         speed = draw.motion.fastest(exposure.start_ns, exposure.end_ns, config.max_px)
         points = self._points_needed(exposure.middle_ns)
-        count = instants(exposure, speed, config.max_px, points, config.max_instants)
+        changes = max((wave.per_second() for wave in draw.scene.waveforms.values()), default=0.0)
+        count = instants(exposure, speed, config.max_px, points, config.max_instants, changes)
         lens = config.lens if points > 1 else None
         aperture = None if lens is None else thin_lens.points(count, lens.aperture)
         total = np.zeros((draw.height, draw.width, 3))
         cells, weights = exposure.cells(count)
-        for i, t_ns in enumerate(cells):
+        for i, (begin_ns, t_ns, end_ns) in enumerate(cells):
             moment = draw.moment(t_ns)
+            if draw.scene.waveforms:
+                moment = moment.over(begin_ns, end_ns)
             if lens is not None and aperture is not None:
                 seen = thin_lens.through(moment.view.camera, aperture[i], lens.focus)
                 moment = moment.from_place(View.of(seen), thin_lens.at_point(moment.T_world_cam, aperture[i]))

@@ -222,8 +222,8 @@ def _read_header(path: Path) -> tuple[str, int]:
 
 
 def _scale(header: str, key: str, prefix: str, usual: float) -> float:
-    said = re.search(rf'key="{key}" value="{prefix}(\d{{1,9}})"', header)
-    return float(said.group(1)) if said else usual
+    stated = re.search(rf'key="{key}" value="{prefix}(\d{{1,9}})"', header)
+    return float(stated.group(1)) if stated else usual
 
 
 def _kinds(address: np.ndarray) -> np.ndarray:

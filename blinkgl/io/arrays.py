@@ -248,15 +248,15 @@ class MatReader(TableReader):
     the file."""
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
-        found, where = read_mat(path), os.fspath(path)
-        tables = {"": found} | {name: one for name, one in found.items() if isinstance(one, dict)}
+        variables, where = read_mat(path), os.fspath(path)
+        tables = {"": variables} | {name: one for name, one in variables.items() if isinstance(one, dict)}
         candidates: list[Candidate] = []
         for name, table in tables.items():
             arrays = {key: one for key, one in table.items() if isinstance(one, np.ndarray)}
             shapes = {key: (one.shape, one.dtype) for key, one in arrays.items()}
             inner = _candidates(shapes, arrays.__getitem__, where, replace(reading, stream=None))
             candidates += [("/".join(filter(None, (name, key))), make) for key, make in inner]
-        super().__init__(Path(path), reading, choose(candidates, reading, where, list(found)))
+        super().__init__(Path(path), reading, choose(candidates, reading, where, list(variables)))
 
 
 class ArrayWriter(CheckedWriter):

@@ -39,8 +39,8 @@ def output_errors(where: str | os.PathLike) -> Iterator[None]:
 
 def _reason(error: OSError) -> str:
     code = error.errno
-    if code is None and (found := re.search(r"errno = (\d+)", str(error))):
-        code = int(found.group(1))
+    if code is None and (number := re.search(r"errno = (\d+)", str(error))):
+        code = int(number.group(1))
     # NumPy's tofile and HDF5 say it in words only.
     if code == errno.ENOSPC or re.search(r"no(t enough free)? space|requested and \d+ written", str(error), re.I):
         return "no space left on the device"
@@ -250,10 +250,10 @@ def _lock(handle: int, folder: Path) -> bool:
 def is_still(path: Path, handle: int) -> bool:
     """Return whether the open file or folder is the one at ``path``: not deleted, moved or replaced."""
     try:
-        found, held = os.stat(path, follow_symlinks=False), os.fstat(handle)
+        now, held = os.stat(path, follow_symlinks=False), os.fstat(handle)
     except OSError:
         return False
-    return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)
+    return (now.st_dev, now.st_ino) == (held.st_dev, held.st_ino)
 
 
 def make_folders(folder: Path) -> list[Path]:

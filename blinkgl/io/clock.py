@@ -35,10 +35,10 @@ def named_unit(heading: str) -> str | None:
 
     A bare ``s`` counts in brackets and after an underscore only: it ends many words."""
     text = heading.strip().lower()
-    if found := re.search(r"[\[(<{]\s*([a-zµμ]+)\s*[\])>}]", text):
-        return _UNIT_OF.get(found[1])
-    if found := re.search(r"(?:_|\bin )([a-zµμ]+)$", text):
-        return _UNIT_OF.get(found[1])
+    if match := re.search(r"[\[(<{]\s*([a-zµμ]+)\s*[\])>}]", text):
+        return _UNIT_OF.get(match[1])
+    if match := re.search(r"(?:_|\bin )([a-zµμ]+)$", text):
+        return _UNIT_OF.get(match[1])
     return _UNIT_OF.get(text) if len(text) > 1 else None
 
 

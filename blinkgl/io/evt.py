@@ -132,13 +132,13 @@ class EvtReader:
 
     def _size(self, fields: dict[str, str], options: dict[str, str]) -> tuple[int, int] | None:
         """Return the (height, width) that ``geometry`` or ``format`` state."""
-        said = {"geometry": fields["geometry"]} if "geometry" in fields else {}
+        stated = {"geometry": fields["geometry"]} if "geometry" in fields else {}
         if {"height", "width"} <= options.keys():
-            said["size in format"] = f"{options['width']}x{options['height']}"
-        for what, size in said.items():
+            stated["size in format"] = f"{options['width']}x{options['height']}"
+        for what, size in stated.items():
             if not re.fullmatch(r"\d{1,9}x\d{1,9}", size):
                 raise AssetError(f"unknown {what}", where=str(self.path), value=size, accepted="WIDTHxHEIGHT")
-        if len(sizes := set(said.values())) > 1:
+        if len(sizes := set(stated.values())) > 1:
             raise AssetError(
                 "geometry and format state different sizes",
                 where=str(self.path),
@@ -204,13 +204,13 @@ _KINDS = {
 
 def state_lines(state: np.ndarray) -> list[str]:
     """Return a line for each kind of words that a decoder left out or mended."""
-    told = (
+    lines = (
         (state[MISSING], "4096 µs counted for each of {:,} TIME_HIGH words that are missing"),
         (state[UNTIMED], "left out: events before the first TIME_HIGH, which have no time: {:,}"),
         (state[OTHERS], "left out: events that are no contrast changes (ADDR_Y of type 1): {:,}"),
         (state[TRIGGERS], "{:,} triggers are no events: blinkgl convert --triggers FILE.csv writes them"),
     )
-    return [line.format(count) for count, line in told if count]
+    return [line.format(count) for count, line in lines if count]
 
 
 def room(version: str, words: int) -> list[np.ndarray]:

@@ -59,9 +59,9 @@ class DatReader:
         self.path = Path(path)
         with input_errors(path), open(path, "rb") as file:
             begin = file.read(_LONGEST_HEADER)
-        found = re.match(rb"(?:%[^\n]*\n)*", begin)
+        heading = re.match(rb"(?:%[^\n]*\n)*", begin)
         # Two bytes follow the header's lines: the type of events and the size of a record.
-        header, self._start = found[0].decode("latin-1") if found else "", found.end() + 2 if found else 2
+        header, self._start = heading[0].decode("latin-1") if heading else "", heading.end() + 2 if heading else 2
         kind = begin[self._start - 2 : self._start]
         if len(kind) < 2 or kind[0] not in _EVENT_TYPES or kind[1] != _DAT.itemsize:
             raise AssetError(
@@ -71,12 +71,12 @@ class DatReader:
                 accepted="type 0 or 12, 8 bytes an event",
             )
         # The last line of a name counts, as in Prophesee's tools.
-        said = dict(re.findall(r"^%\s*(\w+)[ \t:]+(\S.*?)\s*$", header, re.M))
-        sides = [said.get(name) for name in ("Height", "Width")]
+        fields = dict(re.findall(r"^%\s*(\w+)[ \t:]+(\S.*?)\s*$", header, re.M))
+        sides = [fields.get(name) for name in ("Height", "Width")]
         if not all(side is None or re.fullmatch(r"\d{1,5}", side) for side in sides):
             raise AssetError("a size in the header is no number", where=str(path), value=sides, accepted="px")
         self.height, self.width = (None if side is None else int(side) for side in sides)
-        self._places = listed(_VERSIONS, said.get("Version", ""), "unknown Version of .dat", path, "1, 2 or none")
+        self._places = listed(_VERSIONS, fields.get("Version", ""), "unknown Version of .dat", path, "1, 2 or none")
 
     def chunks(self, count: int = 1 << 20) -> Iterator[Events]:
         """Yield all events."""

@@ -60,8 +60,8 @@ class EventFormat:
 
     def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> CheckedWriter:
         """Return a writer of the file. options : those that it takes are used."""
-        given = {name: options[name] for name in self.takes}
-        return self._class(self.writer)(path, height, width, **self.fixed, **given)
+        taken = {name: options[name] for name in self.takes}
+        return self._class(self.writer)(path, height, width, **self.fixed, **taken)
 
     def _class(self, named: str | type) -> Any:
         return getattr(import_module(f"blinkgl.io.{self.module}"), named) if isinstance(named, str) else named
@@ -339,12 +339,12 @@ def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Eve
 def _kind(path: Path, reading: EventReading) -> str:
     """Return the format of a file. Raises AssetError."""
     ending = ending_of(path)
-    found = [one for one in FORMATS.values() if ending in one.endings]
+    formats = [one for one in FORMATS.values() if ending in one.endings]
     if path.is_dir() and (path / "metadata.yaml").is_file():
         return "rosbag"
     if any(path.glob(_EVIMO2)) or (path.match(_EVIMO2) and path.parent.is_dir()):
         return "evimo2"
-    if not found:
+    if not formats:
         raise AssetError("unknown event file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
@@ -356,8 +356,8 @@ def _kind(path: Path, reading: EventReading) -> str:
             return "dsec" if is_dsec(file, reading) else "hdf5"
     with open(path, "rb") as file:
         begin = file.read(16)
-    marked = next((one for one in found if one.magic and begin.startswith(one.magic)), None)
-    return (marked or next((one for one in found if not one.magic), found[0])).name
+    marked = next((one for one in formats if one.magic and begin.startswith(one.magic)), None)
+    return (marked or next((one for one in formats if not one.magic), formats[0])).name
 
 
 def output_format(path: str | os.PathLike) -> str:

@@ -239,20 +239,20 @@ def read_any_image(path: Path, background: str | None = None) -> np.ndarray:
 
 
 def _folder(folder: Path, declared: Declared) -> FrameSource:
-    found = series(folder, IMAGE)
+    pictures = series(folder, IMAGE)
     beside = [folder / name for name in _STAMP_FILES]
     beside += [folder.parent / name for name in ("images.txt", "data.csv", f"{folder.name}.txt")]
     list_file = Path(declared.timestamps) if declared.timestamps else next((f for f in beside if f.is_file()), None)
     if list_file is not None and declared.timestamps is None and declared.fps is not None:
         if declared.time_unit != "frames":
-            found.notes.append(f"{list_file.name} beside the images is not used, because of --fps")
+            pictures.notes.append(f"{list_file.name} beside the images is not used, because of --fps")
             list_file = None
     written = list_file is not None and any((list_file.parent.parent / name).is_file() for name in _OURS)
     usual = "us" if written else None
     stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps, usual=usual)
-    if not found.files and list_file is not None and stamps is not None and stamps.names:
-        found = Series([p for name in stamps.names if (p := inside(list_file.parent, name)).is_file()])
-    if not found.files:
+    if not pictures.files and list_file is not None and stamps is not None and stamps.names:
+        pictures = Series([p for name in stamps.names if (p := inside(list_file.parent, name)).is_file()])
+    if not pictures.files:
         there = sorted({p.suffix.lower() for p in folder.iterdir() if p.is_file()} - {""})
         arrays = {".npz", ".npy"} & set(there)
         other = "" if not arrays else f"; of arrays, one file of all frames, or images ({len(there)} endings are there)"
@@ -262,11 +262,11 @@ def _folder(folder: Path, declared: Declared) -> FrameSource:
             value=" ".join(there) or "no files",
             accepted=" ".join(sorted(IMAGE)) + other,
         )
-    source = _stacks(folder, found, declared)
+    source = _stacks(folder, pictures, declared)
     if (ours := camera_of(folder)) is not None:
         source = _of_our_camera(source, ours, folder.name)
-    if stamps is not None and stamps.names is not None and source.count == len(found.files):
-        stamps = _by_name(stamps, found, str(list_file))
+    if stamps is not None and stamps.names is not None and source.count == len(pictures.files):
+        stamps = _by_name(stamps, pictures, str(list_file))
     return source.timed(replace(declared, timestamps=None), stamps)
 
 
@@ -334,9 +334,9 @@ def _of_our_camera(source: FrameSource, camera: ImagesConfig, pictures: str) -> 
     top = float(2**camera.bits - 1)
     transfer = {"linear": "linear", "gamma": camera.gamma}.get(camera.response)
     quiet = pictures == "clean" or not (camera.photon_noise or camera.read_noise)
-    said = f"{camera.response}, {camera.bits} bits" + (f", {camera.bayer} filters" if camera.bayer else "")
+    words = f"{camera.response}, {camera.bits} bits" + (f", {camera.bayer} filters" if camera.bayer else "")
     notes = [note for note in source.notes if not note.startswith("16-bit codes")]
-    notes.append(f"the sequence's frame camera: {said}, {'no noise' if quiet else 'with its noise'}")
+    notes.append(f"the sequence's frame camera: {words}, {'no noise' if quiet else 'with its noise'}")
     # No light has the black level, on the scale of light.
     levels = (camera.black * top, top) if camera.response == "linear" else (0.0, top)
     return replace(source, transfer=transfer, levels=levels, notes=notes, exact=quiet)
@@ -369,7 +369,9 @@ def _white_of(top: int, notes: list[str]) -> tuple[float, float] | None:
 
 def _by_name(stamps: Stamps, found: Series, where: str) -> Stamps:
     """Return the times of the files, by their names. Raises EventDataError: a file without."""
-    by_name = {name: t for given, t in zip(stamps.names or (), stamps.times_ns) for name in (Path(given).name, given)}
+    by_name = {
+        name: t for listed, t in zip(stamps.names or (), stamps.times_ns) for name in (Path(listed).name, listed)
+    }
     missing = [p.name for p in found.files if p.name not in by_name and p.stem not in by_name]
     if missing:
         raise EventDataError(f"no time stamp for image {missing[0]}", where=where)

@@ -48,11 +48,11 @@ class Hdf5TableReader(TableReader):
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            found = _candidates(self._file, self.path, reading)
-            called = [one for one in found[1] if one[0] in EVENTS or one[0].rpartition("/")[2] == "events"]
-            every = [*found[0], *found[1]]
+            tables = _candidates(self._file, self.path, reading)
+            called = [one for one in tables[1] if one[0] in EVENTS or one[0].rpartition("/")[2] == "events"]
+            every = [*tables[0], *tables[1]]
             # A name may mean any of them; a number counts those that the refusal lists.
-            candidates = every if reading.stream in dict(every) else found[0] or called or found[1]
+            candidates = every if reading.stream in dict(every) else tables[0] or called or tables[1]
             table = choose(candidates, reading, str(path), self._file.names())
             super().__init__(self.path, reading, table)
         self.version = "mvsec" if table.place in EVENTS else "hdf5"

@@ -145,7 +145,7 @@ class NpzReader(Closing):
     def shapes(self) -> tuple[dict[str, tuple[tuple[int, ...], np.dtype]], list[str]]:
         """Return shape and type of each array, of which only the headers are read, and the names of the members that
         would have to be unpickled."""
-        found, pickled = {}, []
+        shapes, pickled = {}, []
         for name in self.names:
             member = f"{name}.npy"
             if member in self._archive.namelist():
@@ -154,8 +154,8 @@ class NpzReader(Closing):
                 if dtype.hasobject:
                     pickled.append(name)
                 else:
-                    found[name] = shape, dtype
-        return found, pickled
+                    shapes[name] = shape, dtype
+        return shapes, pickled
 
     def __contains__(self, name: str) -> bool:
         return name in self.names
@@ -272,8 +272,8 @@ def _image_problem(data: bytes) -> str | None:
     if data[:2] == b"\xff\xd8":
         return "a JPEG, where pictures without loss are read"
     if data[:2] == b"#?":
-        found = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
-        size = found and (int(found[2]), int(found[1]))
+        size_line = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
+        size = size_line and (int(size_line[2]), int(size_line[1]))
     else:
         try:
             with warnings.catch_warnings():

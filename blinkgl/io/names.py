@@ -147,11 +147,11 @@ def _key(stem: str, pattern: re.Pattern) -> tuple:
     """Return a sort key: text and numbers in turn, texts before numbers of the same place."""
     key: list[tuple[int, str | Decimal]] = []
     at = 0
-    for found in pattern.finditer(stem):
-        if found.start() > at:
-            key.append((0, stem[at : found.start()]))
-        key.append((1, Decimal(found[0])))
-        at = found.end()
+    for match in pattern.finditer(stem):
+        if match.start() > at:
+            key.append((0, stem[at : match.start()]))
+        key.append((1, Decimal(match[0])))
+        at = match.end()
     if at < len(stem):
         key.append((0, stem[at:]))
     return tuple(key)

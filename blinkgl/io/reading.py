@@ -98,10 +98,10 @@ def parsed_size(text: str | None) -> tuple[int, int] | None:
     """Return (height, width) of ``WIDTHxHEIGHT``. Raises ConfigError."""
     if text is None:
         return None
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
-    if not found or not all(0 < int(side) <= _MOST_SIDE for side in found.groups()):
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+    if not match or not all(0 < int(side) <= _MOST_SIDE for side in match.groups()):
         raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
-    return int(found[2]), int(found[1])
+    return int(match[2]), int(match[1])
 
 
 def _columns(columns: str | Sequence[str] | None) -> tuple[str, ...] | None:

@@ -94,8 +94,8 @@ def parse(text: str, model: TypeAdapter | None = None) -> Any:
 def first_problem(error: ValidationError) -> str:
     """Return the first place where data are not in the form of a model, and why."""
     first = error.errors(include_url=False)[0]
-    place, said = ".".join(shown(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ").lower()
-    return f"{place}: {said}" if place else said
+    place, message = ".".join(shown(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ").lower()
+    return f"{place}: {message}" if place else message
 
 
 SEAL = "record_sha256"
@@ -112,11 +112,11 @@ def sealed(record: Mapping[str, Any], default: Callable[[Any], Any] | None = Non
 
 def seal_problem(text: str) -> str | None:
     """Return the problem of a sealed record's hash; None where it is right."""
-    found = re.search(rf'"{SEAL}": "([0-9a-f]{{64}})"', text)
-    if found is None:
+    seal = re.search(rf'"{SEAL}": "([0-9a-f]{{64}})"', text)
+    if seal is None:
         return f"'{SEAL}' is missing"
-    whole = text[: found.start(1)] + _OPEN + text[found.end(1) :]
-    return None if hashlib.sha256(whole.encode()).hexdigest() == found[1] else "checksum differs"
+    whole = text[: seal.start(1)] + _OPEN + text[seal.end(1) :]
+    return None if hashlib.sha256(whole.encode()).hexdigest() == seal[1] else "checksum differs"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -186,8 +186,8 @@ def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:
     while pending:
         prefix = pending.pop()
         empty = True
-        with os.scandir(os.path.join(folder, prefix)) as found:
-            for entry in found:
+        with os.scandir(os.path.join(folder, prefix)) as entries:
+            for entry in entries:
                 empty = False
                 name = prefix + entry.name
                 status = entry.stat(follow_symlinks=False)

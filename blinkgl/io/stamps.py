@@ -82,7 +82,7 @@ def read_timestamps(
     if stated is not None:
         return Stamps(nanoseconds(times, stated), names)
     points = [_SECONDS.fullmatch(text) for text in texts]
-    places = max(len(found[1]) for found in points if found) if None not in points else 0
+    places = max(len(point[1]) for point in points if point) if None not in points else 0
     if places and (names is not None or places >= _PLACES) and len(columns) == 1:
         note = f"{path.name}: read as the Event Camera Dataset's and TUM's lists: seconds with a point"
         return Stamps(nanoseconds(times, "s"), names, note)

@@ -208,9 +208,9 @@ def open_stills(path: Path) -> Stills:
         return _png(path, head) if head[:4] == b"\x89PNG" else Stills(path)
     if suffix in (".pbm", ".pgm", ".ppm", ".pnm"):
         head = _bytes(path, 4096)
-        found = re.match(rb"P([1-6])\s+\d+\s+\d+\s+(\d+)?", re.sub(rb"#[^\n]*", b"", head))
-        most = int(found[2] or 0) if found and found[1] in b"2356" else 1
-        if not found or not 1 <= most <= 65535:
+        heading = re.match(rb"P([1-6])\s+\d+\s+\d+\s+(\d+)?", re.sub(rb"#[^\n]*", b"", head))
+        most = int(heading[2] or 0) if heading and heading[1] in b"2356" else 1
+        if not heading or not 1 <= most <= 65535:
             raise AssetError(
                 "unknown kind of PNM", where=str(path), value=(head[:2], most), accepted="P1 to P6, maximum 1 to 65535"
             )
@@ -356,8 +356,8 @@ def _interval_ms(file: Any, notes: list[str]) -> tuple[float | None, int]:
 
 def _deep(data: bytes) -> bool:
     """Return whether a picture has bits that Pillow would reduce to 8: PNG of 16 bits, PNM of a larger maximum."""
-    found = re.match(rb"P[2356]\s+\d+\s+\d+\s+(\d{1,5})\s", re.sub(rb"#[^\n]*", b"", data[:4096]))
-    return (data[:4] == b"\x89PNG" and data[24:25] == b"\x10") or bool(found and int(found[1]) > 255)
+    heading = re.match(rb"P[2356]\s+\d+\s+\d+\s+(\d{1,5})\s", re.sub(rb"#[^\n]*", b"", data[:4096]))
+    return (data[:4] == b"\x89PNG" and data[24:25] == b"\x10") or bool(heading and int(heading[1]) > 255)
 
 
 def _by_opencv(data: bytes, path: Path) -> np.ndarray:

@@ -46,20 +46,20 @@ def slot_of(name: str) -> str:
 def named_columns(names: Iterable[str], reading: EventReading, where: str) -> dict[str, str]:
     """Return column -> its name among ``names``: as declared, else the one that means it; of several the bare letter.
     Raises AssetError: several, and none is declared."""
-    found: dict[str, list[str]] = {}
+    named: dict[str, list[str]] = {}
     names = list(names)
     for name in names:
         if (slot := slot_of(name)) != "_":
-            found.setdefault(slot, []).append(name)
-    whole = set("txyp") <= {*found, *reading.named}
-    for slot, all_ in found.items():
+            named.setdefault(slot, []).append(name)
+    whole = set("txyp") <= {*named, *reading.named}
+    for slot, all_ in named.items():
         if whole and slot not in reading.named and len(all_) > 1 and slot not in all_:
             raise AssetError(
                 f"{len(all_)} columns that may be {slot}, and none is chosen",
                 where=where,
                 accepted="one of " + ", ".join(f"--columns {slot}={name}" for name in all_),
             )
-    columns = {slot: slot if slot in all_ else all_[0] for slot, all_ in found.items() if slot not in reading.named}
+    columns = {slot: slot if slot in all_ else all_[0] for slot, all_ in named.items() if slot not in reading.named}
     return columns | {slot: name for slot, name in reading.named.items() if name in names}
 
 

@@ -104,8 +104,8 @@ class TextReader:
         # Two integers before the first event are the sensor's size.
         size = re.fullmatch(r"(\d{1,9})[ \t,;]+(\d{1,9})", text)
         openeb = re.fullmatch(r"%\s*geometry:\s*(\d{1,9}),(\d{1,9})", text)
-        if (found := size or openeb) and self.width is None:
-            self.width, self.height = int(found[1]), int(found[2])
+        if (size_line := size or openeb) and self.width is None:
+            self.width, self.height = int(size_line[1]), int(size_line[2])
             if openeb and not self._reading.columns:
                 self._order, self._unit = ("x", "y", "p", "t"), "us"
                 self.notes.append("read as OpenEB's CSV: x y p t, µs")
@@ -133,8 +133,8 @@ class TextReader:
         """Return whether rows that nothing describes are of the Event Camera Dataset's layout: the first ones here, all
         others when they are parsed."""
         matches = [_ECD_ROW.fullmatch(row) for row in rows]
-        told = self._order not in ((), _ECD) or self._unit or self._reading.time_unit
-        if told or None in matches or max((len(m[1]) for m in matches if m), default=0) < _ECD_PLACES:
+        declared = self._order not in ((), _ECD) or self._unit or self._reading.time_unit
+        if declared or None in matches or max((len(m[1]) for m in matches if m), default=0) < _ECD_PLACES:
             return False
         self._order = _ECD
         self.notes.append("read as the Event Camera Dataset's text: t x y p, seconds")

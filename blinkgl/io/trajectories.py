@@ -129,9 +129,9 @@ def read_trajectory(
         raise AssetError(
             "no trajectory", where=str(path), value=f"{len(table.positions)} poses", accepted="two or more"
         )
-    said = [] if notes is None else notes
-    said += table.notes
-    t_ns = _times(table, declared, path, said)
+    lines = [] if notes is None else notes
+    lines += table.notes
+    t_ns = _times(table, declared, path, lines)
     T = np.tile(np.eye(4), (len(t_ns), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = table.rotations.as_matrix(), table.positions
     if (declared.maps_from or _FROM.get(form or "", "camera")) == "world":
@@ -141,10 +141,10 @@ def read_trajectory(
         # The world's axes stay; only the body's change, so the matrix stands on the right.
         T[:, :3, :3] = T[:, :3, :3] @ _TO_OPENCV[axes]
         if declared.axes is None:
-            said.append(f"{path.name}: {form}'s axes ({axes}) turned to OpenCV's (axes: opencv if they are already)")
+            lines.append(f"{path.name}: {form}'s axes ({axes}) turned to OpenCV's (axes: opencv if they are already)")
     speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) / (np.diff(t_ns) * 1e-9)
     if (fast := float(np.median(speed))) > _FASTEST:
-        said.append(f"{path.name}: the body moves at {fast:.4g} units/s: another unit of time or length? (time_unit)")
+        lines.append(f"{path.name}: the body moves at {fast:.4g} units/s: another unit of time or length? (time_unit)")
     return t_ns, T
 
 
@@ -292,8 +292,13 @@ def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
     try:
         tree = json.loads(text, parse_int=str, parse_float=str)
         frames = tree["frames"]
-        given = np.array([frame["transform_matrix"] for frame in frames], np.float64)
-        if given.ndim != 3 or given.shape[1] not in (3, 4) or given.shape[2] != 4 or not (np.abs(given) < 1e100).all():
+        matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)
+        if (
+            matrices.ndim != 3
+            or matrices.shape[1] not in (3, 4)
+            or matrices.shape[2] != 4
+            or not (np.abs(matrices) < 1e100).all()
+        ):
             raise ValueError("transform_matrix")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split())[:80]
@@ -304,7 +309,7 @@ def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
         ) from None
     lines = list(range(1, len(frames) + 1))
     times = [str(frame["time"]) for frame in frames] if all("time" in frame for frame in frames) else None
-    return _Table(times, *_matrices(path, given, lines), lines, "s")
+    return _Table(times, *_matrices(path, matrices, lines), lines, "s")
 
 
 def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> np.ndarray:

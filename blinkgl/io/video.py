@@ -341,7 +341,7 @@ class VideoReader:
                         stamps.append(packet.pts)
             except self._av.FFmpegError as error:
                 problem = _gist(error)
-        found = len(stamps) + without
+        decoded = len(stamps) + without
         # The index of a file holds the packets that are to be read, edit lists included; its other counts do not.
         wanted = len(getattr(stream, "index_entries", ())) if "mp4" in file.format.name else 0
         cut = [line for line in log if re.search(r"ended prematurely|partial file|truncat", line, re.I)]
@@ -358,7 +358,7 @@ class VideoReader:
             self._start = min(stamps) * self._tick
         if without:  # some AVI and raw streams: nothing says when, so the frame rate does
             rate = self._rate(file, stream)
-            times = [round(k * 10**9 / rate) if rate else None for k in range(found)]
+            times = [round(k * 10**9 / rate) if rate else None for k in range(decoded)]
             return _Scan(times, [], problem)
         ticks = sorted(stamps)
         rates = [rate for rate in (stream.average_rate, stream.base_rate, stream.guessed_rate) if rate]

@@ -75,15 +75,17 @@ class LabelRequest:
         return hash(self._said)
 
     def __repr__(self) -> str:
-        said = [repr(name) for name in self.names]
-        return f"LabelRequest({', '.join([*said, f'intervals_ns={self.intervals_ns}'] if self.intervals_ns else said)})"
+        names = [repr(name) for name in self.names]
+        return (
+            f"LabelRequest({', '.join([*names, f'intervals_ns={self.intervals_ns}'] if self.intervals_ns else names)})"
+        )
 
 
 def asked_for(labels: LabelsConfig) -> LabelRequest:
     """Return the request of ``labels:``."""
     asked = [name for name, label in LABELS.items() if label.asked(labels)]
     intervals = {ns for name in asked for ns in LABELS[name].intervals(labels)}
-    categories = next((found for name in asked if (found := LABELS[name].categories(labels))), ())
+    categories = next((classes for name in asked if (classes := LABELS[name].categories(labels))), ())
     return LabelRequest(*asked, intervals_ns=sorted(intervals), categories=categories)
 
 

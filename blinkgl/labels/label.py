@@ -269,8 +269,8 @@ class Label:
         # Only the kind of number matters here; :meth:`own` converts the width.
         kind = "" if self.dtype is None else np.dtype(self.dtype).kind
         if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
-            said = f" {np.dtype(self.dtype)}" if kind else ""
-            return f"{array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}"
+            kind_words = f" {np.dtype(self.dtype)}" if kind else ""
+            return f"{array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{kind_words}"
         return None
 
     def read(self, path: Path, form: Form, height: int, width: int) -> Any:

@@ -31,8 +31,8 @@ def _divided_second(source: Source) -> Missing | None:
     if interval % 1000 == 0 and 1_000_000 % interval == 0:
         return None
     rate = max(r for r in (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100) if r <= max(1, 1e6 / interval))
-    said = f"flow over whole ms that divide a second (labels come at {1e6 / interval:g} Hz)"
-    return Missing(said, f"time: {{label_rate: {rate}}}")
+    expected = f"flow over whole ms that divide a second (labels come at {1e6 / interval:g} Hz)"
+    return Missing(expected, f"time: {{label_rate: {rate}}}")
 
 
 _events_before = need(

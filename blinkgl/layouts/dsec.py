@@ -75,9 +75,9 @@ class Dsec(Layout):
         return f"{self.about} (not DSEC's provider, which asks for 'rig: stereo' and 'labels: {{disparity: true}}')"
 
     def write(self, source: Source, folder: Path) -> list[str]:
-        said = []
+        lines = []
         if len(source.flow_times("forward")) == 1:
-            said.append(f"{source.name}: one label, and bflow's loader opens two or more")
+            lines.append(f"{source.name}: one label, and bflow's loader opens two or more")
         write_events(source, folder / "events/left")
         for towards in ("forward", "backward"):
             write_flow(source, towards, folder / "flow")
@@ -88,13 +88,13 @@ class Dsec(Layout):
                 write_bytes(folder / f"images/left/ev_inf/{times.index(t):06d}.png", source.copied("images", k))
         if source.right is not None:
             write_events(source.right, folder / "events/right")
-            said += _write_disparity(source, source.right, folder / "disparity")
+            lines += _write_disparity(source, source.right, folder / "disparity")
         if source.unit is not None:
             for name, content in made_again(source.unit).items():
                 write_bytes(folder / name, content)
         if source.camera is not None:
             write_bytes(folder / "calibration/cam_to_cam.yaml", cam_to_cam(source, source.camera).encode())
-        return said
+        return lines
 
 
 class ERaft(Layout):

@@ -71,16 +71,16 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
     for source in sources:
         _refuse_what_lacks(row, source)
     places = _places(row, sources)
-    said = _size(row, sources)
+    lines = _size(row, sources)
     with atomic_folder(out) as folder:
         for source, place in zip(sources, places):
             (folder / place).mkdir(parents=True, exist_ok=True)
-            said += row.write(source, folder / place)
+            lines += row.write(source, folder / place)
         for split in row.splits:
             (folder / split).mkdir(exist_ok=True)
     held = {place.split("/")[0] for place in places}
-    said += [f"nothing in {split}/, which its loaders open" for split in row.filled if split not in held]
-    return Exported(len(sources), tuple(said), row.opened_by(out))
+    lines += [f"nothing in {split}/, which its loaders open" for split in row.filled if split not in held]
+    return Exported(len(sources), tuple(lines), row.opened_by(out))
 
 
 def refuse_plan(template: RunTemplate, num: int | None, layout: str) -> None:

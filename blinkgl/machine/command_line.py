@@ -97,8 +97,8 @@ def run_app(
     except Exception as error:  # noqa: BLE001 - every error leaves as a line for the user
         if Stop.number is not None and not debug:  # some library turned the interrupt into an error of its own
             return _interrupted(arguments, resumes)
-        said = _said_of_gone(arguments, gone or {}) if _is_usage_error(error) else None
-        return _report(error if said is None else said, debug, project)
+        answer = _said_of_gone(arguments, gone or {}) if _is_usage_error(error) else None
+        return _report(error if answer is None else answer, debug, project)
 
 
 def _interrupted(arguments: list[str], resumes: str) -> int:
@@ -127,11 +127,11 @@ def _is_usage_error(error: Exception) -> bool:
 
 def _said_of_gone(arguments: list[str], gone: Mapping[str, str]) -> ConfigError | None:
     """Return the error for a command or an option of earlier versions among the arguments; None: there is none."""
-    given = {argument.partition("=")[0] for argument in arguments}
-    for words, said in gone.items():
+    options = {argument.partition("=")[0] for argument in arguments}
+    for words, answer in gone.items():
         command, _, option = words.partition(" --")
-        if arguments[: len(command.split())] == command.split() and (not option or f"--{option}" in given):
-            return ConfigError("was removed", where=f"--{option}" if option else command, accepted=said)
+        if arguments[: len(command.split())] == command.split() and (not option or f"--{option}" in options):
+            return ConfigError("was removed", where=f"--{option}" if option else command, accepted=answer)
     return None
 
 

@@ -123,12 +123,12 @@ class _Cache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
-            found = super().load_overload(sig, target_context)
-            if found is None and turn.begin():
-                found = super().load_overload(sig, target_context)
-                if found is not None:
+            overload = super().load_overload(sig, target_context)
+            if overload is None and turn.begin():
+                overload = super().load_overload(sig, target_context)
+                if overload is not None:
                     turn.end()
-            return found
+            return overload
         except Exception:  # noqa: BLE001 - damaged bytes raise anything
             self._say("the kernels kept there are damaged or unreadable and are compiled again")
             with contextlib.suppress(OSError):
@@ -180,7 +180,7 @@ def _stamps_of_imports(module: str) -> tuple[tuple[str, float, int], ...]:
                 seen.add(name)
                 waiting.append(name)
     files = {name: os.stat(file) for name in sorted(seen) if (file := getattr(sys.modules.get(name), "__file__", None))}
-    return tuple((name, found.st_mtime, found.st_size) for name, found in files.items())
+    return tuple((name, status.st_mtime, status.st_size) for name, status in files.items())
 
 
 def kernel(function: Callable | None = None, *, error_model: Literal["python", "numpy"] = "python") -> Any:

@@ -64,8 +64,8 @@ def _guarded(where: str, load):
     except BlinkGLError:
         raise
     except Exception as error:
-        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise ConfigError("the plug-in fails", where=where, value=said, accepted="a file that imports") from error
+        words = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise ConfigError("the plug-in fails", where=where, value=words, accepted="a file that imports") from error
 
 
 def plugin_files() -> list[str]:

@@ -100,9 +100,9 @@ class SampleStream(Closing):
             self._executor = Inline() if workers == 0 else Local(workers, one, cores=workers)
             self._executor.open(self.job)
         except StartError as error:
-            said = _why(error)
+            reason = _why(error)
             self.close()
-            raise ConfigError(said, where="workers") from error
+            raise ConfigError(reason, where="workers") from error
         except BaseException:
             self.close()
             raise
@@ -178,15 +178,15 @@ class SampleStream(Closing):
         if path.with_suffix(_GONE).exists() or slot < (self._base if mine else self._told_base()):
             raise EventDataError("this sample was taken", where=f"slot {slot}")
         try:
-            said = (self.spool / _ERROR).read_text(encoding="utf-8")
+            message = (self.spool / _ERROR).read_text(encoding="utf-8")
         except OSError:
             if not self.spool.is_dir():
                 raise EventDataError("the online source is closed", where=f"slot {slot}") from None
             return False
         if path.is_file():  # earlier samples are valid
             return False
-        where, _, said = said.partition("\n")
-        raise ConfigError(said, where=where)
+        where, _, message = message.partition("\n")
+        raise ConfigError(message, where=where)
 
     def _told_base(self) -> int:
         with suppress(OSError, ValueError):
@@ -345,10 +345,10 @@ def _of_ray() -> Share | None:
     train = sys.modules.get("ray.train")
     try:
         context = cast(Any, train).get_context()
-        said = context.get_world_rank(), context.get_world_size(), context.get_local_rank()
+        ranks = context.get_world_rank(), context.get_world_size(), context.get_local_rank()
     except (AttributeError, RuntimeError):  # not imported; not one of its workers, in some versions
         return None
-    return None if said[0] is None or said[1] is None else Share(*said)
+    return None if ranks[0] is None or ranks[1] is None else Share(*ranks)
 
 
 def _of_environment(environment: Mapping[str, str]) -> Share:

@@ -96,18 +96,18 @@ class Calibration:
         name, (height, width) = self.config.emulator, self.clip.sensor
         seconds = [(self.clip.edges_us[b] - self.clip.edges_us[a]) / 1e6 for a, b in self.halves]
         file = os.path.basename(self.recording)
-        told = {k: v for k, v in self.config.model_dump(exclude_defaults=True).items() if k != "emulator"}
+        values = {k: v for k, v in self.config.model_dump(exclude_defaults=True).items() if k != "emulator"}
         return {
             "name": os.path.splitext(file)[0],
             "width": width,
             "height": height,
             **({} if self.gamma is None else {"frame_gamma": self.gamma}),
-            "emulators": {name: {k: _short(v) for k, v in told.items()}},
+            "emulators": {name: {k: _short(v) for k, v in values.items()}},
             "sources": {
                 f"emulators.{name}": f"blinkgl calibrate, fitted to the first {seconds[0]:.3g} s of {file}; in the "
                 f"other {seconds[1]:.3g} s {self.judged[1].rate_ratio:.2f} of its events, intervals KS "
                 f"{self.judged[1].interval_distance:.3f}",
-                **{f"emulators.{name}.{key}": why for key, why in self.undetermined.items() if key in told},
+                **{f"emulators.{name}.{key}": why for key, why in self.undetermined.items() if key in values},
             },
             "uncertainty": {f"emulators.{name}.{key}": _short(v, 2) for key, v in self.uncertainty.items()},
         }
@@ -150,21 +150,21 @@ def calibrate(
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
     if progress:
         progress("reading", 0.0)
-    stream, size, said = read_recording(recording, events, least=LEAST_EVENTS)
-    given = None
+    stream, size, notes = read_recording(recording, events, least=LEAST_EVENTS)
+    pictures = None
     if not still:
         if frames is None:
             # The frames of the camera whose events are read.
             frames, declared = _own_frames(recording, events), replace(declared, stream=events.stream)
         source, exposures = timed_frames(frames, declared)
-        given, said = list(source), [*said, *source.notes]
+        pictures, notes = list(source), [*notes, *source.notes]
         codes = replace(reading.codes, white_level=declared.white_level, range=declared.range).of(source)
         reading = replace(reading, codes=codes, exposures=exposures, name=os.fspath(frames))
     if declared.zero_time:
         stream = replace(stream, t=stream.t - stream.t[0])
     search = dict(emulator=base, fixed=fixed, starts=starts, seed=seed, progress=progress)
-    result = calibrate_events(stream, size, given, reading, name=os.fspath(recording), **search)
-    return replace(result, notes=[*result.notes, *said])
+    result = calibrate_events(stream, size, pictures, reading, name=os.fspath(recording), **search)
+    return replace(result, notes=[*result.notes, *notes])
 
 
 def calibrate_events(
@@ -198,22 +198,22 @@ def calibrate_events(
     # The first half is fitted, the second only judged: a fit must not see what it is judged by.
     half = (clip.intervals + 1) // 2
     halves = ((0, half), (half, clip.intervals))
-    found = Search([(clip, half)], base, seed, lambda done: say("fitting", done))
-    _fit(found, before, keys, starts)
+    search = Search([(clip, half)], base, seed, lambda done: say("fitting", done))
+    _fit(search, before, keys, starts)
     say("judging", 1.0)
     # Another seed than the search's, so that it is not judged by the noise that it has fitted.
-    streams = [clip.simulate(one, seed + 1) for one in (base, found.config())]
+    streams = [clip.simulate(one, seed + 1) for one in (base, search.config())]
     judged = [_judged(clip, stream, halves) for stream in streams]
     return Calibration(
         recording=name,
         clip=clip,
         before=base,
-        config=found.config(),
-        values=found.values(),
-        uncertainty=found.uncertainty(),
-        undetermined=found.undetermined,
-        cost=found.cost,
-        evaluations=found.evaluations,
+        config=search.config(),
+        values=search.values(),
+        uncertainty=search.uncertainty(),
+        undetermined=search.undetermined,
+        cost=search.cost,
+        evaluations=search.evaluations,
         halves=halves,
         judged_before=judged[0],
         judged=judged[1],
@@ -345,9 +345,9 @@ def _own_frames(recording: str | os.PathLike, events: EventReading) -> str | os.
 def _of_frames(clip: Clip, reading: FrameReading) -> tuple[list[str], list[str]]:
     """Return notes and warnings about the frames."""
     facts, gap_ms = clip.facts, float(np.median(np.diff(clip.clock_us))) / 1000
-    found = f"{facts['found_delay_us'] / 1000:+.1f} ms (correlation {facts['delay_correlation']:.2f})"
+    delay = f"{facts['found_delay_us'] / 1000:+.1f} ms (correlation {facts['delay_correlation']:.2f})"
     notes = [
-        f"Clock: the polarity sums follow the frames best when {found} is added to the frames' times; "
+        f"Clock: the polarity sums follow the frames best when {delay} is added to the frames' times; "
         + (
             f"the emulator's own events lag by {facts['lag_us'] / 1000:.1f} ms of it; {facts['delay_us'] / 1000:+.1f} "
             "ms taken."

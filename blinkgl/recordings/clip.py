@@ -145,9 +145,9 @@ def clip_of_frames(
     if len(bursts):
         facts |= {"bursts": len(bursts), "in_bursts": float(inside_any(events.t, bursts).mean())}
     logs, change = _changes(grey)
-    found, correlation = clock_offset(events, change, clock, size)
-    delay_us = _delay(found, correlation, reading)
-    facts |= {"delay_us": delay_us, "found_delay_us": found, "delay_correlation": correlation}
+    offset, correlation = clock_offset(events, change, clock, size)
+    delay_us = _delay(offset, correlation, reading)
+    facts |= {"delay_us": delay_us, "found_delay_us": offset, "delay_correlation": correlation}
     clock = clock + delay_us
     inside = _spanned(events, clock, reading.name)
     first, last = inside[0], inside[-1] + 1
@@ -209,8 +209,8 @@ def _greys(
                 accepted=f"{size[1]}x{size[0]}, as its events",
             )
         if decode is None:
-            found = meaning(frame, replace(reading.codes, own=OwnFrames(size, "linear")))
-            decode, white = found.decode, found.white
+            codes = meaning(frame, replace(reading.codes, own=OwnFrames(size, "linear")))
+            decode, white = codes.decode, codes.white
             if frame.dtype.kind == "u":
                 # It takes luminance, of which no more than the distance of two codes is to be known.
                 steadied = DenoisedLight(lambda light: light, decode.code_distance(frame.dtype))
@@ -323,8 +323,8 @@ def _one_gain(grey: list[np.ndarray], clock_us: np.ndarray, used: np.ndarray, ev
         if float(np.median(np.abs(ratio - middle))) > max(ALIKE, 0.7 * abs(middle)):  # no common factor
             middle = 0.0
         # said: the contrast that the events stand for at most, in the direction of the change.
-        said = np.sign(middle) * float((on - off)[used].mean()) * LARGEST_THRESHOLD
-        changed = always or (abs(middle) > LEAP and said < abs(middle) / 2)
+        change = np.sign(middle) * float((on - off)[used].mean()) * LARGEST_THRESHOLD
+        changed = always or (abs(middle) > LEAP and change < abs(middle) / 2)
         gains.append(gains[-1] + (middle if changed else 0.0))
     return np.exp(gains)
 
@@ -407,15 +407,15 @@ def clock_offset(events: Events, changes: np.ndarray, clock_us: np.ndarray, size
 
 
 def _match(events: Events, changes: np.ndarray, clock_us: np.ndarray, pairs: list[int], size: tuple[int, int]) -> float:
-    found = []
+    matches = []
     for k in pairs:
         if clock_us[k] < events.t[0] - 1000 or clock_us[k + 1] > events.t[-1] + 1000:
             continue
         part = events.window(int(clock_us[k]), int(clock_us[k + 1]))
         sums = polarity_sums(part, size)
         if sums.any() and np.ptp(changes[k]) > 0:  # frames without motion match nothing
-            found.append(np.corrcoef(cv2.GaussianBlur(sums, (0, 0), BLUR_PX).ravel(), changes[k].ravel())[0, 1])
-    return float(np.mean(found)) if found else float("nan")
+            matches.append(np.corrcoef(cv2.GaussianBlur(sums, (0, 0), BLUR_PX).ravel(), changes[k].ravel())[0, 1])
+    return float(np.mean(matches)) if matches else float("nan")
 
 
 def stuck_pixels(events: Events, size: tuple[int, int]) -> np.ndarray:

@@ -365,19 +365,19 @@ def _frame_intervals(
     lo, hi = inside[0], inside[-1] + 1
     own = OwnFrames((source.height, source.width), "linear")
     codes = Codes(gamma, declared.white_level, declared.range, own).of(source)
-    found = meaning(next(iter(source))[0], codes)
+    frame_codes = meaning(next(iter(source))[0], codes)
 
     def changes() -> Iterator[np.ndarray]:
         before = None
         for k, (frame, _, name) in enumerate(source):
             if lo <= k <= hi:
                 # The offset is in 8-bit codes, so the luminance is scaled to them.
-                log = np.log(found.decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
+                log = np.log(frame_codes.decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
                 if before is not None:
                     yield log - before
                 before = log
 
-    return times[lo : hi + 1], changes(), [*source.notes, *found.notes]
+    return times[lo : hi + 1], changes(), [*source.notes, *frame_codes.notes]
 
 
 def histogram_distance(a: np.ndarray, b: np.ndarray) -> float:

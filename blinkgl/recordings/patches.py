@@ -79,7 +79,7 @@ def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> 
     x, y = right / linked, down / linked
     # An event of each polarity is added, so that few events give no extreme share.
     log, on_share = np.log1p(count), (on + 1) / (count + 2)
-    told = (
+    names = (
         np.log1p(on),
         np.log1p(off),
         np.abs(on - off) / some,
@@ -107,7 +107,7 @@ def patches(events: Events, size: tuple[int, int], span_us: tuple[int, int]) -> 
         np.diff(log, axis=0, prepend=log[:1]),
         -np.diff(log, axis=0, append=log[-1:]),
     )
-    return count.astype(np.int64), np.stack(told, -1).astype(np.float32)
+    return count.astype(np.int64), np.stack(names, -1).astype(np.float32)
 
 
 def _beside(values: np.ndarray) -> np.ndarray:

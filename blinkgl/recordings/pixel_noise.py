@@ -81,12 +81,12 @@ class PixelFit:
     def sensor(self) -> dict[str, Any]:
         """Return the table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
         file = os.path.basename(self.recording)
-        told = {k: float(f"{v:.4g}") for k, v in self.config.model_dump(exclude_defaults=True).items()}
+        values = {k: float(f"{v:.4g}") for k, v in self.config.model_dump(exclude_defaults=True).items()}
         return {
             "name": os.path.splitext(file)[0],
             "width": self.size[1],
             "height": self.size[0],
-            "readout": {"pixels": told},
+            "readout": {"pixels": values},
             "sources": {
                 "readout.pixels": f"blinkgl calibrate --still --emulator pixels, fitted to the first "
                 f"{self.seconds[0]:.3g} s of {file}; in the other {self.seconds[1]:.3g} s {self.rate_ratio:.2f} of its "
@@ -109,8 +109,8 @@ def fit_pixels(
     Raises EventDataError (too few events), AssetError (unreadable)."""
     if progress:
         progress("reading", 0.0)
-    events, size, said = read_recording(recording, reading, least=2 * LEAST_EVENTS)
-    return fit_pixels_of(events, size, name=os.fspath(recording), seed=seed, progress=progress), said
+    events, size, notes = read_recording(recording, reading, least=2 * LEAST_EVENTS)
+    return fit_pixels_of(events, size, name=os.fspath(recording), seed=seed, progress=progress), notes
 
 
 def fit_pixels_of(
@@ -139,8 +139,8 @@ def fit_pixels_of(
         values["refractory_us"] = 1e6 * dead
     is_hot = law.hot_chance(answered, counts) > 0.5
     if answered.hot:
-        found, spread = _preferences(halves[0], pixel, counts, is_hot)
-        values |= found
+        preferences, spread = _preferences(halves[0], pixel, counts, is_hot)
+        values |= preferences
         uncertainty |= spread
     first_on = float((halves[0].p[~is_hot[pixel]] > 0).mean()) if (~is_hot[pixel]).any() else 0.5
     if answered.answers:
@@ -193,7 +193,7 @@ def _undetermined(law: _Found, dead: float) -> dict[str, str]:
         "refractory_us": (dead, "no pixel fires so often that it would show"),
         "answered": (law.answers, "events of a pixel are as many as if none answered another"),
     }
-    return {key: said for key, (known, said) in why.items() if not known}
+    return {key: reason for key, (known, reason) in why.items() if not known}
 
 
 def _answered(share: float, seen: float) -> float:
@@ -256,8 +256,8 @@ def _delays(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: floa
         return -float(np.log(np.maximum(density, 1e-300)).sum())
 
     start = np.array([np.log(np.median(gap)), 0.0, -1.5])
-    found = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 600}).x
-    return float(np.exp(found[0])), float(np.exp(found[1]) / _TEN), float((p[opposite, 0] > 0).mean())
+    best = minimize(loss, start, method="Nelder-Mead", options={"maxiter": 600}).x
+    return float(np.exp(best[0])), float(np.exp(best[1]) / _TEN), float((p[opposite, 0] > 0).mean())
 
 
 def _preferences(
@@ -385,8 +385,8 @@ class _Counts:
         deviation = np.sqrt(mean * (1 + 3 * q) / (1 + q)) * np.maximum(1 - asleep, 1e-2)
         above = ndtr((self._edges[None, _EXACT:] - mean[:, None]) / deviation[:, None])
         many = np.diff(above, axis=1, append=1.0)
-        found = np.concatenate([few, many], axis=1)
-        self._kept[number] = found / np.maximum(found.sum(axis=1, keepdims=True), 1e-12)
+        moments = np.concatenate([few, many], axis=1)
+        self._kept[number] = moments / np.maximum(moments.sum(axis=1, keepdims=True), 1e-12)
         return self._kept[number]
 
     def _law(self, median: float, decades: float) -> np.ndarray:
@@ -468,11 +468,11 @@ class _Counts:
 def _curvature(loss: Callable[[np.ndarray], float], at: np.ndarray, step: float = 0.02) -> np.ndarray:
     """Return (n, n) second differences."""
     n = len(at)
-    found, unit = np.zeros((n, n)), step * np.eye(n)
+    hessian, unit = np.zeros((n, n)), step * np.eye(n)
     for i in range(n):
         for j in range(i + 1):
             a, b = unit[i], unit[j]
             # For i = j these are differences over twice the step, so the divisor is the same.
-            found[i, j] = loss(at + a + b) - loss(at + a - b) - loss(at - a + b) + loss(at - a - b)
-            found[j, i] = found[i, j]
-    return found / (4 * step**2)
+            hessian[i, j] = loss(at + a + b) - loss(at + a - b) - loss(at - a + b) + loss(at - a - b)
+            hessian[j, i] = hessian[i, j]
+    return hessian / (4 * step**2)

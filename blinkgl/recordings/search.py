@@ -79,16 +79,16 @@ class Search:
         """Return the parameters that affect the scene; the others are named and not changed. The test uses the middle
         of all ranges, with one key at either end."""
         middle = self._ends(keys).mean(axis=1)
-        here, found = self._off(keys, middle), []
+        here, responding = self._off(keys, middle), []
         for i, ends in enumerate(self._ends(keys)):
             places = np.repeat(middle[None], 2, axis=0)
             places[:, i] = ends
             if any(np.abs(self._off(keys, at) - here).max() > 0 for at in places):
-                found.append(keys[i])
+                responding.append(keys[i])
             else:
                 self.undetermined[keys[i]] = "makes no difference to this scene, left as it was"
                 self._set[keys[i]] = self._default(keys[i])
-        return found
+        return responding
 
     def roughly(self, keys: list[str], starts: int) -> np.ndarray:
         """Return the logarithms of the parameters at the end of the best of several descents: a few steps from more
@@ -187,8 +187,8 @@ class Search:
         return {key: float(np.exp(v) * s * misfit) for key, v, s in zip(self.keys, self.place, spread)}
 
     def _spread(self) -> np.ndarray:
-        told = (self._jacobian * self._robust()[:, None])[: len(self.target.values)]
-        return np.sqrt(np.diag(np.linalg.inv(told.T @ told + self._prior())))
+        slopes = (self._jacobian * self._robust()[:, None])[: len(self.target.values)]
+        return np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes + self._prior())))
 
     def _robust(self) -> np.ndarray:
         """Return square roots of the loss's weights of the residuals."""
@@ -209,11 +209,11 @@ class Search:
         initial sensor defines what is typical."""
         usual, scale = np.zeros(len(keys)), np.zeros(len(keys))
         for i, key in enumerate(keys):
-            known, given = self._base.fitted[key], self._default(key)
+            known, default = self._base.fitted[key], self._default(key)
             if known.usual is None:
                 continue
-            said = key in self._base.model_fields_set and given
-            usual[i] = np.log(given if said else known.usual)
+            stated = key in self._base.model_fields_set and default
+            usual[i] = np.log(default if stated else known.usual)
             scale[i] = PRIOR / np.log(known.factor)
         return usual, scale
 
@@ -295,7 +295,7 @@ class Search:
         if not keys:
             return _loss(self._difference(keys, start)), start
         low, high = self._ends(keys).T
-        found = least_squares(
+        solution = least_squares(
             lambda at: self._difference(keys, at),
             np.clip(start, low, high),
             jac=lambda at: self._derivatives(keys, at, self._difference(keys, at)) if slopes is None else slopes,
@@ -305,7 +305,7 @@ class Search:
             max_nfev=steps,
         )
         # scipy's cost is half of the loss.
-        return 2 * float(found.cost), found.x
+        return 2 * float(solution.cost), solution.x
 
 
 def _loss(residual: np.ndarray) -> float:

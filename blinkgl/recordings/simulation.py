@@ -243,8 +243,8 @@ def stepped(
     EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
     report.notes.extend(camera.notes)
-    given = _Given(frames, use, report, fitting, camera)
-    stream = iter(given)
+    source = _Given(frames, use, report, fitting, camera)
+    stream = iter(source)
     if use.interpolate == "motion":
         report.displacement = between.Displacement()
         stream = between.motion(stream, use.max_px, displacement=report.displacement)
@@ -261,7 +261,7 @@ def stepped(
     for t_ns, events in emulate(shown(), camera):
         report.add(t_ns, events, camera)
         # An interpolated frame lies before the given frame that has been read last.
-        yield Step(t_ns, events, seen[0], given.decode, t_ns == given.t_ns)
+        yield Step(t_ns, events, seen[0], source.decode, t_ns == source.t_ns)
 
 
 def _watched(stream: Iterator[tuple[np.ndarray, int]], moved_px: list[float]) -> Iterator[tuple[np.ndarray, int]]:
@@ -330,17 +330,17 @@ class _Given:
     def _begin(self, first: np.ndarray) -> tuple[float | None, DenoisedLight | None, bool]:
         """Decide by the first frame's type what codes mean. Return the code of white, what removes noise, and whether
         frames may stay codes."""
-        found = meaning(first, self._use.codes)
-        self.decode, self._report.assumed_gamma = found.decode, found.assumed
-        self._report.notes.extend(found.notes)
+        codes = meaning(first, self._use.codes)
+        self.decode, self._report.assumed_gamma = codes.decode, codes.assumed
+        self._report.notes.extend(codes.notes)
         by_codes = self._use.interpolate == "linear" and first.dtype == np.uint8 and first.ndim == 2
         by_codes = by_codes and self._fitting is None
         if by_codes:
             self._camera.emulator.set_decode(self.decode.table(np.uint8))
         if self._use.keep_noise or first.dtype.kind != "u":
-            return found.white, None, by_codes
+            return codes.white, None, by_codes
         light = lambda frame: self._luminance(frame, "")
-        return found.white, DenoisedLight(light, self.decode.code_distance(first.dtype)), by_codes
+        return codes.white, DenoisedLight(light, self.decode.code_distance(first.dtype)), by_codes
 
     def _luminance(self, frame: np.ndarray, name: str) -> np.ndarray:
         luminance = self.decode(frame, name)
@@ -387,9 +387,9 @@ def file_to_events(
     iterator = iter(frames)
     first = list(itertools.islice(iterator, 2))
     start_us, gap_ns = first[0][1] // 1000, first[-1][1] - first[0][1]
-    given = enumerate(itertools.chain(first, iterator))
+    numbered = enumerate(itertools.chain(first, iterator))
     steps = simulated_steps(
-        ((frame, t_ns, f"{source}: frame {i} ({name})") for i, (frame, t_ns, name) in given),
+        ((frame, t_ns, f"{source}: frame {i} ({name})") for i, (frame, t_ns, name) in numbered),
         use,
         emulator=emulator,
         seed=seed,

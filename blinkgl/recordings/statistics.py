@@ -146,13 +146,13 @@ def _looks(
     events: Events, size: tuple[int, int], span_us: tuple[int, int], full: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``GroupSums.looks`` and (T, Y, X) bool, the patches that count (full: where that is known)."""
-    count, told = patches(events, size, span_us)
+    count, numbers = patches(events, size, span_us)
     full = count >= LEAST_IN_PATCH if full is None else full
     side = TILE_PX // 2
     # The group of the tile in which each patch lies, as in ``groups``.
     rows, columns = (np.arange(n) * SIDE_PX // side for n in full.shape[1:])
     group = np.broadcast_to((rows[:, None] * 7 + columns * 3) % GROUPS, full.shape)[full]
-    values = told[full].astype(np.float64)
+    values = numbers[full].astype(np.float64)
     parts = np.concatenate([np.ones((len(values), 1)), values, values * values], axis=1)
     return np.stack([_by(group, column) for column in parts.T], 1), full
 
@@ -338,9 +338,9 @@ def _probes(isi: np.ndarray) -> np.ndarray:
     if not isi.sum():
         return np.empty(0, np.int64)
     cdf = np.cumsum(isi) / isi.sum()
-    found = np.searchsorted(cdf, PROBES)
+    places = np.searchsorted(cdf, PROBES)
     # The one before the first tells whether a simulation has shorter intervals than the camera ever has.
-    return np.unique(np.concatenate([found, [max(found[0] - 2, 0)]]))
+    return np.unique(np.concatenate([places, [max(places[0] - 2, 0)]]))
 
 
 def numbers(

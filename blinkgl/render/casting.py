@@ -107,13 +107,13 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None) -> Hits:
     hit, bary, depth = nearest(scene, t_ns, rays_of(scene.camera, xy)[:, :2])
     parts = scene_parts(scene)
     # A part's number -1 (nothing hit) indexes the added 0 at the end.
-    found = hit[:, 0] >= 0
+    is_hit = hit[:, 0] >= 0
     ids = np.array([obj.instance_id for obj, _ in parts] + [0], np.int32)
     local = np.full((len(xy), 3), np.nan)
     hits = Hits(
         xy=xy,
         t_ns=int(t_ns),
-        hit=found,
+        hit=is_hit,
         depth=depth,
         instance=ids[hit[:, 0]],
         part=hit[:, 0],

@@ -347,20 +347,20 @@ def _cross(lines, width, height, out, places):
 def _by_pixel(crossings, places, width, counts, pixels, out):
     """Write the crossings to ``out``, grouped by pixel, and return the number of pixels. counts : zeros, left so."""
     # A counting sort. ``counts`` first holds numbers, then write positions, and is zero again at the end.
-    found = 0
+    filled = 0
     for n in range(len(crossings)):
         place = places[n]
         if counts[place] == 0:
-            pixels[found, 2] = place
-            found += 1
+            pixels[filled, 2] = place
+            filled += 1
         counts[place] += 1
     # Another one, of the pixels by their numbers of crossings: processors shade several at once, as long as the one
     # with the most takes.
     begins = np.zeros(_BUSIEST + 1, np.int64)
-    for k in range(found):
+    for k in range(filled):
         begins[min(counts[pixels[k, 2]], _BUSIEST)] += 1
     begins[:] = np.cumsum(begins) - begins
-    for k in range(found):
+    for k in range(filled):
         place = pixels[k, 2]
         at = min(counts[place], _BUSIEST)
         pixels[begins[at], 3] = place
@@ -368,7 +368,7 @@ def _by_pixel(crossings, places, width, counts, pixels, out):
     # Until here pixels[:, 3] holds the sorted places. Now the columns become x, y, first crossing and the one after the
     # last, and ``counts`` the write positions.
     first = 0
-    for k in range(found):
+    for k in range(filled):
         place = pixels[k, 3]
         pixels[k, 0], pixels[k, 1], pixels[k, 2] = place % width, place // width, first
         first += counts[place]
@@ -379,6 +379,6 @@ def _by_pixel(crossings, places, width, counts, pixels, out):
         counts[places[n]] = at + 1
         for i in range(CROSSING):
             out[at, i] = crossings[n, i]
-    for k in range(found):
+    for k in range(filled):
         counts[pixels[k, 1] * width + pixels[k, 0]] = 0
-    return found
+    return filled

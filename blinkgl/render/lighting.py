@@ -70,6 +70,12 @@ class Lighting:
         none = np.zeros((0, 3), np.float32)
         self._directed: tuple[Moment | None, tuple[np.ndarray, np.ndarray]] = None, (none, none)
         self._sun = np.asarray(light.sun_direction, np.float64)
+        self._around = light.over_time
+        self._varying = {
+            name: lamps
+            for name, lamps in (("sun_strength", self.lamps[: self._suns]), ("lamp_strength", near))
+            if any(lamp.over_time is not None for lamp in lamps)
+        }
 
     def defines(self, kind: Kind, one_channel: bool, maps: Sequence[Any]) -> dict[str, Any]:
         """Return the defines of a lit pass's variant. RGB: light of three channels, where one is not enough: for
@@ -89,6 +95,7 @@ class Lighting:
             | {name: count for name, count in counts.items() if count}
             | ({"AMBIENT": ambient} if self._quadric.any() else {})
             | shadows
+            | ({"VARYING": 1} if self._around is not None and "GLOSSY" in kind.more else {})
             | ({"FACETED": 1} if kind.faceted and not (shadows or lamps) else {})
             | (rgb or ({"RGB": 1} if not one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
@@ -108,8 +115,10 @@ class Lighting:
                 # A program of one channel gets one value, weighted by the colour of the surface.
                 one = per_channel and uniform.dimension == 1
                 key = (name, channel) if one else (name,)
-                if key not in self._bytes:
+                if key not in self._bytes or name in self._varying:
                     values = self._fixed[name]
+                    if name in self._varying:
+                        values = values * [moment.factor(lamp.over_time) for lamp in self._varying[name]]
                     values = self.channel(channel) @ values if one else values.T if per_channel else values
                     self._bytes[key] = np.ascontiguousarray(values, np.float32).tobytes()
                 uniform.write(self._bytes[key])
@@ -157,9 +166,10 @@ class Lighting:
         own = axes @ R
         spots = slice(len(self.lamps) - self._spots, None)
         placed = {"sun_towards": own[:, : self._suns], "lamp_place": away @ R, "spot_axis": own[:, spots]}
-        placed |= _forms(_seen_turned(self._quadric, turn))
+        factor = moment.factor(self._around)
+        placed |= _forms(_seen_turned(self._quadric, turn) * factor)
         if self._quartic is not None:
-            placed["around_fourth"] = _fourth(_seen_turned(self._quartic, _kron(R, R)))
+            placed["around_fourth"] = _fourth(_seen_turned(self._quartic, _kron(R, R))) * factor
         if rates:
             dR, dt = moment.rates.T_world_obj[:, :3, :3], moment.rates.T_world_obj[:, :3, 3]
             changes = np.array([lamp.path.derivative(moment.t_ns) for lamp in self.lamps]).reshape(-1, 4, 4)
@@ -172,11 +182,11 @@ class Lighting:
                 "lamp_place_rate": away @ dR + (changes[None, self._suns :, :3, 3] - dt[:, None]) @ R,
                 "spot_axis_rate": own_rate[:, spots],
             }
-            changed = _forms(_seen_turned(self._quadric, turn, turn_rate))
+            changed = _forms(_seen_turned(self._quadric, turn, turn_rate) * factor)
             placed |= {f"{name}_rate": values for name, values in changed.items()}
             if self._quartic is not None:
                 pairs_rate = _kron(dR, R) + _kron(R, dR)
-                placed["around_fourth_rate"] = _fourth(_seen_turned(self._quartic, _kron(R, R), pairs_rate))
+                placed["around_fourth_rate"] = _fourth(_seen_turned(self._quartic, _kron(R, R), pairs_rate)) * factor
         placed = {name: np.ascontiguousarray(values, np.float32) for name, values in placed.items()}
         self._last = moment, rates, placed
         return placed

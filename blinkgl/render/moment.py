@@ -8,6 +8,7 @@ passes.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,12 +19,14 @@ from blinkgl.camera import CameraModel
 from blinkgl.camera.drawing import seen_through
 from blinkgl.scene.motion import piecewise
 from blinkgl.scene.motion.paths import KeyframePath
+from blinkgl.scene.waveforms import factor_at
 from blinkgl.types.recent import Recent
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.scene.motion.pose_path import PosePath
     from blinkgl.scene.types import Scene
+    from blinkgl.scene.waveforms import Waveform
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -121,7 +124,10 @@ class Moment:
     """All objects of a scene at t_ns. Values are computed when they are first used, and only once.
 
     T_world_cam : (4, 4) float64.   T_world_obj, T_cam_obj : (n, 4, 4) float64, a row per object of the scene.
-    view : :class:`View` of the camera.   Arrays per item have a row per drawn part, ``DrawItem.number``."""
+    view : :class:`View` of the camera.   Arrays per item have a row per drawn part, ``DrawItem.number``.
+    exposed_ns : the span over which light that changes over time is averaged; None: it is that of the instant."""
+
+    exposed_ns: tuple[int, int] | None = None
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
         self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
@@ -131,6 +137,19 @@ class Moment:
             T_world_obj,
             stage,
         )
+
+    def over(self, begin_ns: int, end_ns: int) -> Moment:
+        """Return the same instant in the mean light of a span."""
+        other = copy.copy(self)
+        other.exposed_ns = begin_ns, end_ns
+        return other
+
+    def factor(self, wave: Waveform | None) -> float:
+        """Return the factor of light that changes over time; None: 1. At a jump it is that before it, but at the
+        sequence's start that after it."""
+        if wave is not None and self.exposed_ns is not None:
+            return wave.mean(*self.exposed_ns)
+        return factor_at(wave, self.t_ns, self._stage.t0_ns)
 
     def through(self, view: View) -> Moment:
         """Return the same instant through another camera at the same place."""
@@ -144,6 +163,7 @@ class Moment:
         1/s, None: it stands still."""
         other = Moment(self.t_ns, view, T_world_cam, self.T_world_obj, self._stage)
         other.__dict__["dT_world_cam"] = np.zeros((4, 4)) if dT_world_cam is None else dT_world_cam
+        other.exposed_ns = self.exposed_ns
         return other
 
     @cached_property
@@ -243,6 +263,7 @@ class Stage:
     def __init__(self, scene: Scene, items: Sequence[DrawItem], bodies: Bodies):
         self.items, self.bodies = items, bodies
         self.camera_path: PosePath = scene.camera_path
+        self.t0_ns = scene.t0_ns
         self.item_object = np.array([i.object_index for i in items], np.intp)
         self.item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
         self.item_radius = np.array([i.radius for i in items])

@@ -85,7 +85,8 @@ class Painter:
         """Set the uniforms that all items of a picture share: at each picture anew, since the context's programs, with
         their uniforms, are shared with other renderers."""
         if "light_strength" in uniforms:
-            uniforms["light_strength"].value = (self.scene.light.sun, self.scene.light.sky)
+            light, factor = self.scene.light, moment.factor(self.scene.light.over_time)
+            uniforms["light_strength"].value = (light.sun * factor, light.sky * factor)
         if "fog" in uniforms:
             self.fog(uniforms, moment, size)
 
@@ -114,7 +115,12 @@ class Painter:
             uniforms["tint_shares"].value = tuple(self.lighting.channel(material.base_color))
         if "emission" in uniforms:
             colour = uniforms["emission"].dimension == 3
-            uniforms["emission"].value = material.emission if colour else resources.emitted_luminance(material)
+            factor = moment.factor(material.emission_over_time)
+            uniforms["emission"].value = (
+                tuple(factor * c for c in material.emission)
+                if colour
+                else factor * resources.emitted_luminance(material)
+            )
             if "emission_map" in uniforms and material.emission_map is not None:
                 self._look_up(
                     uniforms, "emission_map", resources.emission_texture(material, colour), material.emission_map
@@ -135,6 +141,8 @@ class Painter:
         coloured = "surroundings" in uniforms
         name = "surroundings" if coloured else "surrounding_luminance"
         self._look_up(uniforms, name, self.resources.surroundings_texture(coloured))
+        if "around_factor" in uniforms:
+            uniforms["around_factor"].value = moment.factor(self.scene.light.over_time)
         pose = moment.T_world_obj[item.object_index]
         # The camera's centre in the object's axes, R^T (camera - object).
         R, away = pose[:3, :3], moment.T_world_cam[:3, 3] - pose[:3, 3]

@@ -115,7 +115,8 @@ class Renderer(Releasing):
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
         # A body under a pixel moves without a rectangle of its own.
         self._specks = self._most_specks(samples.grid) if samples.shared else 0
-        stands = scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand and not self._specks
+        lights_stand = lamps_stand and not scene.waveforms
+        stands = scene.camera_path.is_static and some_stand and lights_stand and shadows_stand and not self._specks
         self.whole = whole or not stands
 
     @property

@@ -78,8 +78,8 @@ class Shape:
         """Upload the parameters of one of SETS, unless those of the same ``key`` are there."""
         if self._held.get(name) != key:
             data = np.zeros((self._rows, 4), np.float32)
-            given = rows()
-            data[: len(given)] = given
+            numbers = rows()
+            data[: len(numbers)] = numbers
             self._buffer.write(data.tobytes(), offset=self.SETS.index(name) * data.nbytes)
             self._held[name] = key
 
@@ -244,14 +244,14 @@ class SceneResources:
     def emission_texture(self, material: Material, colour: bool) -> moderngl.Texture:
         """Return the material's own emission, linear rgb, or R16F or R32F as :meth:`luminance_texture`, scaled to a
         luminance of at most 1."""
-        given = _of(material.emission_map)
+        texels = _of(material.emission_map)
         if colour:
-            return self._colour(given.texture, given.wrap)
-        key = ("emission", id(given.texture), material.emission, given.wrap)
+            return self._colour(texels.texture, texels.wrap)
+        key = ("emission", id(texels.texture), material.emission, texels.wrap)
         if key not in self._textures:
             shares = np.asarray(material.emission, np.float64) / self.emitted_luminance(material)
-            image = luminance_image(given.texture.image, tuple(shares))[..., None]
-            self._textures[key] = self._light(image, given.texture, given.wrap)
+            image = luminance_image(texels.texture.image, tuple(shares))[..., None]
+            self._textures[key] = self._light(image, texels.texture, texels.wrap)
         return self._textures[key]
 
     def emitted_luminance(self, material: Material) -> float:

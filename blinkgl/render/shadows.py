@@ -82,11 +82,11 @@ def boxes(scene: Scene, items: Sequence[DrawItem]) -> dict[int, Box | None]:
     spheres = _swept(scene, items)
     if not len(spheres):
         return {}
-    found: dict[int, Box | None] = {}
+    by_object: dict[int, Box | None] = {}
     lamps = lamps_of(scene.light)
     for k in shadowing(scene.light):
-        found[k] = _box(lamps[k], spheres) if lamps[k].kind == "sun" else None
-    return found
+        by_object[k] = _box(lamps[k], spheres) if lamps[k].kind == "sun" else None
+    return by_object
 
 
 def _box(lamp: Lamp, spheres: np.ndarray) -> Box:

@@ -43,8 +43,8 @@ def torch_device(name: Any) -> Any:
     try:
         return torch, torch.empty(0, device=name).device
     except Exception as error:  # noqa: BLE001 - torch raises what it likes for a device that is not there
-        said = str(error).splitlines()[0][:120]
-        raise GLError(f"no such device for torch ({said})", where="device", value=str(name), accepted="cpu") from None
+        words = str(error).splitlines()[0][:120]
+        raise GLError(f"no such device for torch ({words})", where="device", value=str(name), accepted="cpu") from None
 
 
 class TextureReader:

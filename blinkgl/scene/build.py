@@ -13,6 +13,7 @@ from blinkgl.config.poses import TrajectoryConfig
 from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.waveforms import MAX_CHANGES
 from blinkgl.errors import ConfigError
 from blinkgl.scene.reading import existing
 from blinkgl.scene.rig import Rig, Sensor
@@ -53,7 +54,20 @@ def build_scene(
         scene = explicit_scene(config, camera.model, t0_ns, t1_ns, base)
     else:
         scene = scene_from_file(config, camera.model, t0_ns, t1_ns, base)
+    _refuse_too_many_changes(scene)
     return in_fog(scene, config)
+
+
+def _refuse_too_many_changes(scene: Scene) -> None:
+    seconds = (scene.t1_ns - scene.t0_ns) * 1e-9
+    for name, wave in scene.waveforms.items():
+        if (changes := wave.per_second() * seconds) > MAX_CHANGES:
+            raise ConfigError(
+                "the light changes too often: each jump and turn needs its frames",
+                where=f"over_time of {name}",
+                value=f"{changes:.3g} times in {seconds:g} s",
+                accepted=f"at most {MAX_CHANGES:,} times: a lower frequency, or a shorter time",
+            )
 
 
 def in_fog(scene: Scene, config: SceneConfig) -> Scene:

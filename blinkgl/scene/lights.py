@@ -8,7 +8,7 @@ light at 1 world unit (it falls with the square of the distance). An irradiance 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -24,11 +24,14 @@ from blinkgl.config.lights import (
     SunLampConfig,
     direction_of,
 )
-from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.config.poses import KeyedMotionConfig
+from blinkgl.config.waveforms import CodeConfig, LightKeysConfig, PwmConfig, SineConfig
+from blinkgl.scene.motion.paths import OffsetPath, StaticPath
 from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
 from blinkgl.scene.types import Lamp, Light, Panorama
+from blinkgl.scene.waveforms import Code, Keys, Pwm, Sine, Waveform
 from blinkgl.types.poses import pose_of
 
 MAX_LAMPS = 32
@@ -59,7 +62,7 @@ def lamps_of(light: Light) -> tuple[Lamp, ...]:
     if light.sun:
         strength = _scaled(light.sun_color, light.sun)
         towards = lamp_pose(shines=-np.asarray(light.sun_direction))
-        lamps = (Lamp("sun", strength, StaticPath(towards), size=light.sun_size), *lamps)
+        lamps = (Lamp("sun", strength, StaticPath(towards), size=light.sun_size, over_time=light.over_time), *lamps)
     order = ("sun", "point", "spot")
     return tuple(sorted(lamps, key=lambda lamp: order.index(lamp.kind)))
 
@@ -166,10 +169,19 @@ def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
 # ---- from the configuration ---------------------------------------------------------------------------------------
 
 
-def make_light(config: LightConfig, rng: np.random.Generator | None = None, further: Sequence[Lamp] = ()) -> Light:
+LampPath = Callable[[KeyedMotionConfig, str], PosePath]
+"""The path of a lamp's motion: T_world of a camera's axes, from its configuration and where that stands."""
+
+
+def make_light(
+    config: LightConfig,
+    path_of: LampPath,
+    rng: np.random.Generator | None = None,
+    further: Sequence[Lamp] = (),
+) -> Light:
     """Return the light of a scene. The sun's direction is drawn where the configuration leaves it open and ``rng`` is
     given.
-    further : lamps in addition to the configuration's."""
+    path_of : makes the paths of lamps that move.   further : lamps in addition to the configuration's."""
     drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
     return Light(
         sun_direction=config.sun_direction(*drawn),
@@ -178,22 +190,48 @@ def make_light(config: LightConfig, rng: np.random.Generator | None = None, furt
         sun_color=config.sun_color,
         sky_color=config.sky_color,
         sun_size=math.radians(config.sun_size),
-        lamps=(*(_lamp(one) for one in config.lights), *further),
+        over_time=waveform_of(config.over_time),
+        lamps=(*(_lamp(k, one, path_of) for k, one in enumerate(config.lights)), *further),
         shadows=config.shadows,
         shadow_size=config.shadow_size,
     )
 
 
-def _lamp(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
+def waveform_of(config: SineConfig | PwmConfig | CodeConfig | LightKeysConfig | None) -> Waveform | None:
+    """Return the factor over time that a configuration describes; None: constant."""
+    if config is None:
+        return None
+    if isinstance(config, LightKeysConfig):
+        times = tuple(round(key.time * 1e9) for key in config.keys)
+        return Keys(times, tuple(key.factor for key in config.keys), config.interpolation == "hold")
+    kinds = {SineConfig: Sine, PwmConfig: Pwm, CodeConfig: Code}
+    return kinds[type(config)](**config.model_dump(exclude={"kind"}))
+
+
+_AS_A_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
+"""T_camera_lamp: a lamp shines along its -z axis, a camera looks along its z axis."""
+
+
+def _lamp(k: int, config: SunLampConfig | PointLampConfig | SpotLampConfig, path_of: LampPath) -> Lamp:
+    lamp = replace(_still(config), name=f"lights[{k}]", over_time=waveform_of(config.over_time))
+    if isinstance(config, SunLampConfig) or config.motion is None:
+        return lamp
+    return replace(lamp, path=OffsetPath(path_of(config.motion, f"scene.light.lights.{k}.motion"), _AS_A_CAMERA))
+
+
+def _still(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
+    """Return a lamp as it is without its motion and its changes over time."""
     strength = _scaled(config.color, config.strength)
     if isinstance(config, SunLampConfig):
         shines = -np.asarray(direction_of(config.elevation, config.azimuth))
         return Lamp("sun", strength, StaticPath(lamp_pose(shines=shines)), size=math.radians(config.size))
     reach = math.inf if config.reach is None else config.reach
     if not isinstance(config, SpotLampConfig):
-        return Lamp("point", strength, StaticPath(lamp_pose(config.position)), reach)
+        return Lamp("point", strength, StaticPath(lamp_pose(config.position or (0.0, 0.0, 0.0))), reach)
     outer = math.radians(config.angle / 2)
-    pose = lamp_pose(config.position, np.subtract(config.look_at, config.position))
+    pose = np.eye(4)
+    if config.position is not None and config.look_at is not None:
+        pose = lamp_pose(config.position, np.subtract(config.look_at, config.position))
     return Lamp(
         kind="spot",
         strength=strength,
@@ -208,7 +246,13 @@ def _lamp(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
 def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
     """Return the light with a panorama's instead of its sun and sky. factor : on its radiance."""
     suns = [
-        Lamp("sun", _scaled(sun.strength, factor), StaticPath(lamp_pose(shines=-sun.towards)), size=sun.size)
+        Lamp(
+            kind="sun",
+            strength=_scaled(sun.strength, factor),
+            path=StaticPath(lamp_pose(shines=-sun.towards)),
+            size=sun.size,
+            over_time=light.over_time,
+        )
         for sun in panorama.suns
     ]
     around, finer = (

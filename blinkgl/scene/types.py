@@ -14,6 +14,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from blinkgl.config.deform import DeformConfig
     from blinkgl.scene.motion.pose_path import PosePath
     from blinkgl.scene.rig import Rig, Sensor
+    from blinkgl.scene.waveforms import Waveform
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +233,7 @@ class Material:
     gloss        : None: Lambert.
     bumps        : normal map, x right in the texture, y up, z outwards, 0 to 1 for -1 to 1; None: none.
     bump_scale   : factor on its x and y.
-    emission     : (3,) emitted radiance, linear; times ``emission_map``, a colour.
+    emission     : (3,) emitted radiance, linear; times ``emission_map``, a colour, and ``emission_over_time``; None: 1.
     mask         : its holes; None: none.
     """
 
@@ -247,6 +249,7 @@ class Material:
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emission_map: Map | None = None
     mask: Mask | None = None
+    emission_over_time: Waveform | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,6 +318,7 @@ class Lamp:
                shine; between them by the square of a function that is linear in the cosine from 1 to 0
                (KHR_lights_punctual).
     size     : source size for soft shadows: a sun's angular diameter, rad; the diameter of others, world units.
+    over_time : factor on its strength; None: 1.   name : for messages and lights.npz.
     """
 
     kind: Literal["sun", "point", "spot"]
@@ -324,6 +328,8 @@ class Lamp:
     inner: float = 0.0
     outer: float = math.pi / 4
     size: float = 0.0
+    over_time: Waveform | None = None
+    name: str = ""
 
     @property
     def cone(self) -> tuple[float, float]:
@@ -356,6 +362,7 @@ class Light:
     surroundings : the same as a picture without its suns, for reflections; lights that differ only in it are equal.
         None: the sky alone, ``sky`` above the horizon.
     shadows : of suns and spot lights; soft by their size.   shadow_size : px per side of each map.
+    over_time : factor on the sun and the light of the surroundings; None: 1.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
     """
@@ -372,6 +379,7 @@ class Light:
     surroundings: Panorama | None = field(default=None, compare=False, repr=False)
     shadows: Literal["off", "hard", "soft"] = "off"
     shadow_size: int = LightConfig().shadow_size
+    over_time: Waveform | None = None
 
     @property
     def plain(self) -> bool:
@@ -436,6 +444,20 @@ class Scene:
             sky = self.rig.path_of_sky()
             placed = tuple(replace(obj, path=sky) if obj.at_infinity else obj for obj in self.objects)
             object.__setattr__(self, "objects", placed)
+
+    @cached_property
+    def waveforms(self) -> dict[str, Waveform]:
+        """Return the lights that change over time, by name: "light", the sun's and the surroundings', those of lamps,
+        and of objects whose material emits."""
+        lights = {} if self.light.over_time is None else {"light": self.light.over_time}
+        for lamp in self.light.lamps:
+            if lamp.over_time is not None and lamp.over_time is not self.light.over_time:
+                lights[lamp.name] = lamp.over_time
+        for obj in self.objects:
+            for k, part in enumerate(obj.parts):
+                if (wave := part.material.emission_over_time) is not None:
+                    lights.setdefault(obj.name if not k else f"{obj.name}, part {k}", wave)
+        return lights
 
     @property
     def backdrop(self) -> float:

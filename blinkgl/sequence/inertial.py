@@ -121,10 +121,10 @@ def _refuse_jumps(path: PosePath, t0_ns: int, t1_ns: int) -> None:
     if len(first) < 2:
         return
     # The change of velocity that the accelerations at both ends explain, by the trapezoidal rule.
-    said = 0.5e-9 * step * (second[1:] + second[:-1])
-    left = np.abs(first[1:] - first[:-1] - said).max(axis=(1, 2))
+    change = 0.5e-9 * step * (second[1:] + second[:-1])
+    left = np.abs(first[1:] - first[:-1] - change).max(axis=(1, 2))
     # a smooth curve leaves a third-order remainder; a jump does not
-    allowed = 2e-3 * np.abs(first).max() + 0.25 * np.abs(said).max(axis=(1, 2))
+    allowed = 2e-3 * np.abs(first).max() + 0.25 * np.abs(change).max(axis=(1, 2))
     if (left > allowed).any():
         at = int(np.argmax(left - allowed))
         raise ConfigError(

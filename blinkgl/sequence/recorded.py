@@ -55,7 +55,7 @@ _CHECKED_PAIRS = 3
 def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
     """Return the folders of ``frames.folders``, sorted. Raises ConfigError: none given, none found, or no image folder
     inside."""
-    found: list[Path] = []
+    folders: list[Path] = []
     for number, pattern in enumerate(config.folders):
         matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
         if not matches:
@@ -65,12 +65,12 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
                 value=pattern,
                 accepted="a folder of frames, or a pattern",
             )
-        found += matches
-    if not found:
+        folders += matches
+    if not folders:
         raise ConfigError(
             "no folders of frames", where="frames.folders", value=[], accepted="one folder per sequence, or patterns"
         )
-    for folder in found:
+    for folder in folders:
         if not (folder / config.images).is_dir():
             raise ConfigError(
                 "no such folder",
@@ -78,7 +78,7 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
                 value=str(folder / config.images),
                 accepted="a folder of images",
             )
-    return found
+    return folders
 
 
 def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
@@ -95,10 +95,10 @@ def used_images(config: FramesConfig, folder: Path) -> list[Path]:
     last longer than an event file can hold."""
     if not (folder / config.images).is_dir():
         raise AssetError("no such folder", where=str(folder / config.images))
-    found = series(folder / config.images, IMAGE)
+    images = series(folder / config.images, IMAGE)
     used = slice(config.first, None if config.count is None else config.first + config.count)
-    files = found.files[used]
-    if missing := replace(found, files=files, numbers=found.numbers and found.numbers[used]).missing():
+    files = images.files[used]
+    if missing := replace(images, files=files, numbers=images.numbers and images.numbers[used]).missing():
         # Its flow is missing, too, or would be half of what the images show.
         raise AssetError(
             missing[0].partition(":")[0],
@@ -145,11 +145,11 @@ def _check_stamps(folder: Path, files: list[Path], fps: float, used: slice) -> N
 def _folder_of_flow(folder: Path, flow: str) -> Path:
     # {0} is the folder's own name, {1} its parent's, …: other sets keep the flow of a scene in a tree of its own.
     parts = folder.absolute().parts[::-1]
-    named = re.sub(r"\{(\d)\}", lambda found: parts[min(int(found[1]), len(parts) - 1)], flow)
-    found = Path(os.path.normpath(folder / named))
-    if not found.is_dir():
-        raise AssetError("no such folder", where=str(found))
-    return found
+    named = re.sub(r"\{(\d)\}", lambda digit: parts[min(int(digit[1]), len(parts) - 1)], flow)
+    place = Path(os.path.normpath(folder / named))
+    if not place.is_dir():
+        raise AssetError("no such folder", where=str(place))
+    return place
 
 
 @dataclass(frozen=True)
@@ -223,8 +223,8 @@ def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None
 
 
 def _number(path: Path) -> int | None:
-    found = re.search(r"\d+", path.stem)
-    return None if found is None else int(found[0])
+    digits = re.search(r"\d+", path.stem)
+    return None if digits is None else int(digits[0])
 
 
 def read_flow_of(path: Path, size: tuple[int, int], form: str | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -336,8 +336,8 @@ class RecordedSequence(SensorSimulation):
                 value=f"read as {self._form}",
                 accepted="a third channel that is not 0 where flow is valid, or frames.check_flow: false",
             )
-        if (found := factor_that_fits([pair for pair in pairs if pair[0].shape == pair[1].shape])) is not None:
-            factor, error, own = found
+        if (fitting := factor_that_fits([pair for pair in pairs if pair[0].shape == pair[1].shape])) is not None:
+            factor, error, own = fitting
             other_way = f"frames.flow_direction: {'forward' if back else 'backward'}"
             what = {0.0: "no motion at all", -1.0: f"its negative ({other_way}?)"}
             raise AssetError(

@@ -12,6 +12,7 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
 from blinkgl.config.over_time import track_times
+from blinkgl.config.scene import lights_change
 from blinkgl.config.sequence import CameraOnRig
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
@@ -88,7 +89,8 @@ class RenderedSequence(SensorSimulation):
             # A frame is drawn at every impact: a velocity jumps there, and no speed measured before it bounds the step.
             stops = () if scene.dynamics is None else scene.dynamics.impacts_ns
             response = emulator_of(config.events).response(config.events)
-            self.timeline = make_timeline(config.timeline, *span_ns, renderer, response, stops)
+            lights = tuple(scene.waveforms.values())
+            self.timeline = make_timeline(config.timeline, *span_ns, renderer, response, stops, lights)
         if request.labels and config.images is not None:
             seed = kernel_seed(config.seed, request.index, Role.IMAGES, of.number)
             self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
@@ -208,6 +210,23 @@ class RenderedSequence(SensorSimulation):
         """Return the camera whose pixels labels use; None: the sensor's own."""
         asked = self.config.labels.pixels == "rectified"
         return rectified(self.scene.camera) if asked and self.lens is not None else None
+
+    def lights(self) -> dict[str, np.ndarray]:
+        if not lights_change(self.config.scene):
+            return {}
+        waves, times = self.scene.waveforms, [self.config.time.t0_ns, *self.config.time.label_times_ns]
+        span = self.scene.t0_ns, self.scene.t1_ns
+        jumps = sorted((t, k) for k, wave in enumerate(waves.values()) for t in wave.jumps(*span))
+        factors = [[wave.factor(t) for t in times] for wave in waves.values()]
+        after = [[*waves.values()][k].factor(t) for t, k in jumps]
+        return {
+            "t_ns": np.asarray(times, np.int64),
+            "names": np.array([*waves], dtype=str),
+            "factors": np.array(factors, np.float64).reshape(len(waves), len(times)),
+            "jump_t_ns": np.array([t for t, _ in jumps], np.int64),
+            "jump_light": np.array([k for _, k in jumps], np.int64),
+            "jump_factor": np.array(after, np.float64),
+        }
 
     def imu(self) -> Inertial | None:
         return self._imu

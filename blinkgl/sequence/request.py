@@ -52,7 +52,7 @@ class SequenceRequest:
                 accepted="None, or events=True",
             )
         drawn = (self.scene, self.renderer, self.window_ns)
-        if self.config.frames is not None and any(given is not None for given in drawn):
+        if self.config.frames is not None and any(part is not None for part in drawn):
             raise ConfigError(
                 "recorded frames are not drawn",
                 where="frames",

@@ -200,6 +200,10 @@ class SensorSimulation(ABC):
         """Return the points of ``tracks:``; None: not requested."""
         return None
 
+    def lights(self) -> dict[str, np.ndarray]:
+        """Return the arrays of :func:`blinkgl.io.lights.read_lights`; {}: no light changes over time."""
+        return {}
+
     @abstractmethod
     def _resume(self) -> None:
         """Called before drawing again: the caller may have used OpenGL meanwhile."""

@@ -176,13 +176,13 @@ class TensorEsim(Batch):
         # From here on the state changes.
         self._log, self._now = self._now, self._log
         if self._jitter:
-            found = self._walk(firing, interval, cap)
+            events = self._walk(firing, interval, cap)
         else:
-            found = self._at_once(firing, counts, sizes, interval, cap)
+            events = self._at_once(firing, counts, sizes, interval, cap)
         for k in interval.fresh:
             self._first_levels(k)
-        causes = torch.zeros_like(found.word) if self.config.causes else None
-        return self._events(interval, found, causes, waves=self._jitter > 0)
+        causes = torch.zeros_like(events.word) if self.config.causes else None
+        return self._events(interval, events, causes, waves=self._jitter > 0)
 
     def _look(self, flat: Tensor) -> Tensor:
         """Compute log intensities and distances beyond the levels (the first half), and return the extremes of the
@@ -303,9 +303,9 @@ class TensorEsim(Batch):
             env = of_owner(env) if self.envs > 1 else torch.zeros_like(word)
         after = crossing_ns(part, whole, v.of(v.dt_ns, env), v.longest_ns)
         after += v.of(v.t0_ns - 1000 * v.base_us, env)
-        found = Found(word, torch.div(after, 1000, rounding_mode="trunc"))
+        events = Found(word, torch.div(after, 1000, rounding_mode="trunc"))
         if not self._refractory_ns and cap is None:
-            return found
+            return events
         if sizes.most <= 1:
             first = owner = torch.arange(len(word), device=self.device)
         # Some events may be dropped from here on.
@@ -320,7 +320,7 @@ class TensorEsim(Batch):
             within = rank < cap.index_select(0, owner)
             self._count_cut(env, keep & ~within)
             keep = keep & within
-        return Found(*(one[keep] for one in found))
+        return Found(*(one[keep] for one in events))
 
     def _awake(self, f: Firing, counts: Tensor, first: Tensor, most: int, t_ns: Tensor) -> Tensor:
         """Return which events come after their pixel's refractory period, (N,) bool; the others are dropped.
@@ -347,7 +347,7 @@ class TensorEsim(Batch):
         gap, fired = f.gap.clone(), self._fired.index_select(0, f.flat).to(torch.int64)
         up, down, emitted = torch.zeros_like(gap), torch.zeros_like(gap), torch.zeros_like(gap)
         last = self._last_ns.index_select(0, f.flat) if self._refractory_ns else gap
-        found: list[Found] = []
+        rounds: list[Found] = []
         # One iteration per level; pixels without a further one drop out.
         while len(slots):
             flat, env, whole = (one.index_select(0, slots) for one in (f.flat, f.env, f.whole))
@@ -366,7 +366,7 @@ class TensorEsim(Batch):
                 emitted.index_add_(0, slots, alive.to(torch.int64))
             # Number of the pixel in the whole batch, and the polarity in bit 0.
             word = (flat << 1) | polarity
-            found.append(Found(word[alive], torch.div(after[alive], 1000, rounding_mode="trunc")))
+            rounds.append(Found(word[alive], torch.div(after[alive], 1000, rounding_mode="trunc")))
             # The next thresholds, drawn once per level and numbered by the levels passed.
             number = fired.index_select(0, slots) + 1
             on, off = (c.index_select(0, slots) if isinstance(c, Tensor) else c for c in (f.on, f.off))
@@ -383,4 +383,4 @@ class TensorEsim(Batch):
         self._fired.index_copy_(0, f.flat, fired.to(torch.int32))
         if self._refractory_ns:
             self._last_ns.index_copy_(0, f.flat, last)
-        return Found(*(torch.cat([f.flat[:0], *(one[c] for one in found)]) for c in range(2)))
+        return Found(*(torch.cat([f.flat[:0], *(one[c] for one in rounds)]) for c in range(2)))

@@ -204,7 +204,7 @@ class TensorV2e(Batch):
         now, beyond = self._look(flat.view(self.envs, -1), each)
         shots = self._draw_shots(interval, now) if self._shots else None
         rows, step = self._rows(places(self._flagged(beyond, shots)), now, shots, each, interval)
-        found = waves(rows, step, self._has, shots, self._put_back)
+        events = waves(rows, step, self._has, shots, self._put_back)
         # The second half is done: the photoreceptors' values become the state.
         for name, value in now.items():
             getattr(self, name).copy_(value.reshape(-1))
@@ -212,7 +212,7 @@ class TensorV2e(Batch):
         for k in interval.fresh:
             self._begin(k, flat, int(interval.end_ns[k]))
         none = torch.empty(0, dtype=torch.int64, device=self.device)
-        word, after, cause = (torch.cat([none, *(wave[c] for wave in found)]) for c in range(3))
+        word, after, cause = (torch.cat([none, *(wave[c] for wave in events)]) for c in range(3))
         return self._events(interval, Found(word, after), cause if self.config.causes else None, waves=True)
 
     def _numbers(self, v: Interval) -> Numbers:
@@ -317,7 +317,7 @@ class TensorV2e(Batch):
         start_ns, dt_ns = (self._filled(v, env) for v in (interval.t0_ns, interval.dt_ns))
         whole = table[:, -1].to(torch.float64)
         rate = whole * self._shot_unit
-        found: list[tuple[Tensor, ...]] = []
+        shots: list[tuple[Tensor, ...]] = []
         while len(due := torch.nonzero(self._clock_ns <= end_ns).view(-1)):
             key, number, b = self._keys[env[due]].unbind(1), self._clock_index[due], block[due]
             u, pick = uniform2(key, b, int(Stream.SHOT), number * 2)
@@ -336,13 +336,13 @@ class TensorV2e(Batch):
             # Thinning from the rate in the dark, see v2e_model.shot_factor.
             factor = 1.0 - ((light + 20.0) / 275.0).clamp(0.0, 1.0) * 0.75
             let = inside & (accept * model.DARKEST < factor)
-            found.append((flat[let], after[let], on[let].to(torch.int64)))
+            shots.append((flat[let], after[let], on[let].to(torch.int64)))
             # Exponential waiting time; at least 1 ns, so that the clock moves on.
             gap = (-log_f64(u) / rate[due]).clamp(max=1e18).to(torch.int64) + 1
             self._clock_ns[due] += gap
             self._clock_index[due] += 1
         none = torch.empty(0, dtype=torch.int64, device=self.device)
-        flat, after, on = (torch.cat([none, *(one[c] for one in found)]) for c in range(3))
+        flat, after, on = (torch.cat([none, *(one[c] for one in shots)]) for c in range(3))
         # Bits of each key: pixel number, ns within an interval, polarity.
         order = stable_order([(flat, 31), (after, 41), (on, 1)])
         return Shots(flat[order], after[order], on[order]) if len(flat) else None

@@ -254,12 +254,12 @@ def waves(
     """(word, microseconds after the base, cause) of every wave's events.
 
     r : rows of the pixels with levels, in raster order.   put_back : called with the rows after each wave."""
-    found = []
+    events = []
     while len(r["flat"]):
         _aim(r)
         if has.low_pass:
             # After an event without dead time s has moved, and e follows it.
-            if found and not has.refractory_ns:
+            if events and not has.refractory_ns:
                 r["e"] = fall_f64(r["k"] * r["s"])
             _meet(r)
         else:
@@ -274,7 +274,7 @@ def waves(
         word = (r["flat"] << 1) | r["polarity"]
         cause = _cause_bits(r) if has.causes else word
         after = torch.div(r["at_ns"] + v.start_ns, 1000, rounding_mode="trunc")
-        found.append((word[fires], after[fires], cause[fires] >> CAUSE_SHIFT))
+        events.append((word[fires], after[fires], cause[fires] >> CAUSE_SHIFT))
         if has.leak_jitter > 0.0:
             _change_leaks(r, v, has.leak_jitter)
         _new_references(r, v, has, shots)
@@ -290,4 +290,4 @@ def waves(
             passed = passed | (r["shot"] != len(shots.flat))
         keep = fires & ~r["dead"] & passed
         r, v = {name: value[keep] for name, value in r.items()}, v.of(keep)
-    return found
+    return events

@@ -67,23 +67,25 @@ def bounded_times(
     t0_ns: int,
     t1_ns: int,
     stops_ns: Sequence[int] = (),
+    exact_ns: Sequence[int] = (),
 ) -> Iterator[int]:
     """Yield times with ``pace * step <= 1`` everywhere in each step, steps within [min_step, max_step].
 
     stops_ns : increasing times that no step may cross, such as impacts. One that comes less than min_step after
         another, or before t1, is left out.
+    exact_ns : increasing times that are yielded however near they are to each other, such as jumps of light.
     The step is proposed from the pace at its start (as in Rebecq et al. 2018, section 3.2), or from the expected pace
     at its end if the pace rises as over the last step. It is then checked against the pace at its end, and inside it
     wherever the pace may be higher than at the times known so far (:func:`_holds_until`), which the original does not
     do: a motion that accelerates, or goes to and fro, or passes through the picture inside the step would exceed the
     bound. A rejected step is shortened and tried again. The pace at an accepted end is the next step's start, so there
     is one pace per frame if nothing is rejected. The last step ends at t1 exactly; steps are shorter than min_step only
-    there and before a stop.
+    there, before a stop, and between exact times.
     """
     yield t0_ns
     t = t0_ns
     v = v_before = pace.at(t)
-    ends = deque(_apart(stops_ns, min_step_ns, t0_ns, t1_ns))
+    ends = deque(sorted({*_apart(stops_ns, min_step_ns, t0_ns, t1_ns), *(t for t in exact_ns if t0_ns < t < t1_ns)}))
     while t < t1_ns:
         while ends and ends[0] <= t:
             ends.popleft()

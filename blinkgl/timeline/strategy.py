@@ -111,6 +111,16 @@ class Moving(Protocol):
         """Return how far, px, anything leaves a steady motion between two looks."""
 
 
+class Changing(Protocol):
+    """A light that changes over time (:class:`blinkgl.scene.waveforms.Waveform`)."""
+
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]: ...
+
+    def corners(self, t0_ns: int, t1_ns: int) -> list[int]: ...
+
+    def steepness(self, t_ns: int) -> float: ...
+
+
 class Watched(Protocol):
     """What a timeline asks of a renderer."""
 
@@ -126,7 +136,9 @@ class Watched(Protocol):
 
 class Timeline:
     """Iterator over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when
-    requested. ``stops_ns``: times of impacts, which adaptive kinds do not cross."""
+    requested. ``stops_ns``: times of impacts, which adaptive kinds do not cross.   ``lights``: those that change over
+    time: adaptive kinds have a frame at each of their jumps and one a nanosecond later, do not cross their turning
+    points, and in between take steps in which a light changes by a threshold at most."""
 
     def __init__(
         self,
@@ -136,7 +148,9 @@ class Timeline:
         scene: Watched,
         response: Response,
         stops_ns: Sequence[int] = (),
+        lights: Sequence[Changing] = (),
     ):
+        self.lights = lights
         self.config, self.t0_ns, self.t1_ns, self.scene, self.response = config, t0_ns, t1_ns, scene, response
         self.stops_ns = stops_ns
         self.looks = 0
@@ -153,7 +167,11 @@ class Timeline:
         c = self.config
         least, most = round(c.min_step_us * 1000), round(c.max_step_us * 1000)
         last, self.too_long, self.longest = self.t0_ns, 0, 0.0
-        for t_ns in bounded_times(self, least, most, self.t0_ns, self.t1_ns, self.stops_ns):
+        span = self.t0_ns, self.t1_ns
+        jumps = {t for light in self.lights for t in light.jumps(*span)}
+        turns = {t for light in self.lights for t in light.corners(*span)}
+        exact = sorted({*jumps, *(t + 1 for t in jumps), *turns})
+        for t_ns in bounded_times(self, least, most, *span, self.stops_ns, exact):
             steps = max(self.at(last), self.at(t_ns)) * (t_ns - last) * 1e-9
             self.too_long += steps > TOO_LONG
             self.longest = max(self.longest, steps)
@@ -163,18 +181,18 @@ class Timeline:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return what limits the times so far, a line each."""
-        found = []
+        notes = []
         if self.too_long:
-            found.append(
+            notes.append(
                 f"{self.too_long} steps between event frames are {self.config.min_step_us:g} µs long and would have to "
                 f"be up to {self.longest:.3g} times shorter for this motion; expected a smaller timeline.min_step_us"
             )
         if self.unseen and not self.scene.motion.unbounded:
-            found.append(
+            notes.append(
                 f"something may pass, or move to and fro, unseen within {self.config.min_step_us:g} µs, first at "
                 f"{self.unseen[0] * 1e-9:.9g} s; expected a smaller timeline.min_step_us"
             )
-        return (*found, *(line for other in self.others for line in other.notes))
+        return (*notes, *(line for other in self.others for line in other.notes))
 
     def misses(self, ta_ns: int, tb_ns: int) -> None:
         self.unseen = self.unseen or (ta_ns, tb_ns)
@@ -207,7 +225,8 @@ class Timeline:
 
     def _counted(self, t_ns: int) -> float:
         self.looks += 1
-        return max([self.pace(t_ns), *(other.pace(t_ns) for other in self.others)])
+        lights = [light.steepness(t_ns) / self.response.threshold for light in self.lights]
+        return max([self.pace(t_ns), *lights, *(other.pace(t_ns) for other in self.others)])
 
 
 TOO_LONG = 1.25
@@ -273,10 +292,11 @@ def make_timeline(
     scene: Watched,
     response: Response,
     stops_ns: Sequence[int] = (),
+    lights: Sequence[Changing] = (),
 ) -> Timeline:
     """Return the timeline of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, which adaptive
-    kinds do not cross."""
-    return _KINDS[config.kind](config, t0_ns, t1_ns, scene, response, stops_ns)
+    kinds do not cross.   lights : see :class:`Timeline`."""
+    return _KINDS[config.kind](config, t0_ns, t1_ns, scene, response, stops_ns, lights)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

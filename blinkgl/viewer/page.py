@@ -135,8 +135,8 @@ class Page:
         self._windows, self._layers = [], {}
         if with_events := [s for s in sequence.sensors if s.event_count]:
             usual = with_events[0].usual_window_us() / 1000
-            for said, long in (("window, ms", usual), ("window in 3-D, ms", SPACE_WINDOWS * usual)):
-                self._windows.append(gui.add_slider(said, 0.1, max(100.0, long), 0.1, float(long)))
+            for label, long in (("window, ms", usual), ("window in 3-D, ms", SPACE_WINDOWS * usual)):
+                self._windows.append(gui.add_slider(label, 0.1, max(100.0, long), 0.1, float(long)))
         with gui.add_folder("3-D view"):
             looks = [name for name, there in (("world", sequence.has_space), ("events", with_events)) if there]
             if looks:
@@ -202,8 +202,8 @@ class Page:
         t_us = round(1000 * self._time.value)
         window_us, long_us = [max(1, round(1000 * one.value)) for one in self._windows] or (1, 1)
         pictures = {sensor.name: sensor.pictures(t_us, window_us) for sensor in sequence.sensors}
-        for name, found in pictures.items():
-            for one in found:
+        for name, panels in pictures.items():
+            for one in panels:
                 self._picture(name, one)
         layers = [name for name, box in self._layers.items() if box.value]
         self.stage.show(t_us, long_us, pictures, layers)
@@ -213,14 +213,14 @@ class Page:
 
     def _picture(self, sensor: str, one: Picture) -> None:
         images = self._images.setdefault(sensor, {})
-        said = f"{one.heading} · {one.note}" if one.note else one.heading
+        heading = f"{one.heading} · {one.note}" if one.note else one.heading
         times = max(1, _PICTURES_PX // one.image.shape[1])  # otherwise small pictures would not be enlarged
         image = one.image.repeat(times, axis=0).repeat(times, axis=1)
         if one.heading not in images:
             with self._tabs[sensor]:
-                images[one.heading] = self.server.gui.add_image(image, label=said, jpeg_quality=85)
+                images[one.heading] = self.server.gui.add_image(image, label=heading, jpeg_quality=85)
             return
-        images[one.heading].label = said
+        images[one.heading].label = heading
         if not np.array_equal(images[one.heading].image, image):
             images[one.heading].image = image
 

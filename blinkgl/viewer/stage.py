@@ -104,12 +104,12 @@ class Stage:
     def has(self, layer: str) -> bool:
         """Return whether a layer of the world has anything."""
         sensors, start = self._sequence.sensors, self._sequence.start_us
-        found = {
+        kinds = {
             "points": lambda s: s.depth_cloud(start),
             "boxes": lambda s: s.bodies(start) or None,
             "tracks": lambda s: s.track_cloud(start),
         }[layer]
-        return any(found(s) is not None for s in sensors)
+        return any(kinds(s) is not None for s in sensors)
 
     # ---- what stays ----------------------------------------------------------------------------------------------
 
@@ -231,24 +231,24 @@ class Stage:
     def _wall(self, pictures: dict[str, list[Picture]]) -> None:
         """Show all pictures, side by side."""
         several = len(pictures) > 1
-        found = [
+        tracks = [
             (f"{name}: {one.heading}" if several else one.heading, one.image)
             for name, some in pictures.items()
             for one in some
         ]
         # In the left half of the view, as large as they can be, with a line of text above each.
         width, height = 0.48 * ASPECT * self._height(), 0.94 * self._height()
-        tall = max((image.shape[0] / image.shape[1] for _, image in found), default=1.0)
-        rows_of = lambda columns: math.ceil(len(found) / columns)
+        tall = max((image.shape[0] / image.shape[1] for _, image in tracks), default=1.0)
+        rows_of = lambda columns: math.ceil(len(tracks) / columns)
         size_of = lambda columns: min(width / columns, height / rows_of(columns) / (tall + 0.14))
-        columns = max(range(1, max(len(found), 1) + 1), key=size_of)
+        columns = max(range(1, max(len(tracks), 1) + 1), key=size_of)
         size, step = size_of(columns), (tall + 0.14) * size_of(columns)
         if "wall" not in self._shown:
             place = self._aside(-0.25 * ASPECT * self._height())
             self._shown["wall"] = self._scene.add_frame(
                 "/pictures", show_axes=False, wxyz=_wxyz(self._turn), position=place
             )
-        for number, (name, image) in enumerate(found):
+        for number, (name, image) in enumerate(tracks):
             row, column = divmod(number, columns)
             at = np.array(
                 [size * (column - (columns - 1) / 2), 0, step * ((rows_of(columns) - 1) / 2 - row) - 0.05 * size]

@@ -96,17 +96,17 @@ class CameraView:
     def pictures(self, t_us: int, window_us: int) -> list[Picture]:
         """Return all pictures of a time: frame, images of a frame camera, events of [t - window, t), then labels, those
         of motion first. Missing kinds are left out."""
-        found = [*self._frame(t_us), *self._of_frame_camera(t_us)]
+        pictures = [*self._frame(t_us), *self._of_frame_camera(t_us)]
         if self._events is not None:
             events = self.events(t_us, window_us)
             counts = np.zeros((2, self.source.height, self.source.width), np.uint16)
             count_events(events.x, events.y, events.p, counts)
             span = f"{(t_us - window_us) / 1000:.1f}–{t_us / 1000:.1f} ms"
-            found.append(Picture("events", f"{span}, {len(events):,}, ON blue, OFF red", event_colour(counts)))
+            pictures.append(Picture("events", f"{span}, {len(events):,}, ON blue, OFF red", event_colour(counts)))
         k = self.label(t_us)
         if k not in self._known:
             self._known = {k: self._of_label(k)}  # playing reads each file once
-        return found + self._known[k]
+        return pictures + self._known[k]
 
     def _frame(self, t_us: int) -> list[Picture]:
         """Return the image at the last label's time, with the objects' boxes and the tracks of points over it."""
@@ -132,7 +132,7 @@ class CameraView:
         about = self.source.manifest["frame_camera"]
         ends = [one.end_us for one in self._exposures]
         k = max(int(np.searchsorted(ends, t_us, side="right")) - 1, 0)
-        found = []
+        pictures = []
         for name in about["pictures"]:
             codes = read_image(self.source.folder / picture_file(name, k))
             # The upper eight of the codes' bits.
@@ -140,11 +140,11 @@ class CameraView:
             shown = np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
             heading = "frame camera" if name == "images" else f"frame camera, {name}"
             note = f"{self._exposures[k].middle_us / 1000:.1f} ms, exposed {self._exposures[k].exposure_us / 1000:g} ms"
-            found.append(Picture(heading, note, shown))
-        return found
+            pictures.append(Picture(heading, note, shown))
+        return pictures
 
     def _of_label(self, k: int) -> list[Picture]:
-        found = []
+        pictures = []
         for label in sorted(LABELS.values(), key=_rank):
             form = label.forms[0]
             if form.read is None or not self.source.has(form.file(k)):
@@ -153,8 +153,8 @@ class CameraView:
             views = [view for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]
             for view in views:
                 image, legend = picture(view.kind, view.of(value))
-                found.append(Picture(view.title, self._note(k, legend, view.unit), image))
-        return found
+                pictures.append(Picture(view.title, self._note(k, legend, view.unit), image))
+        return pictures
 
     def _note(self, k: int, legend: dict[str, Any], unit: str) -> str:
         when = f"{self._label_us[k] / 1000:.1f} ms"
@@ -223,7 +223,7 @@ class CameraView:
         if len(self._label_us) and self._label_us[0] <= t_us and (boxes := self._boxes(self.label(t_us))) is not None:
             seen = {int(i): (s, T) for i, s, T in zip(boxes.instance, boxes.size, boxes.T_world_box)}
         at_rest = {one["id"]: one["box"] for one in self.source.manifest.get("objects", ()) if one.get("box")}
-        found = []
+        bodies = []
         for row, number in enumerate(map(int, poses.get("object_ids", ()))):
             if number in self._everywhere() or number not in {*at_rest, *seen}:
                 continue
@@ -233,8 +233,8 @@ class CameraView:
             middle[:3, 3] = (low + high) / 2
             size, pose = seen.get(number, (high - low, poses["T_world_obj"][row, m] @ middle))
             colour = id_colours(np.array([number]))[0]
-            found.append(Body(str(poses["object_names"][row]), colour, size, pose))
-        return found
+            bodies.append(Body(str(poses["object_names"][row]), colour, size, pose))
+        return bodies
 
     def _everywhere(self) -> set[int]:
         poses = self.source.poses
@@ -339,8 +339,8 @@ def sequences_in(path: str | Path) -> list[Path]:
     path = Path(path)
     if not path.is_dir():
         raise AssetError("no such folder", where=str(path), accepted="a sequence, or a folder of sequences")
-    if not (found := list(made_folders(path))):
+    if not (folders := list(made_folders(path))):
         raise AssetError(
             "the folder has no sequence", where=str(path), accepted="a folder that 'blinkgl generate' wrote"
         )
-    return found
+    return folders

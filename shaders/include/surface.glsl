@@ -65,6 +65,12 @@ uniform mat3 to_world_rate;
 #define TO_WORLD to_world
 #endif
 
+#ifdef VARYING
+uniform float around_factor; // of the surroundings' light, which changes over time
+#else
+const float around_factor = 1.0;
+#endif
+
 // Radiance from direction d, world axes, mirrored by a surface of this roughness.
 ILLUMINANT mirrored(vec3 d, float roughness)
 {
@@ -72,9 +78,9 @@ ILLUMINANT mirrored(vec3 d, float roughness)
     vec2 at = vec2(0.5 - atan(d.y, d.x) * 0.15915494309, 0.5 - asin(clamp(d.z, -1.0, 1.0)) * 0.31830988618);
     vec4 radiance = map_at(SURROUNDINGS, vec3(at, (roughness * (levels - 1.0) + 0.5) / levels));
 #ifdef RGB
-    return radiance.rgb;
+    return radiance.rgb * around_factor;
 #else
-    return radiance.r;
+    return radiance.r * around_factor;
 #endif
 }
 

@@ -269,8 +269,13 @@ def test_images_are_taken_while_their_exposure_fits(gl):
 
 def test_a_global_shutter_takes_the_middles_of_equal_cells():
     exposure = Exposure(5 * MS, 10 * MS, 0.0, 7)
-    times, weights = exposure.cells(4)
-    assert times == [6_250_000, 8_750_000, 11_250_000, 13_750_000]
+    cells, weights = exposure.cells(4)
+    assert [middle for _, middle, _ in cells] == [6_250_000, 8_750_000, 11_250_000, 13_750_000]
+    assert [(begin, end) for begin, _, end in cells][1:] == [
+        (7_500_000, 10 * MS),
+        (10 * MS, 12_500_000),
+        (12_500_000, 15 * MS),
+    ]
     assert (weights == 0.25).all() and weights.shape == (4, 7)
     assert exposure.end_ns == 15 * MS and exposure.middle_ns == 10 * MS
 
@@ -281,7 +286,8 @@ def test_a_global_shutter_takes_the_middles_of_equal_cells():
 )
 def test_each_row_weighs_the_cells_by_what_of_them_it_sees(exposure_ns, row_ns, count):
     exposure = Exposure(3 * MS, exposure_ns, row_ns, 24)
-    times, weights = exposure.cells(count)
+    cells, weights = exposure.cells(count)
+    times = [middle for _, middle, _ in cells]
     np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=1e-12)
     # by brute force: in which cell are a million instants of the row's own exposure
     span = exposure.end_ns - exposure.start_ns

@@ -117,7 +117,7 @@ SPOT = {"kind": "spot", "position": [1, 2, 3], "look_at": [1, 2, 0], "strength":
 
 
 def light(**tree) -> Light:
-    return make_light(validate(LightConfig, tree, where="scene.light"))
+    return make_light(validate(LightConfig, tree, where="scene.light"), None)
 
 
 def test_nothing_white_is_clipped_in_the_default_light():

@@ -18,6 +18,7 @@ from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, quartic_of
 from blinkgl.scene.shapes.sweep import normals_at
 from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.types import REPEAT, Lamp, Map, Material, Part, Scene, Texture
+from blinkgl.scene.waveforms import factor_at
 from blinkgl.srgb import linear_from_srgb
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
@@ -107,6 +108,7 @@ def radiated(
     # Maps are looked up at the base colour's coordinates.
     at = uv * np.asarray(material.uv_scale)
     emission = np.broadcast_to(np.asarray(material.emission, np.float64), albedo.shape)
+    emission = emission * factor_at(material.emission_over_time, hits.t_ns, scene.t0_ns)
     if material.emission_map is not None:
         emission = emission * sample_map(material.emission_map, at, colour=True)
     if material.bumps is not None:
@@ -184,6 +186,7 @@ def shone(
         _surroundings.clear()
         _surroundings[id(scene.light)] = scene.light, surroundings_of(scene.light)
     around = gloss.mirrored_radiance(_surroundings[id(scene.light)][1], normal, away, nv, roughness)
+    around = around * factor_at(scene.light.over_time, t_ns, scene.t0_ns)
     out = around * (even_clear * (1 - mix) + even_metal * mix)
     # Lamps: GGX lobe with Schlick's Fresnel term, half vector between lamp and eye.
     for k, lamp in enumerate(lamps_of(scene.light)):
@@ -233,10 +236,11 @@ def received(
     for k, lamp in enumerate(lamps):
         towards, strength = beam(lamp, lamp.path.pose(t_ns), points)
         facing = np.maximum(0.0, (towards * normal).sum(axis=1))
-        direct[k] = open_[k] = facing[:, None] * strength
+        direct[k] = open_[k] = facing[:, None] * strength * factor_at(lamp.over_time, t_ns, scene.t0_ns)
         if own is not None and k in casting:
             direct[k] *= seen_share(scene, t_ns, lamp, points, own)[:, None]
-    return Received(direct, open_, ambient(quadric_of(scene.light), normal, quartic_of(scene.light)))
+    around = ambient(quadric_of(scene.light), normal, quartic_of(scene.light))
+    return Received(direct, open_, around * factor_at(scene.light.over_time, t_ns, scene.t0_ns))
 
 
 SOFT_SAMPLES = 64

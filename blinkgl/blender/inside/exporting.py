@@ -50,8 +50,8 @@ def names(objs: Iterable[Any], limit: int = 3) -> str:
 def cause(problem: Exception) -> str:
     """Return the last line of an error that says something: operators put a traceback before, its place behind."""
     lines = [line.strip() for line in str(problem).splitlines() if line.strip()]
-    said = [line for line in lines if not line.startswith(("Location:", "File ", "Error: Python", "Traceback", "^"))]
-    return (said or ["no reason given"])[-1].removeprefix("Error: ")[:300]
+    message = [line for line in lines if not line.startswith(("Location:", "File ", "Error: Python", "Traceback", "^"))]
+    return (message or ["no reason given"])[-1].removeprefix("Error: ")[:300]
 
 
 # --- opening ----------------------------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ def clock_of(frames: list[int] | None, per: int) -> Clock:
 def rendered() -> tuple[list[Any], list[str]]:
     """Return the objects of the view layer that Blender renders at some time, shown so that they are evaluated, and
     lines about others. Objects that the camera does not see are hidden."""
-    found, unseen, hidden = [], [], []
+    objects, unseen, hidden = [], [], []
     shown = set(collections(bpy.context.view_layer.layer_collection))
     for obj in bpy.context.view_layer.objects:
         if obj.type in SEEN and obj.type != "CAMERA" and (obj.is_holdout or not obj.visible_camera):
@@ -132,11 +132,11 @@ def rendered() -> tuple[list[Any], list[str]]:
             obj.hide_viewport = False
             obj.hide_set(False)
             obj.show_instancer_for_viewport = obj.show_instancer_for_render
-            found.append(obj)
+            objects.append(obj)
     for obj in unseen + hidden:
         obj.hide_render = True
     lines = [f"invisible to the camera, or cut out of the picture: {names(unseen)}"] if unseen else []
-    return found, lines + ([f"in collections that are not rendered: {names(hidden)}"] if hidden else [])
+    return objects, lines + ([f"in collections that are not rendered: {names(hidden)}"] if hidden else [])
 
 
 def collections(layer: Any) -> Iterator[str]:
@@ -362,8 +362,8 @@ def written(
     tried, reasons = set(broken), {}
     for number in range(ROUNDS):
         say(doing="writing the GLB")
-        found = export(clock, out, job["clips"], tracks)
-        if not found["meshes"] and not figures:  # a clip for another's figure
+        exported = export(clock, out, job["clips"], tracks)
+        if not exported["meshes"] and not figures:  # a clip for another's figure
             raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
         if job["clips"] or not owners:
             break
@@ -380,7 +380,7 @@ def written(
         tracks, reasons, tried = tracks + more, reasons | why, tried | differ
         if denser == 1 and tried == broken | why.keys():
             break
-    return found, tracks, reasons
+    return exported, tracks, reasons
 
 
 def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
@@ -414,14 +414,14 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     for place, what, instead in (("material.materials", "gather_material", NO_MATERIAL), ("mesh", "gather_mesh", None)):
         forgive(place, what, instead, failed)
     figures = any(obj.type == "ARMATURE" for obj in objs)
-    found, tracks, reasons = written(job, out, say, clock, set(broken), owners, figures)
+    exported, tracks, reasons = written(job, out, say, clock, set(broken), owners, figures)
     lines += [f"'{name}' cannot be exported, it is left out or plain ({why})" for name, why in sorted(failed.items())]
     cameras = [obj for obj in objs if obj.type == "CAMERA" and obj.data.type == "PERSP"]
     scene.frame_set(scene.frame_start)
     active = scene.camera if scene.camera in cameras else None
     return {
         "blender": bpy.app.version_string,
-        "counts": found,
+        "counts": exported,
         "left_out": lines,
         "cameras": [obj.name for obj in cameras],
         "camera": active and active.name,

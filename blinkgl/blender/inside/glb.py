@@ -49,8 +49,8 @@ def add_keys(
     """Add key frames of a node to the first animation. values : (K, n)."""
     animation = tree.setdefault("animations", [{"name": "Scene", "channels": [], "samplers": []}])[0]
     shape = {"rotation": "VEC4", "weights": "SCALAR"}.get(path, "VEC3")
-    given = [add_values(tree, binary, *one) for one in ((np.array(times), "SCALAR"), (values, shape))]
-    tree["accessors"][given[0]] |= {"min": [float(np.float32(times[0]))], "max": [float(np.float32(times[-1]))]}
-    animation["samplers"].append({"input": given[0], "output": given[1], "interpolation": kind})
+    accessors = [add_values(tree, binary, *one) for one in ((np.array(times), "SCALAR"), (values, shape))]
+    tree["accessors"][accessors[0]] |= {"min": [float(np.float32(times[0]))], "max": [float(np.float32(times[-1]))]}
+    animation["samplers"].append({"input": accessors[0], "output": accessors[1], "interpolation": kind})
     aim = {"sampler": len(animation["samplers"]) - 1, "target": {"node": node, "path": path}}
     animation["channels"].append(aim)

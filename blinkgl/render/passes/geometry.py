@@ -63,8 +63,8 @@ class Geometry(ScenePass):
             # Once per kind and frame: programs of one kind have the same uniforms.
             if item.kind not in checked:
                 checked.add(item.kind)
-                given = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
-                self._check(uniforms, given, item)
+                own = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
+                self._check(uniforms, own, item)
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
                 painter.deform(uniforms, item, shot.moment, shot.ends)
@@ -87,8 +87,8 @@ class Geometry(ScenePass):
         """Return uniform -> the label that gives it, and its bytes for each object."""
         count, values = len(shot.scene.objects), {}
         for label in (LABELS[name] for name in self.names):
-            given = label.uniforms(shot)
-            for name, array in given.items():
+            uniforms = label.uniforms(shot)
+            for name, array in uniforms.items():
                 array = np.asarray(array)
                 if array.ndim not in (1, 2, 3) or len(array) != count:
                     raise TypeError(

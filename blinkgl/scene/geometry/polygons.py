@@ -34,9 +34,9 @@ def triangulate(points: np.ndarray, places: np.ndarray, sizes: np.ndarray) -> tu
             clipped = row[_ears(points[places[row]])]
             triangles.append(clipped)
             owners.append(np.full(len(clipped), owner))
-    found, owner = np.concatenate(triangles), np.concatenate(owners)
+    ears, owner = np.concatenate(triangles), np.concatenate(owners)
     order = np.argsort(owner, kind="stable")  # as in the file
-    return found[order], owner[order], len(places) - len(corners)
+    return ears[order], owner[order], len(places) - len(corners)
 
 
 def _fans(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,9 +62,9 @@ def _ears(points: np.ndarray) -> np.ndarray:
     normal = np.cross(flat[1:-1], flat[2:]).sum(axis=0)
     axis = int(np.abs(normal).argmax())
     seen = np.delete(flat, axis, axis=1) / (np.abs(flat).max() or 1.0)
-    found = mapbox_earcut.triangulate_float64(seen, np.array([len(seen)], np.uint32)).reshape(-1, 3).astype(np.int64)
-    a, b, c = (flat[found[:, k]] for k in range(3))
+    ears = mapbox_earcut.triangulate_float64(seen, np.array([len(seen)], np.uint32)).reshape(-1, 3).astype(np.int64)
+    a, b, c = (flat[ears[:, k]] for k in range(3))
     # Triangles have the winding that is seen along the axis, which may be opposite to the polygon's.
     behind = (np.cross(b - a, c - a) @ normal) < 0
-    found[behind] = found[behind, ::-1]
-    return found
+    ears[behind] = ears[behind, ::-1]
+    return ears

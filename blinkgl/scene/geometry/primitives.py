@@ -120,8 +120,8 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
         raise TypeError(f"no primitive '{build.__name__}' in config/primitives.py")
     whole = inspect.signature(build)
     # ``level``, of living ones, is no parameter of the configuration: scenes choose it (:func:`coarser`).
-    given = [p for p in whole.parameters.values() if p.kind is not p.KEYWORD_ONLY]
-    signature = whole.replace(parameters=given)
+    keywords = [p for p in whole.parameters.values() if p.kind is not p.KEYWORD_ONLY]
+    signature = whole.replace(parameters=keywords)
 
     def checked(**parameters: Any) -> inspect.BoundArguments:
         where = build.__name__

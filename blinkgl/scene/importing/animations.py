@@ -245,12 +245,12 @@ def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, wh
     places = {node.name: place for place, node in reversed(list(enumerate(mine.nodes.values())))}
     names = [node.name for node in theirs.nodes.values()]
     matrices = {node.name for node in mine.nodes.values() if node.matrix is not None}
-    found = [
+    matching = [
         Track(places[names[t.joint]], t.path, t.times, t.values, t.interpolation)
         for t in tracks
         if names[t.joint] in places and t.path in PATHS and names[t.joint] not in matrices
     ]
-    if not found:
+    if not matching:
         raise ConfigError(
             "the clip's file moves no joint with a name of this file",
             where=where,
@@ -259,6 +259,6 @@ def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, wh
         )
     if missing := {names[t.joint] for t in tracks} - set(places):
         some = sorted(missing)
-        said = ", ".join(some[:5]) + (", …" if len(some) > 5 else "")
-        mine.omissions.add(f"joints of '{Path(file).name}' that it has not: {said}")
-    return found
+        listed = ", ".join(some[:5]) + (", …" if len(some) > 5 else "")
+        mine.omissions.add(f"joints of '{Path(file).name}' that it has not: {listed}")
+    return matching

@@ -85,12 +85,12 @@ class Document:
         defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
         table = gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights).lights
-        found: dict[int, dict[str, Any]] = {}
+        lights: dict[int, dict[str, Any]] = {}
         for index in (index for index, node in self.nodes.items() if node.visible):
             if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
                 number = index_of(reference.get("light"), len(table), "lights", self.where)
-                found[index] = table[number].model_dump()
-        return found
+                lights[index] = table[number].model_dump()
+        return lights
 
     # ---- geometry
     def world(self, node: int) -> np.ndarray:
@@ -278,15 +278,15 @@ class Document:
         """Return the morph weights of a node's mesh at rest, (count,). Raises AssetError where their number differs."""
         mesh = item(self.tree, "meshes", self.nodes[node].mesh, self.where)
         own = self.nodes[node].weights
-        given = mesh.get("weights", [0.0] * count) if own is None else own
-        if len(given) != count:
+        weights = mesh.get("weights", [0.0] * count) if own is None else own
+        if len(weights) != count:
             raise AssetError(
                 "a mesh does not have one weight per morph target",
                 where=self.where,
-                value=len(given),
+                value=len(weights),
                 accepted=str(count),
             )
-        return np.array(given, np.float64)
+        return np.array(weights, np.float64)
 
     def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
         """Return an attribute, (count, width) float64, None without it. Its length is checked before it is read."""
@@ -312,16 +312,16 @@ class Document:
             return material, None
         index = primitive["attributes"]["COLOR_0"]
         width = _WIDTHS[item(self.tree, "accessors", index, self.where)["type"]]
-        given = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)
-        assert given is not None
-        known = np.all(np.isfinite(given), axis=1)
-        if not known.all() or given.min(initial=0) < 0 or given.max(initial=0) > 1:
+        colours = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)
+        assert colours is not None
+        known = np.all(np.isfinite(colours), axis=1)
+        if not known.all() or colours.min(initial=0) < 0 or colours.max(initial=0) > 1:
             self.omissions.add("colours beyond 0 to 1 (white where they are no numbers, else the nearest)")
-        if width == 4 and (given[:, 3] < 1).any() and self.materials.mode(primitive.get("material")) != "OPAQUE":
+        if width == 4 and (colours[:, 3] < 1).any() and self.materials.mode(primitive.get("material")) != "OPAQUE":
             self.omissions.add(OPACITY)
-            if not given[:, 3].any():
+            if not colours[:, 3].any():
                 return INVISIBLE, None
-        return tinted(material, np.where(known[:, None], given[:, :3], 1.0).clip(0, 1))
+        return tinted(material, np.where(known[:, None], colours[:, :3], 1.0).clip(0, 1))
 
     def _without_coordinates(self, material: Material | None) -> Material | None:
         """Return the material of a mesh without texture coordinates, without normal map, whose direction is then
@@ -379,7 +379,7 @@ class Document:
         """Return the tracks of an animation, with joints as indices of :attr:`nodes`; undrawn parts are added to
         omissions."""
         a = item(self.tree, "animations", animation, self.where)
-        samplers, places, found = a["samplers"], self.places, []
+        samplers, places, tracks = a["samplers"], self.places, []
         for channel in a["channels"]:
             node, path = channel["target"].get("node"), channel["target"]["path"]
             if path not in (*PATHS, "weights"):
@@ -396,13 +396,13 @@ class Document:
             width = 4 if path == "rotation" else self._target_count(node) if path == "weights" else 3
             # A cubic key has three entries: in-tangent, value, out-tangent.
             per_key = 3 if kind == "CUBICSPLINE" else 1
-            keys, given = (item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
+            keys, outputs = (item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
             per_value = width if path == "weights" else 1  # weights are scalars, one after the other
             # Lengths first: both are as long as the file declares.
             fits = (
                 keys["type"] == "SCALAR"
-                and given["count"] == per_key * per_value * keys["count"] > 0
-                and _WIDTHS[given["type"]] * per_value == width
+                and outputs["count"] == per_key * per_value * keys["count"] > 0
+                and _WIDTHS[outputs["type"]] * per_value == width
             )
             times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
             values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
@@ -423,8 +423,8 @@ class Document:
                 raise AssetError(
                     f"the animation of node '{self.nodes[node].name}' has a rotation of zero", where=self.where
                 )
-            found.append(Track(places[node], path, times, values if per_key == 3 else values[:, 0], kind))
-        return found
+            tracks.append(Track(places[node], path, times, values if per_key == 3 else values[:, 0], kind))
+        return tracks
 
     def _target_count(self, node: int) -> int:
         """Return the number of morph targets of a node's mesh; 0 for a node without one."""

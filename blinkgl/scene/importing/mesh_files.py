@@ -128,20 +128,20 @@ def _asset(
 ) -> Asset:
     """Return the asset of a file with the content ``data``; the arguments are those of :func:`load_asset`."""
     near = Neighbours(path, border, Omissions(path.name))
-    found = _found(data, near, max_faces, keep_materials, max_texture, up, play)
-    limit_faces(sum(len(raw.faces) for raw in found.raws), max_faces, str(path))
-    has_materials = keep_materials and any(raw.material is not None for raw in found.raws)
-    common = {"name": path.stem, "where": str(path), "source_hash": digest, "log": found.log}
+    content = _found(data, near, max_faces, keep_materials, max_texture, up, play)
+    limit_faces(sum(len(raw.faces) for raw in content.raws), max_faces, str(path))
+    has_materials = keep_materials and any(raw.material is not None for raw in content.raws)
+    common = {"name": path.stem, "where": str(path), "source_hash": digest, "log": content.log}
     parts = tuple(
         part_of(raw, **common, materials=has_materials, uv_size=uv_size, deformer=deformer)
-        for raw, deformer in zip(found.raws, found.deformers, strict=True)
-        if len(raw.faces) or len(found.raws) == 1
+        for raw, deformer in zip(content.raws, content.deformers, strict=True)
+        if len(raw.faces) or len(content.raws) == 1
     )
     if not parts:
-        found.omissions.add(WHOLE)
+        content.omissions.add(WHOLE)
     parts = parts if has_materials else _white(parts, path.stem, digest)
-    said = tuple(dict.fromkeys(found.log)), found.omissions.lines()
-    return Asset(path.stem, digest, parts, has_materials, *said, tuple(found.clips))
+    lines = tuple(dict.fromkeys(content.log)), content.omissions.lines()
+    return Asset(path.stem, digest, parts, has_materials, *lines, tuple(content.clips))
 
 
 def clip_of(config: AnimationConfig, base: Path | str = ".", where: str = "animation") -> ClipOf:
@@ -255,18 +255,18 @@ def _of_document(document: gltf.Document, play: ClipOf | None, turn: np.ndarray 
     clips, played = clip_names(document), None if play is None else play(document)
     if clips and played is None:
         document.omissions.add("animations (the rest pose is drawn)")
-    found = _Found([], [], document.log, document.omissions, clips)
+    content = _Found([], [], document.log, document.omissions, clips)
     if not any(node.mesh is not None for node in document.nodes.values()):
         raise AssetError("the file has no faces", where=document.where, accepted="a mesh with triangles")
     for node in document.nodes:
         raws, world = shown(document, node, played) or ([], np.eye(4))
         for raw in raws:
             placed = transformed(raw, world)
-            found.raws.append(placed if turn is None else transformed(placed, turn))
+            content.raws.append(placed if turn is None else transformed(placed, turn))
             axes = np.eye(4) if turn is None else turn
             deformer = None if played is None else partial(played.deformer, node, at_rest=axes @ world, turn=axes)
-            found.deformers.append(deformer)
-    return found
+            content.deformers.append(deformer)
+    return content
 
 
 def _white(parts: tuple[Part, ...], name: str, digest: str) -> tuple[Part, ...]:

@@ -75,12 +75,12 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
     max_texture : None leaves materials out. Raises AssetError with file and line: indices that do not exist,
     coordinates that are not numbers, too many faces."""
     path, log, where = near.path, near.log, str(near.path)
-    said = _statements(data, where, near.omissions)
+    statements = _statements(data, where, near.omissions)
     # Four numbers a face, as _statements appends them; ``sizes`` are the corners of each face.
-    lines, sizes, surfaces, smoothing = np.array(said.faces).reshape(-1, 4).T
+    lines, sizes, surfaces, smoothing = np.array(statements.faces).reshape(-1, 4).T
     # Each distinct v/vt/vn is parsed once; ``used`` repeats them for the corners of all faces.
-    index = np.array(said.distinct).reshape(-1, 3)[np.array(said.used, np.int64)]
-    tables = [_rows(*table, width) for table, width in zip(said.tables.values(), (7, 2, 3), strict=True)]
+    index = np.array(statements.distinct).reshape(-1, 3)[np.array(statements.used, np.int64)]
+    tables = [_rows(*table, width) for table, width in zip(statements.tables.values(), (7, 2, 3), strict=True)]
     for k, table in enumerate(tables):
         # k is 0 for positions, 1 for texture coordinates, 2 for normals. A table of length 1 has only the NaN row that
         # _rows appends, which index -1 selects.
@@ -97,18 +97,21 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
     at, materials, colours = index[:, 0].copy(), [None], None
     del index
     if max_texture is not None:
-        worn = _materials(data, near, said.materials, max_texture)
+        worn = _materials(data, near, statements.materials, max_texture)
         materials = [material for material, _, _ in worn]
         if uvs is not None:
             scale, offset = (np.array([one[k] for one in worn])[np.repeat(surfaces, sizes)] for k in (1, 2))
             uvs = uvs * scale + offset
         # Colours, and their opacity, stand behind x, y and z.
-        have = np.array(said.tables["v"][1])
+        have = np.array(statements.tables["v"][1])
         if (have >= 6).any():
             codes = np.where((have >= 6)[:, None], vertices[:-1, 3:6], np.nan)
             colours = linear_colours(codes, near, None, vertices[:-1][have >= 7, 6])[at]
-    surfaces, groups = (surfaces if max_texture is not None else surfaces * 0), smoothing if said.grouped else None
-    given = Polygons(
+    surfaces, groups = (
+        (surfaces if max_texture is not None else surfaces * 0),
+        smoothing if statements.grouped else None,
+    )
+    polygons = Polygons(
         points=vertices[:-1, :3],
         places=at,
         sizes=sizes,
@@ -119,7 +122,7 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
         smoothing=groups,
         lines=lines,
     )
-    return raw_meshes(given, materials, max_faces, where, log)
+    return raw_meshes(polygons, materials, max_faces, where, log)
 
 
 def _rows(values: array, counts: array, width: int) -> np.ndarray:
@@ -153,13 +156,13 @@ def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
 
 
 def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
-    said, material, smoothing = _Statements(), "", 0
+    statements, material, smoothing = _Statements(), "", 0
     known: dict[str, int] = {}
     unknown: dict[str, None] = {}
     for line, key, rest in _lines(data):
-        if key in said.tables:
+        if key in statements.tables:
             row = _numbers(rest, 1 if key == "vt" else 3, where, line)
-            values, counts = said.tables[key]
+            values, counts = statements.tables[key]
             values.extend(row)
             counts.append(len(row))
         elif key in ("f", "fo"):
@@ -167,24 +170,24 @@ def _statements(data: bytes, where: str, omissions: Omissions) -> _Statements:
             words = (_COMMENT.split(rest)[0] if "#" in rest else rest).split()
             for word in words:
                 if word not in known or "-" in word:  # what a relative index means depends on its line
-                    known[word] = len(said.distinct) // 3
-                    said.distinct.extend(_corner(word, said.tables, f"{where}, line {line}"))
-                said.used.append(known[word])
-            surface = said.materials.setdefault(material, len(said.materials))
-            said.faces.extend((line, len(words), surface, smoothing))
+                    known[word] = len(statements.distinct) // 3
+                    statements.distinct.extend(_corner(word, statements.tables, f"{where}, line {line}"))
+                statements.used.append(known[word])
+            surface = statements.materials.setdefault(material, len(statements.materials))
+            statements.faces.extend((line, len(words), surface, smoothing))
         elif key == "usemtl":
             material = rest
         elif key == "s":
             # "s off" switches smoothing off, as "s 0" does; anything else that is no number counts as off, too.
-            smoothing, said.grouped = int(rest) if re.fullmatch(r"\d{1,9}", rest) else 0, True
+            smoothing, statements.grouped = int(rest) if re.fullmatch(r"\d{1,9}", rest) else 0, True
         elif key in _NOT_DRAWN:
             omissions.add(_NOT_DRAWN[key])
         elif key not in _WITHOUT_EFFECT:
             unknown[key[:20]] = None
     omissions.unknown("statements of OBJ", unknown)
-    if not said.faces:
+    if not statements.faces:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
-    return said
+    return statements
 
 
 def _numbers(text: str, least: int, where: str, line: int) -> list[float]:

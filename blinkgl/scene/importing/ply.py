@@ -55,27 +55,27 @@ def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
         near.omissions.add("edges and triangle strips" if name in ("edge", "tristrips") else f"elements '{name}'")
     sizes, places = (values.astype(np.int64) for values in indices)
     inside = np.clip(places, 0, max(len(vertex["x"]) - 1, 0))  # raw_meshes refuses the others
-    given = Polygons(_columns_of(vertex, "xyz"), places, sizes)
+    polygons = Polygons(_columns_of(vertex, "xyz"), places, sizes)
     if {"nx", "ny", "nz"} <= set(vertex):
-        given.normals = _columns_of(vertex, ("nx", "ny", "nz"))[inside]
-    given.uvs, number = _coordinates(elements, sizes, inside, near)
+        polygons.normals = _columns_of(vertex, ("nx", "ny", "nz"))[inside]
+    polygons.uvs, number = _coordinates(elements, sizes, inside, near)
     materials: list[Material | None] = [None]
     if max_texture is not None:
         for name, known in _KNOWN.items():
             near.omissions.unknown(f"properties of {name} elements", set(elements.get(name, ())) - known)
         of_faces, of_vertices = _colours(face, near), _colours(vertex, near)
-        given.colours = np.repeat(of_faces, sizes, axis=0) if of_faces is not None else None
-        given.colours = of_vertices[inside] if of_vertices is not None else given.colours
+        polygons.colours = np.repeat(of_faces, sizes, axis=0) if of_faces is not None else None
+        polygons.colours = of_vertices[inside] if of_vertices is not None else polygons.colours
         textures = [file for _, file in files_of_ply(data, near)]
-        for file in textures if given.uvs is not None else ():
+        for file in textures if polygons.uvs is not None else ():
             texture = texture_beside(file, max_texture, near.omissions)
             materials.append(None if texture is None else Material(texture=texture))
-        if textures and given.uvs is None:
+        if textures and polygons.uvs is None:
             near.omissions.add("a texture, since there are no texture coordinates")
         if len(materials) > 1 and isinstance(number, np.ndarray):
             # A face's number counts textures from 0, and -1 is none; material 0 is for faces without a texture.
-            given.surfaces = np.clip(np.nan_to_num(number), -1, len(materials) - 2).astype(np.int64) + 1
-    return raw_meshes(given, materials, max_faces, where, near.log)
+            polygons.surfaces = np.clip(np.nan_to_num(number), -1, len(materials) - 2).astype(np.int64) + 1
+    return raw_meshes(polygons, materials, max_faces, where, near.log)
 
 
 def _coordinates(
@@ -187,8 +187,8 @@ class _Body:
         limits = np.iinfo(kind if kind[0] != "f" else "i4")
         # The numbers of a text are float64, which holds whole numbers up to 2^53 exactly.
         least, most = max(limits.min, -(2**53)), min(limits.max, 2**53)
-        found = self.items[at]
-        return found if kind[0] == "f" else np.clip(np.nan_to_num(found, nan=most), least, most).astype(kind)
+        item = self.items[at]
+        return item if kind[0] == "f" else np.clip(np.nan_to_num(item, nan=most), least, most).astype(kind)
 
     def columns(self, count: int, properties: list[tuple[str, str | None, str]], name: str, where: str) -> dict:
         """Return the columns of the next element: (name, type of a list's length or None, type) of each property."""
@@ -217,22 +217,22 @@ class _Body:
                     raise truncated
                 if inner[k]:
                     # The value itself where a length takes one item: a byte, or a number of a text.
-                    given = self.items[at - 1]
+                    count_of = self.items[at - 1]
                     if self.order and width > 1:  # one byte, the usual length of a length, is read without an array
-                        given = self.values(starts[k, row : row + 1], properties[k][1] or "")[0]
-                    lengths[k, row] = max(int(given), 0)
+                        count_of = self.values(starts[k, row : row + 1], properties[k][1] or "")[0]
+                    lengths[k, row] = max(int(count_of), 0)
                     at += int(lengths[k, row]) * inner[k]
             if at > end:
                 raise truncated
-        self.at, found = at if any(inner) else at + count * sum(widths), {}
+        self.at, columns = at if any(inner) else at + count * sum(widths), {}
         if starts.max(initial=0) >= max(len(self.items), 1):
             raise truncated
         for k, (key, length, kind) in enumerate(properties):
             if length is None:
-                found[key] = self.values(starts[k], kind)
+                columns[key] = self.values(starts[k], kind)
                 continue
             # within: the place of each value in its own list, 0, 1, …
             within = np.arange(lengths[k].sum()) - np.repeat(np.cumsum(lengths[k]) - lengths[k], lengths[k])
             places = np.repeat(starts[k] + widths[k], lengths[k]) + within * inner[k]
-            found[key] = lengths[k], self.values(places, kind)
-        return found
+            columns[key] = lengths[k], self.values(places, kind)
+        return columns

@@ -118,15 +118,15 @@ def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[Ra
     if any(len(row) < width + tints for row in rows[-1:]) or sum(map(abs, sizes)) != len(places):
         raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
     points = np.array(rows, np.float64).reshape(number, width + tints)
-    given = Polygons(points[:, :3], np.array(places, np.int64), np.array(sizes, np.int64))
-    corner = given.places.clip(0, max(number - 1, 0))
-    given.normals = points[corner, 3:6] if "N" in kind else None
-    given.uvs = points[corner, -2:] if "ST" in kind else None
+    polygons = Polygons(points[:, :3], np.array(places, np.int64), np.array(sizes, np.int64))
+    corner = polygons.places.clip(0, max(number - 1, 0))
+    polygons.normals = points[corner, 3:6] if "N" in kind else None
+    polygons.uvs = points[corner, -2:] if "ST" in kind else None
     if wanted and tints:
-        given.colours = _off_colours([row[first : first + tints] for row in rows], near)[corner]
+        polygons.colours = _off_colours([row[first : first + tints] for row in rows], near)[corner]
     elif wanted and any(specs):
-        given.colours = np.repeat(_off_colours(specs, near), given.sizes, axis=0)
-    return raw_meshes(given, [None], max_faces, where, near.log)
+        polygons.colours = np.repeat(_off_colours(specs, near), polygons.sizes, axis=0)
+    return raw_meshes(polygons, [None], max_faces, where, near.log)
 
 
 def _off_colours(specs: Sequence[Sequence[str]], near: Neighbours) -> np.ndarray:

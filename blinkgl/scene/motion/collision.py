@@ -213,7 +213,7 @@ class _Search:
 
     def at_start(self) -> list[Collision]:
         """Return contacts at t0; record which bodies rest on which, and stop moving ones."""
-        found = []
+        meeting = []
         for i, j in self._pairs():
             a, b = self.bodies[i], self.bodies[j]
             Ta, Tb = a.path.pose(self.t0), b.path.pose(self.t0)
@@ -223,9 +223,11 @@ class _Search:
             if not self._rests(i, j, Ta, Tb):
                 separation = self._distance(a, b, Ta, Tb)
                 if separation <= self._tol(a, b):
-                    found.append((a, b, max(separation, 0.0)))
+                    meeting.append((a, b, max(separation, 0.0)))
         # Stopped only now, so that every pair is tested in the same scene.
-        return [Collision(self.t0, a.name, b.name, separation, self._stop(self.t0, a, b)) for a, b, separation in found]
+        return [
+            Collision(self.t0, a.name, b.name, separation, self._stop(self.t0, a, b)) for a, b, separation in meeting
+        ]
 
     def _pairs(self):
         for i, a in enumerate(self.bodies):

@@ -81,10 +81,10 @@ def path_along_curve(
 
     points : as of :class:`ArcLengthCurve`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its
     x axis follows the slope, its y axis staying level.   start : fraction of the way covered at time 0."""
-    given = np.asarray(points, np.float64)
-    after = np.roll(given, -1, axis=0) if closed else given[1:]
-    for k in np.flatnonzero(np.abs(after - given[: len(after)]).max(axis=1) < 1e-6):
-        raise ConfigError("must differ from the next point", where=f"{where}.points.{k}", value=given[k].tolist())
+    control = np.asarray(points, np.float64)
+    after = np.roll(control, -1, axis=0) if closed else control[1:]
+    for k in np.flatnonzero(np.abs(after - control[: len(after)]).max(axis=1) < 1e-6):
+        raise ConfigError("must differ from the next point", where=f"{where}.points.{k}", value=control[k].tolist())
     curve = ArcLengthCurve(points, closed)
     span = (t1_ns - t0_ns) * 1e-9
     legs = len(np.asarray(points)) - (not closed)

@@ -71,7 +71,7 @@ class Exploded(ConfigError):
 def engine() -> ModuleType:
     """Return MuJoCo. Raises ConfigError with the command that installs it."""
     # It would load an OpenGL library for its own pictures.
-    said = os.environ.get("MUJOCO_GL")
+    wanted = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
     try:
         import mujoco
@@ -80,10 +80,10 @@ def engine() -> ModuleType:
             "physics needs MuJoCo, which is not installed", where="scene.physics", accepted=f"run {install('mujoco')}"
         ) from None
     finally:
-        if said is None:
+        if wanted is None:
             del os.environ["MUJOCO_GL"]
         else:
-            os.environ["MUJOCO_GL"] = said
+            os.environ["MUJOCO_GL"] = wanted
     # Its own handler writes a file into the working folder; the checks here replace it.
     mujoco.set_mju_user_warning(_silent)  # type: ignore[missing-attribute]
     return mujoco
@@ -318,15 +318,15 @@ class _World:
     def _pushed(self, first: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """Return (which body, qpos (n, 7), qvel (n, 6)) of the pushers at steps ``first`` and after."""
         times = _times(np.arange(first, first + _CHUNK + 2), self.t0_ns, self.settings.rate)
-        found = []
+        pushed = []
         for body in self.pushers:
             T = body.path.poses(times)
             # A pusher's velocity moves it to its next pose within one step.
             q, R = quaternions(T[:, :3, :3]), Rotation.from_matrix(T[:, :3, :3])
             p = T[:, :3, 3] + T[:, :3, :3] @ body.centre
             turns = (R[:-1].inv() * R[1:]).as_rotvec()
-            found.append((body.at, np.hstack([p, q])[:-1], np.hstack([np.diff(p, axis=0), turns]) / self.step))
-        return found
+            pushed.append((body.at, np.hstack([p, q])[:-1], np.hstack([np.diff(p, axis=0), turns]) / self.step))
+        return pushed
 
     def _push(self, pushed, k: int) -> None:
         for at, qpos, qvel in pushed:

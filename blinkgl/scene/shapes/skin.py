@@ -174,8 +174,8 @@ class Skin(Deformer):
     def transformed(self, matrix: np.ndarray) -> Skin:
         matrix = np.asarray(matrix, np.float64)
         morphs = None if self.morphs is None else self.morphs.transformed(matrix[:3, :3])
-        given = self.skeleton, self.bones, self.inverse_bind, self.joints, self.weights, morphs
-        return Skin(*given, after=matrix @ self.after, before=self.before @ np.linalg.inv(matrix), where=self.where)
+        parts = self.skeleton, self.bones, self.inverse_bind, self.joints, self.weights, morphs
+        return Skin(*parts, after=matrix @ self.after, before=self.before @ np.linalg.inv(matrix), where=self.where)
 
     # ---- the shape, on the CPU -----------------------------------------------------------------------------------
 

@@ -64,20 +64,20 @@ def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
     if width > _WIDTH:
         image = cv2.resize(image, (_WIDTH, max(1, round(height * _WIDTH / width))), interpolation=cv2.INTER_AREA)
     directions, solid = pixel_directions(*image.shape[:2])
-    found: list[Sun] = []
-    while len(found) < suns:
+    cut_out: list[Sun] = []
+    while len(cut_out) < suns:
         sun, image = _without_sun(image, directions, solid)
         if sun is None:
             break
-        found.append(sun)
+        cut_out.append(sun)
     small = (min(image.shape[1], PICTURE_WIDTH), min(image.shape[0], PICTURE_WIDTH // 2))
     picture = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32)
     quadric = quadric_of_harmonics(harmonics(image, directions, solid))
     # The mean over all normals of n^T A n is a third of the trace of A, and that of the linear terms is 0.
     mean = np.trace(quadric, axis1=1, axis2=2) - (2 / 3) * np.trace(quadric[:, :3, :3], axis1=1, axis2=2)
-    mean = mean + sum((sun.strength / 4 for sun in found), np.zeros(3))  # the mean of a sun over all normals is 1/4
+    mean = mean + sum((sun.strength / 4 for sun in cut_out), np.zeros(3))  # the mean of a sun over all normals is 1/4
     finer, size = quartic(picture, *pixel_directions(*picture.shape[:2]))
-    return Environment(quadric, tuple(found), picture, finer if (size > FINER * mean).any() else None)
+    return Environment(quadric, tuple(cut_out), picture, finer if (size > FINER * mean).any() else None)
 
 
 def turned(given: Environment, angle: float) -> Environment:

@@ -28,7 +28,7 @@ from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, border_of, clip_of, load_asset, sides_of
 from blinkgl.scene.importing.polygons import texture_of
-from blinkgl.scene.lights import make_light
+from blinkgl.scene.lights import LampPath, make_light, waveform_of
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.curves import path_along_curve
 from blinkgl.scene.motion.dynamics import simulate
@@ -95,7 +95,9 @@ def explicit_scene(
     dynamics = None
     if config.physics is not None:
         objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
-    light, objects = with_environment(config.light.environment, make_light(config.light), base, objects)
+    light, objects = with_environment(
+        config.light.environment, make_light(config.light, lamp_paths(t0_ns, t1_ns, base)), base, objects
+    )
     return Scene(
         objects,
         Rig.alone(camera, path),
@@ -130,8 +132,8 @@ def _objects(
         own, animation = item.material is None, animation_of(item.animation)
         key = item.mesh, own, animation
         if key not in assets:
-            given = config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
-            assets[key] = _asset(*given, animation, f"{where}.animation")
+            arguments = config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
+            assets[key] = _asset(*arguments, animation, f"{where}.animation")
             log += [line for line in assets[key].log if line not in log]
             omissions.update(dict.fromkeys(assets[key].omissions))
         parts = _parts(assets[key], item, None if item.material is None else materials[item.material], config)
@@ -229,6 +231,11 @@ def motion_path(
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
     times = [round(k.time * 1e9) for k in config.keyframes]
     return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation)
+
+
+def lamp_paths(t0_ns: int, t1_ns: int, base: Path) -> LampPath:
+    """Return what makes the paths of lamps that move in a sequence."""
+    return lambda motion, where: motion_path(motion, t0_ns, t1_ns, where, base, camera=True)
 
 
 def trajectory_path(
@@ -404,6 +411,7 @@ def _material(
         bump_scale=config.normal_scale,
         emission=config.emission,
         emission_map=_map(config, "emission_map", base, where, maps),
+        emission_over_time=waveform_of(config.emission_over_time),
         mask=_mask(config, base, where, maps),
     )
 
@@ -412,13 +420,13 @@ def _map(config: MaterialConfig, key: str, base: Path, where: str, maps: Mapping
     """Return the map of the image file of a key, or in memory; None: neither."""
     if key in maps:
         return Map(Texture(maps[key], key))
-    given = getattr(config, key)
-    if given is None:
+    value = getattr(config, key)
+    if value is None:
         return None
-    data = contents(existing(given, base, f"{where}.{key}", _IMAGE), "image")
+    data = contents(existing(value, base, f"{where}.{key}", _IMAGE), "image")
     decode = decode_image if key == "emission_map" else decode_numbers
-    pixels = decode(data, config.max_size, f"{where}.{key}: {given}")
-    return Map(Texture(pixels, Path(given).name, content_hash(data)))
+    pixels = decode(data, config.max_size, f"{where}.{key}: {value}")
+    return Map(Texture(pixels, Path(value).name, content_hash(data)))
 
 
 def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.ndarray]) -> Mask | None:
@@ -428,10 +436,10 @@ def _mask(config: MaterialConfig, base: Path, where: str, maps: Mapping[str, np.
         if config.mask is None:
             return None
         data = contents(existing(config.mask, base, f"{where}.mask", _IMAGE), "image")
-        said = f"{where}.mask: {config.mask}"
-        alpha = decode_alpha(data, config.max_size, said)
+        place = f"{where}.mask: {config.mask}"
+        alpha = decode_alpha(data, config.max_size, place)
         if alpha is None:
-            alpha = decode_numbers(data, config.max_size, said).mean(axis=2).round().astype(np.uint8)
+            alpha = decode_numbers(data, config.max_size, place).mean(axis=2).round().astype(np.uint8)
     if alpha.max() < 255 * config.cutoff:
         raise ConfigError(
             "the mask removes the whole surface",

@@ -30,7 +30,7 @@ from blinkgl.scene.reading import existing, reading
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Light, Part, Scene, SceneObject
-from blinkgl.scene.worlds.explicit import motion_path
+from blinkgl.scene.worlds.explicit import lamp_paths, motion_path
 from blinkgl.scene.worlds.sky import with_environment
 from blinkgl.types.poses import pose_of
 
@@ -59,7 +59,7 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
             intrinsics=config.intrinsics,
             animation=config.animation,
             base=base,
-            light=make_light(config.light),
+            light=make_light(config.light, lamp_paths(t0_ns, t1_ns, base)),
             lights_gain=config.lights_gain if own else None,
         )
     light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
@@ -114,11 +114,11 @@ def _objects(document: gltf.Document, animation: Animation | None, t0_ns: int, t
     made: list[SceneObject] = []
     names: set[str] = set()
     for index, node in document.nodes.items():
-        found = _object(document, index, animation, t0_ns, t1_ns)
-        if found is not None:
+        shown_object = _object(document, index, animation, t0_ns, t1_ns)
+        if shown_object is not None:
             name = node.name if node.name not in names else f"{node.name}#{len(made)}"
             names.add(name)
-            made.append(SceneObject(name, len(made) + 1, *found))
+            made.append(SceneObject(name, len(made) + 1, *shown_object))
     if not made and not any(node.mesh is not None for node in document.nodes.values()):
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
     if not made:
@@ -130,10 +130,10 @@ def _object(
     document: gltf.Document, index: int, animation: Animation | None, t0_ns: int, t1_ns: int
 ) -> tuple[tuple[Part, ...], PosePath] | None:
     """Return (parts, path) of a node that shows a mesh; None: one of which nothing is visible."""
-    node, found = document.nodes[index], shown(document, index, animation)
-    if found is None:
+    node, clip = document.nodes[index], shown(document, index, animation)
+    if clip is None:
         return None
-    raws, world = found
+    raws, world = clip
     if animation is None:
         place, baked = split_rigid(Z_UP @ world)
         return _parts(raws, baked, node.name, document), StaticPath(place, t0_ns, t1_ns)
@@ -177,8 +177,8 @@ def _parts(
     parts = []
     for raw in (transformed(raw, baked) for raw in raws if len(raw.faces)):
         digest = content_hash(raw.vertices.tobytes(), np.ascontiguousarray(raw.faces, np.int64).tobytes())
-        given = {"name": name, "where": document.where, "source_hash": digest, "log": document.log}
-        parts.append(part_of(raw, **given, deformer=deformer))
+        origin = {"name": name, "where": document.where, "source_hash": digest, "log": document.log}
+        parts.append(part_of(raw, **origin, deformer=deformer))
     return tuple(parts)
 
 
@@ -237,16 +237,16 @@ def _with_lights(
     document: gltf.Document, animation: Animation | None, t0_ns: int, t1_ns: int, light: Light, gain: float
 ) -> Light:
     """Return the light with the file's lights instead of the sun: the strongest, where there are too many."""
-    found = document.lights()
-    if not found:
+    lights = document.lights()
+    if not lights:
         raise ConfigError("the file has no lights", where="scene.lights", value="file", accepted="config")
     # The configuration's own lamps come first; of the file's, the brightest fill the rest.
     room = MAX_LAMPS - len(light.lamps)
-    kept = sorted(found, key=lambda node: -found[node]["intensity"] * max(found[node]["color"]))[:room]
-    if len(found) > room:
-        document.omissions.add(f"{len(found) - room} of {len(found)} lights (the weakest; at most {room} shine)")
+    kept = sorted(lights, key=lambda node: -lights[node]["intensity"] * max(lights[node]["color"]))[:room]
+    if len(lights) > room:
+        document.omissions.add(f"{len(lights) - room} of {len(lights)} lights (the weakest; at most {room} shine)")
     lamps = [
-        lamp_of_gltf(found[node], _motion(document, node, animation, t0_ns, t1_ns)[0], gain) for node in sorted(kept)
+        lamp_of_gltf(lights[node], _motion(document, node, animation, t0_ns, t1_ns)[0], gain) for node in sorted(kept)
     ]
     return replace(light, sun=0.0, lamps=(*light.lamps, *lamps))
 

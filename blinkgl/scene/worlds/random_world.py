@@ -27,7 +27,7 @@ from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.importing.mesh_files import Asset, sides_of
-from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
+from blinkgl.scene.lights import MAX_LAMPS, LampPath, make_light, random_lamps
 from blinkgl.scene.motion.body_shapes import Barrier
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.curves import random_path_along_curve
@@ -39,6 +39,7 @@ from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.sweep import filled, gait
 from blinkgl.scene.surfaces.images import SKY_SIDES
 from blinkgl.scene.types import Lamp, Light, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.scene.worlds.explicit import lamp_paths
 from blinkgl.scene.worlds.pool import Pool, object_pool, texture_pool
 from blinkgl.scene.worlds.sky import Panorama, drawn_panorama, panorama_light, panorama_sky, sky_box
 from blinkgl.types.poses import pose_of
@@ -103,7 +104,9 @@ def random_world(
         rig=Rig.alone(camera, camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
-        light=_light(config, panorama, rng, generator(seed, sequence, Role.LIGHT), floor),
+        light=_light(
+            config, panorama, lamp_paths(t0_ns, t1_ns, base), rng, generator(seed, sequence, Role.LIGHT), floor
+        ),
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),
@@ -221,7 +224,9 @@ def _fallen(config, objects, bodies, eye, floor, t0_ns, t1_ns, log):
     return objects, None
 
 
-def _light(config: RandomSceneConfig, panorama: Panorama | None, rng, rng_lamps, floor: float) -> Light:
+def _light(
+    config: RandomSceneConfig, panorama: Panorama | None, path_of: LampPath, rng, rng_lamps, floor: float
+) -> Light:
     lamps: tuple[Lamp, ...] = ()
     if config.lights is not None:
         lamps = random_lamps(config.lights, rng_lamps, config.region.width / 2, floor)
@@ -232,7 +237,7 @@ def _light(config: RandomSceneConfig, panorama: Panorama | None, rng, rng_lamps,
                 value=config.lights.count[1],
                 accepted=f"at most {MAX_LAMPS - 1} with those of scene.light.lights",
             )
-    light = make_light(config.light, rng, lamps)
+    light = make_light(config.light, path_of, rng, lamps)
     if config.sky is not None and config.sky.lights and panorama is not None:
         light = panorama_light(panorama.file, panorama.angle, panorama.brightness, light, panorama.where)
     return light
@@ -282,7 +287,7 @@ def _place(
     centres, radii = np.empty((settings.count + 1, 3)), np.empty(settings.count + 1)
     centres[0], radii[0] = T_cam[:3, 3], clearance
     for k in range(settings.count):
-        asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
+        asset, playing = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
         resting = config.ground is not None and rng.random() >= settings.flying
         locomotion, _ = gait(asset.parts)
@@ -315,7 +320,7 @@ def _place(
             continue
         centres[taken], radii[taken] = position, radius
         placed.append(_Placed(f"{asset.name}#{k}", parts, pose_of(position, rotation), radius, resting))
-        log.extend(f"{asset.name}#{k} {text}" for text in (said, word) if text)
+        log.extend(f"{asset.name}#{k} {text}" for text in (playing, word) if text)
         log.extend(line for line in asset.log if line not in log)
         omissions.update(dict.fromkeys(asset.omissions))
     return placed

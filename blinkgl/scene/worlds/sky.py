@@ -118,16 +118,16 @@ def drawn_panorama(
 ) -> Panorama:
     """Return a random panorama of this split, turned to a random heading."""
     files = []
-    for i, given in enumerate(config.panoramas):
-        path, where = resolve(given, base), f"scene.sky.panoramas.{i}"
+    for i, entry in enumerate(config.panoramas):
+        path, where = resolve(entry, base), f"scene.sky.panoramas.{i}"
         if not path.exists():
             raise ConfigError(
                 "no such file or folder",
                 where=where,
-                value=given,
+                value=entry,
                 accepted="an equirectangular image or a folder of them",
             )
-        files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
+        files += [path] if path.is_file() else files_below(path, where, entry, IMAGE_SUFFIXES, "images")
     # By content: neither names, copies nor the order of a folder change what is drawn.
     hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
     mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, Removed, rule
 
+_Px = Annotated[int, Field(ge=0, le=16384)]
 _Rate = Annotated[float, Field(ge=0, le=1e4)]
 
 
@@ -130,6 +131,16 @@ class ReadoutConfig(Config):
         le=2**24,
         description="Events that may wait for the bus; an event that finds the queue full is lost.",
     )
+    roi: tuple[_Px, _Px, _Px, _Px] | None = Field(
+        None, description="[x, y, width, height], px: pixels outside of it are switched off; null: none are."
+    )
+    max_rate: float | None = Field(
+        None,
+        ge=5000,
+        le=1e12,
+        description="Events per second that the camera's event rate controller lets through, in periods of 200 µs; "
+        "null: all (docs/sensors.md).",
+    )
     clock_us: int = Field(
         1,
         ge=1,
@@ -153,6 +164,11 @@ class ReadoutConfig(Config):
                 value=queue,
                 accepted="a shorter queue or a faster bus",
             )
+
+    @rule("?roi", "roi")
+    def _some_pixels(there, roi: tuple[int, int, int, int]):
+        if there and not (roi[2] and roi[3]):
+            raise Refused("a region without pixels", where="roi", value=list(roi))
 
     @property
     def drain_us(self) -> float:

@@ -21,6 +21,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.light_noise import LightNoise
 from blinkgl.events.pixels import PixelNoise
+from blinkgl.events.rate_control import RateController
 from blinkgl.events.resets import FrameResets
 from blinkgl.events.table import EMULATORS, make_emulator
 from blinkgl.events.truth import Surfaces, SurfaceTruth
@@ -77,13 +78,13 @@ def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
 class Readout:
     """Events of an emulator, in order, chunk by chunk -> the events the sensor sends.
 
-    ``dropped`` counts the events that found the queue full; ``late`` those that had not left the bus by the end of the
-    last step.
+    ``dropped`` counts the events that found the queue full or that the rate controller took out; ``late`` those that
+    had not left the bus by the end of the last step.
     """
 
     def __init__(self, config: ReadoutConfig):
         self.config = config
-        self.dropped = 0
+        self._overrun = 0
         rate = config.events_per_second
         self._event_ps = 0 if rate is None else max(1, round(1e12 / rate))
         self._row_ps = round(config.row_ns * 1000)
@@ -91,6 +92,11 @@ class Readout:
         # Events accepted; time from which the bus is free (always); its row (none); µs of the first event.
         self._state = np.array([0, -(2**62), -1, _NO_EVENT_YET], np.int64)
         self._on_bus = Events.empty()
+        self._control = None if config.max_rate is None else RateController(config.max_rate)
+
+    @property
+    def dropped(self) -> int:
+        return self._overrun + (0 if self._control is None else self._control.dropped)
 
     @property
     def late(self) -> int:
@@ -103,13 +109,22 @@ class Readout:
 
         ``until_us`` : the time up to which the emulator has given its events, int µs.
         Raises EventDataError 100 days after the first event, which picoseconds in int64 cannot hold."""
+        events = self._inside(events)
         sent = self._serve(events) if len(events) and self._event_ps else events
         # Events that have been served are already in order and later than those still on the bus.
         if self.late:
             sent = Events.concatenate([self._on_bus, sent])
         count = len(sent) if until_us is None else int(np.searchsorted(sent.t, until_us, side="right"))
         self._on_bus = sent.part(slice(count, None)).copy()
-        return self._stamped(sent.part(slice(count)))
+        passed = sent.part(slice(count))
+        return self._stamped(passed if self._control is None else self._control.step(passed))
+
+    def _inside(self, events: Events) -> Events:
+        """Return the events of the region of interest, all where there is none."""
+        if self.config.roi is None or not len(events):
+            return events
+        x, y, width, height = self.config.roi
+        return events.part((events.x >= x) & (events.x < x + width) & (events.y >= y) & (events.y < y + height))
 
     def _stamped(self, events: Events) -> Events:
         """Return the events stamped with the last tick of the clock."""
@@ -131,7 +146,7 @@ class Readout:
         keep, out_us = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
         after_us = events.t - origin_us
         kept = _serve(after_us, events.y, self._event_ps, self._row_ps, self._waiting, self._state, keep, out_us)
-        self.dropped += len(events) - kept
+        self._overrun += len(events) - kept
         keep = keep[:kept]
         return replace(events.part(keep), t=out_us[:kept] + origin_us)
 
@@ -139,17 +154,21 @@ class Readout:
         return {
             "waiting": self._waiting.copy(),
             "state": self._state.copy(),
-            "dropped": np.array([self.dropped], np.int64),
+            "dropped": np.array([self._overrun], np.int64),
+            **({} if self._control is None else {"control": self._control.state_dict()}),
             **{f"on_bus_{k}": getattr(self._on_bus, k).copy() for k in self._on_bus.columns},
         }
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         columns = ("x", "y", "t", "p", *(k for k in OPTIONAL if f"on_bus_{k}" in state))
-        known = {"waiting", "state", "dropped", *(f"on_bus_{k}" for k in columns)}
+        control = () if self._control is None else ("control",)
+        known = {"waiting", "state", "dropped", *control, *(f"on_bus_{k}" for k in columns)}
         mine = {"waiting": self._waiting, "state": self._state}
         if set(state) != known or any(state[name].shape != array.shape for name, array in mine.items()):
             raise EventDataError("the saved state belongs to another read-out", value=sorted(state))
-        self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])
+        self._waiting[...], self._state[...], self._overrun = state["waiting"], state["state"], int(state["dropped"][0])
+        if self._control is not None:
+            self._control.load_state_dict(state["control"])
         self._on_bus = Events(**{k: state[f"on_bus_{k}"].copy() for k in columns})
 
 
@@ -237,7 +256,8 @@ class EventCamera:
 
     @property
     def dropped(self) -> int:
-        """Return the events that found the read-out's queue full so far."""
+        """Return the events that the read-out has lost so far: the queue was full, or the rate controller took them
+        out."""
         return 0 if self._readout is None else self._readout.dropped
 
     @property

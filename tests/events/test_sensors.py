@@ -193,3 +193,57 @@ def test_a_still_scene_is_as_noisy_as_the_recorded_one():
     on = [np.bincount(pixel, weights=e.p) for e, pixel in halves]
     theirs, ours = (np.corrcoef(k[n > 1], (n - k)[n > 1])[0, 1] for k, n in zip(on, counts, strict=True))
     assert abs(ours - theirs) < 0.2, "ON and OFF events of a pixel: hot ones prefer either"
+
+
+# --- The event rate controller and the region of interest.
+
+
+def _burst(rates_per_period):
+    """Return events of the given numbers in periods of 200 µs, evenly within each."""
+    t = np.concatenate([200 * k + (np.arange(n) * 200) // max(n, 1) for k, n in enumerate(rates_per_period)])
+    x = (np.arange(len(t)) * 7) % 40
+    return Events(x=x.astype(np.uint16), y=(x // 2).astype(np.uint16), t=t.astype(np.int64), p=(x % 2).astype(np.uint8))
+
+
+@pytest.mark.parametrize("chunks", [1, 7, 100])
+def test_the_rate_controller_thins_a_burst_evenly_to_its_target(chunks):
+    """4,000 events in 200 µs are Prophesee's default, 20 million a second; here a hundredth of that."""
+    events = _burst([10, 40, 400, 400, 400, 20, 0, 39, 400])
+    readout = Readout(ReadoutConfig(max_rate=40 / 200e-6))
+    edges = np.linspace(0, len(events), chunks + 1).astype(int)
+    parts = [readout.step(events.part(slice(a, b))) for a, b in itertools.pairwise(edges)]
+    kept = Events.concatenate(parts)
+    counts = np.bincount(kept.t // 200, minlength=9)
+    # Never more than 40; a burst's first period keeps its first 40, later ones every tenth.
+    assert counts.tolist() == [10, 40, 40, 40, 40, 19, 0, 39, 40]
+    assert readout.dropped == len(events) - len(kept)
+    second = kept.t[kept.t // 200 == 3]
+    assert np.diff(second).min() >= 4 and np.diff(second).max() <= 6, "even in time"
+    first = kept.t[kept.t // 200 == 2] - 400
+    assert first.max() < 21
+
+
+def test_a_rate_controller_that_is_never_needed_changes_nothing():
+    events = _burst([30] * 20)
+    kept = Readout(ReadoutConfig(max_rate=30 / 200e-6)).step(events)
+    assert len(kept) == len(events) and (kept.t == events.t).all()
+
+
+def test_a_region_of_interest_switches_the_other_pixels_off():
+    events = _burst([200])
+    kept = Readout(ReadoutConfig(roi=(10, 5, 8, 4))).step(events)
+    inside = (events.x >= 10) & (events.x < 18) & (events.y >= 5) & (events.y < 9)
+    assert len(kept) == inside.sum() > 0 and set(kept.x) == set(events.x[inside])
+    with pytest.raises(ValueError, match="a region without pixels"):
+        ReadoutConfig(roi=(10, 5, 0, 4))
+
+
+def test_the_state_of_a_rate_controller_is_saved_with_the_read_out():
+    events, config = _burst([400] * 6), ReadoutConfig(max_rate=2e5)
+    whole = Readout(config).step(events)
+    first = Readout(config)
+    begun = first.step(events.part(slice(0, 1111)))
+    second = Readout(config)
+    second.load_state_dict(first.state_dict())
+    rest = second.step(events.part(slice(1111, None)))
+    assert (Events.concatenate([begun, rest]).t == whole.t).all() and second.dropped == len(events) - len(whole)

@@ -14,6 +14,10 @@ MAX_IMAGES = 1_000_000
 """File names have six digits."""
 
 
+Bayer = Literal["rggb", "bggr", "grbg", "gbrg"]
+"""Colours of the filters of a 2 x 2 block, row by row."""
+
+
 class LensConfig(Config):
     """A thin lens: a point out of focus is imaged as a disc."""
 
@@ -126,7 +130,7 @@ class ImagesConfig(Config):
     )
     response: Literal["srgb", "gamma", "linear"] = Field("srgb", description="curve from linear light to codes")
     gamma: float = Field(2.2, ge=0.1, le=10, description="for `response: gamma`: code = light ^ (1 / gamma)")
-    bayer: Literal["rggb", "bggr", "grbg", "gbrg"] | None = Field(
+    bayer: Bayer | None = Field(
         None,
         description="one colour per pixel in this pattern (row by row from the top left): one channel, as read out",
     )

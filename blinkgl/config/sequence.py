@@ -19,6 +19,7 @@ from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.optics import OpticsConfig
 from blinkgl.config.over_time import ImuConfig, TracksConfig, check_imu, check_tracks
 from blinkgl.config.quality import DEFAULT, Quality
 from blinkgl.config.readout import ReadoutConfig, drain_us
@@ -226,6 +227,7 @@ class CameraOnRig(NamedTuple):
 _NOT_OF_FRAMES = {
     "sensors": "have only one camera",
     "images": "are already images",
+    "optics": "have come through their own lens",
     "imu": "do not tell where their camera was",
     "tracks": "do not tell where their surfaces are",
 }
@@ -238,6 +240,9 @@ class SequenceConfig(Config):
     output: OutputConfig = Field(OutputConfig(), description="names and number of the sequences")
     camera: CameraConfig = Field(CameraConfig(), description="resolution, intrinsics and lens")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
+    optics: OpticsConfig | None = Field(
+        None, description="lens, point spread and colour filters of the event camera (docs/cameras.md); null: none"
+    )
     quality: Quality | None = Field(
         DEFAULT,
         description="fast, balanced, accurate or reference: sets timeline and render to a measured trade-off of "
@@ -303,7 +308,7 @@ class SequenceConfig(Config):
         preview = self.preview.model_copy(update={"enabled": False})
         return self.model_copy(update={**own, "rig": None, "sensors": None, "preview": preview})
 
-    @rule("?frames", "?sensors", "?images", "?imu", "?tracks")
+    @rule("?frames", "?sensors", "?images", "?optics", "?imu", "?tracks")
     def _frames_have_no_others(frames: bool, *others: bool):
         instead = "null, or a scene instead of frames"
         for (key, problem), there in zip(_NOT_OF_FRAMES.items(), others, strict=True):

@@ -19,6 +19,7 @@ from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate, emulate_beside
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.imaging import FrameCamera
+from blinkgl.imaging.optics import Optics
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
@@ -28,7 +29,7 @@ from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.request import GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.sensor import SensorSimulation
-from blinkgl.tensors.choice import make_on_device
+from blinkgl.tensors.choice import make_on_device, on_device
 from blinkgl.timeline import make_timeline
 from blinkgl.types.events import Events
 
@@ -36,12 +37,24 @@ SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that give the truth of an event."""
 
 
-def drawn(renderer: Renderer, times: Iterable[int], surfaces: bool = False, device: Any = None) -> Iterator[EventFrame]:
+def drawn(
+    renderer: Renderer,
+    times: Iterable[int],
+    surfaces: bool = False,
+    device: Any = None,
+    optics: Optics | None = None,
+) -> Iterator[EventFrame]:
     """Yield the frames of the event pass at ``times``, ns.
     surfaces : with the surface at every pixel.   device : torch's, on which frames are tensors; None: they are
-    arrays."""
+    arrays.   optics : what the light passes; None: nothing."""
     frame = None
     for t_ns in times:
+        if optics is not None:
+            light: Any = optics.light(t_ns)
+            if device is not None:
+                light = on_device(light, device)
+            yield EventFrame(t_ns, light, None, surfaces_at(renderer, t_ns) if surfaces else None)
+            continue
         before, frame = frame, renderer.luminance(t_ns)
         # The emulator skips unchanged rows: with a still camera the cost depends on what moves.
         rows = frame.rows_changed_since(before)
@@ -74,6 +87,7 @@ class RenderedSequence(SensorSimulation):
                 LABELS[name].check(scene, config.labels)
         # A given renderer may have drawn before: its seconds until now do not belong to this sequence.
         self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
+        self._optics = None if config.optics is None else Optics(renderer, config.optics)
         camera, pictures_hz = None, None
         if request.events and of.gives_events:
             pictures_hz = request.pictures_hz
@@ -116,7 +130,8 @@ class RenderedSequence(SensorSimulation):
     def _frames(self) -> Iterator[EventFrame]:
         """Yield the frames of the event pass."""
         assert self.camera is not None and self.timeline is not None
-        return drawn(self.renderer, self.timeline, self.camera.records_truth, self.camera.tensor_device)
+        device = self.camera.tensor_device
+        return drawn(self.renderer, self.timeline, self.camera.records_truth, device, self._optics)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()

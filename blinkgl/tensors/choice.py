@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.events import Emulator, emulator_of, make_emulator
 
 if TYPE_CHECKING:
+    import torch
+
     from blinkgl.gl import GLContext
 
 
@@ -29,3 +33,10 @@ def make_on_device(
     from blinkgl.tensors.emulator import emulator_on
 
     return emulator_on(emulator_of(config), config, height, width, seed)
+
+
+def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """Return a tensor of the array's values on a torch device."""
+    import torch
+
+    return torch.from_numpy(array).to(device)

@@ -131,7 +131,8 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
                 files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]
             ):
                 _note(hashes, f"{without_places(name)}/{paths.name}", content_hash(contents(paths, "panorama")))
-    tree = {} if isinstance(scene, RandomSceneConfig) else scene.model_dump()
+    # A random world has files of its own besides its pools only in its light: trajectories of lamps.
+    tree = scene.light.model_dump() if isinstance(scene, RandomSceneConfig) else scene.model_dump()
     for used in dict.fromkeys([*_values(tree, "file"), *_values(tree, "T_body_sensor")]):
         if isinstance(used, str) and resolve(used, base).is_file():  # a mesh, a trajectory, a clip
             file(resolve(used, base), used)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,25 @@ INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
-NO_FRAME, NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
+_NO_FRAME, _NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
+
+
+class Source(NamedTuple):
+    """The frame of a step for kernels: linear light, or codes of 8 bits with tables of all 256 of them."""
+
+    frame: np.ndarray  # float32, flat; [] where there are codes
+    codes: np.ndarray  # uint8; []
+    table: np.ndarray  # (256,) what the emulator takes of a code
+    signals: np.ndarray  # (256,) a second table: V2E's signal; []
+
+    @classmethod
+    def of(cls, frame: np.ndarray, table: np.ndarray, signals: np.ndarray = _NO_FRAME) -> Source:
+        """Return the source of a flat frame, float32 or uint8."""
+        if frame.dtype == np.uint8:
+            return cls(frame=_NO_FRAME, codes=frame, table=table, signals=signals)
+        return cls(frame=frame, codes=_NO_CODES, table=table, signals=signals)
+
+
 """Used for the kind of frame that was not given."""
 
 

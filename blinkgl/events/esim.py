@@ -24,7 +24,7 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
+from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator, Source
 from blinkgl.events.packing import T_SHIFT, compact_flags, copy_block, lookup_block
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters
 from blinkgl.events.response import Response
@@ -175,7 +175,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
 
 
 @kernel(error_model="numpy")
-def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
+def _band(first_block, stop_block, share, packed, filled, source, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
     # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active``
     # has eight more.
@@ -190,10 +190,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             # The last block is shorter, and compact_flags looks at whole words.
             flags[:] = 0
         # A uint8 frame needs 256 logarithms, which are in the table.
-        if codes.size:
-            lookup_block(codes[s:e], table, now[:n])
+        if source.codes.size:
+            lookup_block(source.codes[s:e], source.table, now[:n])
         else:
-            log_block(frame[s:e], v.eps, now[:n])
+            log_block(source.frame[s:e], v.eps, now[:n])
         farthest = _flag_block(now[:n], p.upper[s:e], p.lower[s:e], flags)
         if farthest >= 0:
             count = compact_flags(flags, scratch, s, active)
@@ -213,14 +213,12 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
 
 
 @kernel(error_model="numpy")
-def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
+def _bands(taken, start, edges, progress, share, packed, source, p, v):
     # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
     # until none is left.
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band(
-            progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v
-        )
+        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], source, p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
@@ -317,10 +315,9 @@ class Esim(Emulator):
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
-        source = (NO_FRAME, frame, self._table) if frame.dtype == np.uint8 else (frame, NO_CODES, self._table)
         levels, interval = self._levels(self._log), self._interval(self.t_ns, t_ns)
         base_us = self.t_ns // 1000
-        return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
+        return self._run(_bands, (Source.of(frame, self._table), levels, interval), base_us, t_ns // 1000 - base_us)
 
     def _levels(self, log: np.ndarray) -> Levels:
         return Levels(

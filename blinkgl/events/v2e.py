@@ -26,7 +26,7 @@ import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
+from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator, Source
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import compact_flags, copy_block, lookup_block, scale_block
@@ -109,7 +109,7 @@ class Interval(NamedTuple):
 
 
 @kernel(error_model="numpy")
-def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
+def _band(first_block, stop_block, share, packed, filled, source, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.x.size
     # Scratch memory of one block. compact_flags writes eight numbers at a time.
@@ -126,11 +126,11 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         # The block's state at the interval's end; z is what the comparator sees. ``p`` is of the frame before.
         intensity, x, lag, noise, z = now[0, :n], now[1, :n], now[2, :n], now[3, :n], now[4, :n]
         # uint8 frames: luminance and lin-log of all 256 codes are in tables.
-        if codes.size:
-            lookup_block(codes[s:e], x_table, x)
-            lookup_block(codes[s:e], table, intensity)
+        if source.codes.size:
+            lookup_block(source.codes[s:e], source.signals, x)
+            lookup_block(source.codes[s:e], source.table, intensity)
         else:
-            scale_block(frame[s:e], v.scale, intensity)
+            scale_block(source.frame[s:e], v.scale, intensity)
             lin_log_block(intensity, x)
         # The low-pass of the photoreceptor.
         if p.lag.size:
@@ -184,14 +184,12 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
 
 
 @kernel(error_model="numpy")
-def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_table, p, v):
+def _bands(taken, start, edges, progress, share, packed, source, p, v):
     # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
     # until none is left.
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band(
-            progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, x_table, p, v
-        )
+        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], source, p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
@@ -369,10 +367,8 @@ class V2e(Emulator):
         )
         interval = self._interval(t_ns)
         base_us = interval.base_us
-        source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
-        events = self._run(
-            _bands, (*source, self._table, self._x_table, pixels, interval), base_us, t_ns // 1000 - base_us
-        )
+        source = Source.of(frame, self._table, self._x_table)
+        events = self._run(_bands, (source, pixels, interval), base_us, t_ns // 1000 - base_us)
         if t_ns - int(self._epoch_ns[0]) >= self._rebase_ns:
             self._begin_leaks_anew(t_ns)
         return events

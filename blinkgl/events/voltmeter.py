@@ -34,7 +34,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig, VoltmeterConfig
-from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
+from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator, Source
 from blinkgl.events.packing import (
     CAUSE_SHIFT,
     T_SHIFT,
@@ -88,6 +88,15 @@ class Pixels(NamedTuple):
     release: np.ndarray  # int64 ns, end of the dead time or NEVER; [] without dead time
     by_light: np.ndarray  # float32: part of V caused by light and leak since it was 0; [] without causes
     by_leak: np.ndarray
+
+
+class Ends(NamedTuple):
+    """State of one block at the interval's end, as in :class:`Pixels`."""
+
+    v: np.ndarray
+    unspent: np.ndarray
+    light: np.ndarray
+    leak: np.ndarray
 
 
 class Interval(NamedTuple):
@@ -190,7 +199,7 @@ def _end_of_part(side, distance, mean, noise, seed, pixel, draw):
 
 
 @kernel(error_model="numpy")
-def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
+def _emit_block(active, first, now, end, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
     voltages.
 
@@ -202,7 +211,8 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
     # row y.
     y = first // v.width
     row_end = (y + 1) * v.width
-    for j in range(count):
+    v_end, unspent_end, light_end, leak_end = end.v, end.unspent, end.light, end.leak
+    for j in range(active.size):
         i = np.int64(active[j])
         while i >= row_end:
             y += 1
@@ -293,7 +303,7 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
 
 
 @kernel(error_model="numpy")
-def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p, v):
+def _band(first_block, stop_block, share, packed, filled, source, p, v):
     """Process the blocks of a band, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.v.size
     # Scratch memory of one block. compact_flags writes eight numbers at a time.
@@ -301,6 +311,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     now, v_end, unspent_end = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
     shares = BLOCK if p.by_light.size else 0
     light_end, leak_end = np.empty(shares, np.float32), np.empty(shares, np.float32)
+    end = Ends(v=v_end, unspent=unspent_end, light=light_end, leak=leak_end)
     for block in range(first_block, stop_block):
         s = block * BLOCK
         e = min(s + BLOCK, pixels)
@@ -308,10 +319,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         if n < BLOCK:
             # compact_flags reads whole words of eight flags.
             flags[:] = 0
-        if codes.size:
-            lookup_block(codes[s:e], table, now[:n])
+        if source.codes.size:
+            lookup_block(source.codes[s:e], source.table, now[:n])
         else:
-            scale_block(frame[s:e], v.scale, now[:n])
+            scale_block(source.frame[s:e], v.scale, now[:n])
         most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], p.unspent[s:e], v, v_end, unspent_end, flags)
         if p.by_light.size:
             _share_block(p.intensity[s:e], now[:n], p.by_light[s:e], p.by_leak[s:e], v, light_end[:n], leak_end[:n])
@@ -326,9 +337,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             # No room for the worst case; nothing of this block has been changed: the caller makes room and repeats it.
             if filled + count * cap > packed.size:
                 return block, filled, cut
-            filled, cut_here = _emit_block(
-                active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
-            )
+            filled, cut_here = _emit_block(active[:count], s, now, end, p, v, cap, packed, filled)
             cut += cut_here
         # The copies come last, because p holds the previous frame until here.
         copy_block(now[:n], p.intensity[s:e])
@@ -341,14 +350,12 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
 
 
 @kernel(error_model="numpy")
-def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
+def _bands(taken, start, edges, progress, share, packed, source, p, v):
     # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
     # until none is left.
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band(
-            progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v
-        )
+        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], source, p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
@@ -429,5 +436,4 @@ class DvsVoltmeter(Emulator):
             refractory_ns=self._refractory_ns,
             bound_per_pixel=dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
         )
-        source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
-        return self._run(_bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)
+        return self._run(_bands, (Source.of(frame, self._table), pixels, interval), base_us, t_ns // 1000 - base_us)

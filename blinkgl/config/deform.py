@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 from blinkgl.config.values import as_pair, ordered
 
 if TYPE_CHECKING:
@@ -177,9 +177,9 @@ class AnimationConfig(Config):
         True, description="true: repeats; false: holds the first pose before it and the last pose after it"
     )
 
-    removed: ClassVar[Any] = {
-        "blend": Removed("one clip; mix two in Blender and export the mixture", lambda value: value is None),
-        "share": Removed("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
+    former: ClassVar[Any] = {
+        "blend": Former("one clip; mix two in Blender and export the mixture", lambda value: value is None),
+        "share": Former("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
     }
 
 

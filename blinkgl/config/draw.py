@@ -281,10 +281,22 @@ def corners(tree: Any) -> Iterator[Any]:
     if not (every := sites(tree)):
         yield tree
         return
-    yield _chosen(tree, (), lambda path, node: options(path, node)[0])
+    varying = {path[:depth] for path in every for depth in range(len(path) + 1)}
+
+    def chosen(node: Any, path: Path, pick: Callable[[Path, dict[str, Any]], Any]) -> Any:
+        if path not in varying:
+            return node
+        if is_distribution(node):
+            return chosen(pick(path, node), path, pick)
+        values = [chosen(child, (*path, step), pick) for step, child in _children(node)]
+        if isinstance(node, dict):
+            return dict(zip(node, values))
+        return values if isinstance(node, list) else node
+
+    yield chosen(tree, (), lambda path, node: options(path, node)[0])
     dealer = _Dealer()
     for _ in range(min(max(LEAST, _EACH * sum(every.values())), MOST)):
-        yield _chosen(tree, (), dealer.deal)
+        yield chosen(tree, (), dealer.deal)
 
 
 class _Dealer:
@@ -302,17 +314,6 @@ class _Dealer:
             self._random.shuffle(deck)
             self._decks[path, id(node)] = deck
         return deck.pop()
-
-
-def _chosen(node: Any, path: Path, pick: Callable[[Path, dict[str, Any]], Any]) -> Any:
-    """Return the node with every distribution replaced by ``pick``'s option; the same object where there is none."""
-    if is_distribution(node):
-        return _chosen(pick(path, node), path, pick)
-    children = _children(node)
-    values = [_chosen(child, (*path, step), pick) for step, child in children]
-    if all(value is child for value, (_, child) in zip(values, children)):
-        return node
-    return dict(zip(node, values)) if isinstance(node, dict) else values
 
 
 def _children(node: Any) -> list[tuple[str, Any]]:

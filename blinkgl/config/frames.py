@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 from blinkgl.config.values import Paths
 
 CURVES = ("srgb", "linear", "pq", "hlg")
@@ -81,12 +81,12 @@ class FramesConfig(Config):
         description="99th percentile of the given flow, px, above which frames are too far apart to interpolate "
         "and their sequence is skipped; null: no check",
     )
-    removed: ClassVar[Any] = {
-        "qualify": Removed("max_displacement", lambda value: value is None or isinstance(value, dict)),
-        "factor": Removed(
+    former: ClassVar[Any] = {
+        "qualify": Former("max_displacement", lambda value: value is None or isinstance(value, dict)),
+        "factor": Former(
             "the key left out: it belonged to interpolate: cubic, which was removed", lambda value: value == 4
         ),
-        "backward": Removed("the key left out: it has no effect", lambda value: value is None),
+        "backward": Former("the key left out: it has no effect", lambda value: value is None),
     }
 
     @rule("gamma")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from blinkgl.config.base import Config, Refused, rule
 
@@ -79,8 +79,6 @@ class ImagesConfig(Config):
         },
     }
 
-    instead: ClassVar[dict[str, str]] = {"times": "rate"}
-
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
         "plain",
         description="gives the other keys the values of a use (docs/cameras.md); keys given beside it override it",
@@ -143,6 +141,12 @@ class ImagesConfig(Config):
         description="further pictures written for each image. sharp: at the middle of the exposure, global "
         "shutter, pinhole, no noise. clean: the same image without noise",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _times_instead_of_a_rate(cls, data: Any) -> Any:
+        """Return the keys with a rate of null beside times: the rate of a preset or the default would contradict."""
+        return {"rate": None, **data} if isinstance(data, dict) and data.get("times") is not None else data
 
     @rule(
         "auto_exposure.shortest_us", "auto_exposure.longest_us", "auto_exposure.max_gain_db", "exposure_us", "gain_db"

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, at_most_one, rule
 
 TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
@@ -55,13 +55,9 @@ class MaterialConfig(Config):
     )
     cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="threshold of the mask; 1 is white or opaque")
 
-    removed: ClassVar[Any] = {"double_sided": Removed("both_sides: true", lambda value: value is False)}
+    former: ClassVar[Any] = {"double_sided": Former("both_sides: true", lambda value: value is False)}
 
-    @rule("texture", "procedural", "photograph")
-    def _one(*sources):
-        given = [k for k, v in zip(("texture", "procedural", "photograph"), sources) if v is not None]
-        if len(given) > 1:
-            raise Refused("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
+    _one = at_most_one("texture", "procedural", "photograph")
 
     @property
     def files(self) -> dict[str, str]:

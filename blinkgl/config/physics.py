@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 from blinkgl.config.trajectory import RateRange, SpeedRange
 from blinkgl.config.values import as_pair, ordered
 
@@ -99,7 +99,7 @@ class BodyConfig(Config):
         (0.0, 0.0, 0.0), description="angular velocity at the start about the world's axes, deg/s"
     )
 
-    removed: ClassVar[Any] = {"shape": Removed("the mesh's own hull, box or ball", lambda value: value == "auto")}
+    former: ClassVar[Any] = {"shape": Former("the mesh's own hull, box or ball", lambda value: value == "auto")}
 
     @rule("kind", "velocity", "spin")
     def _only_what_moves_has_a_velocity(kind, velocity, spin):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 
 _Rate = Annotated[float, Field(ge=0, le=1e4)]
 
@@ -107,9 +107,9 @@ class ReadoutConfig(Config):
     """The bus between pixels and time stamps (:mod:`blinkgl.events.camera`), and before it the pixels' noise
     (:mod:`blinkgl.events.pixels`)."""
 
-    removed: ClassVar[Any] = {
-        "filters": Removed("events filtered after they were written", lambda value: not value),
-        "latency": Removed("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
+    former: ClassVar[Any] = {
+        "filters": Former("events filtered after they were written", lambda value: not value),
+        "latency": Former("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
     }
 
     events_per_second: float | None = Field(

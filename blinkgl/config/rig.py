@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from blinkgl.camera import PinHole
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, at_most_one, rule
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.images import ImagesConfig
@@ -58,19 +58,14 @@ class PlaceConfig(Config):
         "(Kalibr's T_cn_cnm1 is the inverse of a camera's pose relative to the previous one)",
     )
 
-    @rule("euler", "quaternion", "matrix", "position")
-    def _one_place(euler, quaternion, matrix, position):
-        turned = [k for k, v in (("euler", euler), ("quaternion", quaternion), ("matrix", matrix)) if v is not None]
-        if len(turned) > 1:
-            raise Refused("only one of euler, quaternion, matrix may be given, not " + " and ".join(turned))
-        if matrix is not None and any(position):
-            raise Refused("the matrix contains the position", where="position", value=list(position))
-
+    _one_orientation = at_most_one("euler", "quaternion", "matrix")
     _some_rotation = some_rotation
 
-    @rule("matrix")
-    def _rigid(matrix):
+    @rule("matrix", "position")
+    def _whole_place(matrix, position):
         if matrix is not None:
+            if any(position):
+                raise Refused("the matrix contains the position", where="position", value=list(position))
             check_rigid(matrix, "matrix")
 
     @property

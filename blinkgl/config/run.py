@@ -30,7 +30,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.base import Refused, placed, remembering
+from blinkgl.config.base import Refused, placed
 from blinkgl.config.draw import Fill, corners, draw, is_distribution, sites
 from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
@@ -117,8 +117,7 @@ class RunTemplate:
     def corners(self) -> list[SequenceConfig]:
         """Return configurations that represent all that can be drawn (:mod:`blinkgl.config.draw`). Raises
         ConfigError."""
-        with remembering():
-            return [_validated(tree) for tree in corners(with_default(self.tree))]
+        return [_validated(tree) for tree in corners(with_default(self.tree))]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WrapValidator
 
-from blinkgl.config.base import Config, Refused, Removed, one_of, rule
+from blinkgl.config.base import Config, Former, Refused, always, one_of, rule
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.lights import FOG, FogConfig, LightConfig, RandomLightsConfig
 from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, TextureKind
@@ -77,11 +77,11 @@ class PoolConfig(Config):
         description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for others",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
-    removed: ClassVar[Any] = {
-        "urdfs": Removed("folders: [...]", lambda value: value in (False, "auto")),
+    max_file_mb: ClassVar[float] = 512.0
+    former: ClassVar[Any] = {
+        "urdfs": Former("folders: [...]", lambda value: value in (False, "auto")),
+        "max_file_mb": always(max_file_mb),
     }
-    max_file_mb: ClassVar[Any] = 512.0
-    fixed: ClassVar[Any] = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: Literal["auto"] | bool = Field(
         "auto",
@@ -155,9 +155,9 @@ class RegionConfig(Config):
 
     width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
     height: float = Field(8.0, gt=0, le=1e6, description="m")
-    camera_height: ClassVar[Any] = (1.0, 3.5)
+    camera_height: ClassVar[tuple[float, float]] = (1.0, 3.5)
     """Height of the camera's first position above the ground, m; uniform."""
-    fixed: ClassVar[Any] = ("camera_height",)
+    former: ClassVar[Any] = {"camera_height": always(camera_height)}
 
 
 class RandomSceneConfig(Config):
@@ -183,8 +183,8 @@ class RandomSceneConfig(Config):
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
-    removed: ClassVar[Any] = {
-        "walls": Removed(
+    former: ClassVar[Any] = {
+        "walls": Former(
             "scene: {kind: explicit} with objects of category: wall",
             lambda value: value is False or (isinstance(value, dict) and not value.get("count")),
         )
@@ -240,9 +240,9 @@ class MeshConfig(Config):
         description="upward axis of the file, which becomes the world's z: with y, the file's (x, y, z) is drawn "
         "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for others",
     )
-    project_uvs: ClassVar[Any] = False
-    uv_size: ClassVar[Any] = 1.0
-    fixed: ClassVar[Any] = ("project_uvs", "uv_size")
+    uv_size: ClassVar[float] = 1.0
+    """Edge of one repeat of projected texture coordinates, m."""
+    former: ClassVar[Any] = {"project_uvs": always(False), "uv_size": always(uv_size)}
 
     @rule("primitive", "file")
     def _one(primitive, file):
@@ -360,8 +360,8 @@ class ExplicitSceneConfig(Config):
     fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
-    max_faces: ClassVar[Any] = 5_000_000
-    fixed: ClassVar[Any] = ("max_faces",)
+    max_faces: ClassVar[int] = 5_000_000
+    former: ClassVar[Any] = {"max_faces": always(max_faces)}
 
     @rule("objects.*.mesh", "#meshes")
     def _meshes_are_known(used, known):
@@ -427,9 +427,9 @@ class FileSceneConfig(Config):
         description="factor on the file's lights; their lux and candela are divided by 683 lm/W, the factor of "
         "Blender's exporter",
     )
-    max_faces: ClassVar[Any] = 5_000_000
-    max_texture_size: ClassVar[Any] = 2048
-    fixed: ClassVar[Any] = ("max_faces", "max_texture_size")
+    max_faces: ClassVar[int] = 5_000_000
+    max_texture_size: ClassVar[int] = 2048
+    former: ClassVar[Any] = {"max_faces": always(max_faces), "max_texture_size": always(max_texture_size)}
 
     @rule("lights", "light.unlit")
     def _lit(lights, unlit):

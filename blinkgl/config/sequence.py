@@ -11,9 +11,8 @@ import re
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
-from pydantic.fields import FieldInfo
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
@@ -163,8 +162,8 @@ class RenderConfig(Config):
         le=8,
         description="added to the mip level, log2: -1 doubles the sharpness, with more aliasing",
     )
-    removed: ClassVar[Any] = {
-        "lod": Removed(
+    former: ClassVar[Any] = {
+        "lod": Former(
             "meshes that are as fine as you want them drawn",
             lambda value: isinstance(value, dict) and value.get("enabled", False) is False,
         )
@@ -176,9 +175,9 @@ class PreviewConfig(Config):
 
     enabled: bool = Field(True, description="false: no preview")
     rate: float = Field(30.0, gt=0, le=1e4, description="frames per second of simulated time, Hz")
-    slowdown: ClassVar[Any] = 2.0
+    slowdown: ClassVar[float] = 2.0
     """The video plays this many times slower than the simulation."""
-    fixed: ClassVar[Any] = ("slowdown",)
+    former: ClassVar[Any] = {"slowdown": always(slowdown)}
 
 
 def _file_name(name: str) -> str:
@@ -408,10 +407,3 @@ class SequenceConfig(Config):
                 accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
                 "plane's corners: camera.near and camera.fov)",
             )
-
-
-def add_label(name: str, about: str) -> None:
-    """Add a key to ``labels:``, true or false, for a label of a plug-in."""
-    LabelsConfig.model_fields[name] = FieldInfo(annotation=bool, default=False, description=about)
-    for model in (LabelsConfig, RigSensorConfig, SequenceConfig):  # pydantic has frozen the keys of the present ones
-        model.model_rebuild(force=True)

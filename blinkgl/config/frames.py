@@ -10,6 +10,7 @@ from blinkgl.config.base import Config, Former, Refused, rule
 from blinkgl.config.values import Paths
 
 CURVES = ("srgb", "linear", "pq", "hlg")
+ACCEPTED_CURVES = f"{', '.join(CURVES)} or an exponent up to 10"
 FLOW_FORMATS = ("dsec", "kitti", "vkitti2", "tartanair2", "flo", "pfm", "flo5", "npy")
 MAX_SPAN_S = (2**32 - 1) * 1e-6
 """Longest recording of one event file, s: DSEC stores microseconds in 32 bits."""
@@ -92,8 +93,7 @@ class FramesConfig(Config):
     @rule("gamma")
     def _a_curve(gamma: str | float | None):
         if (isinstance(gamma, str) and gamma not in CURVES) or (isinstance(gamma, float) and not 0 < gamma <= 10):
-            accepted = f"{', '.join(CURVES)} or an exponent up to 10"
-            raise Refused("unknown transfer curve", where="gamma", value=gamma, accepted=accepted)
+            raise Refused("unknown transfer curve", where="gamma", value=gamma, accepted=ACCEPTED_CURVES)
 
     @rule("flow_format")
     def _a_format(flow_format: str):

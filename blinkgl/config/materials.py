@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field
 
 from blinkgl.config.base import Config, Former, Refused, at_most_one, rule
 
-TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
+TEXTURE_KINDS: tuple[str, ...] = get_args(TextureKind)
 Radiance = Annotated[float, Field(ge=0, le=1e9)]
 Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
 

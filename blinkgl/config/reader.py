@@ -24,6 +24,7 @@ from yaml.nodes import MappingNode, Node, ScalarNode
 from yaml.resolver import Resolver
 
 from blinkgl.config.draw import is_distribution
+from blinkgl.config.names import shipped_names
 from blinkgl.errors import ConfigError
 
 MAX_BYTES = 4 << 20
@@ -309,13 +310,6 @@ def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Files that ship with the program, by name: runs, and tables of sensors, rigs, quality presets and recipes.
-
-
-@lru_cache
-def shipped_names(kind: str) -> tuple[str, ...]:
-    """Return the sorted names of all tables of a kind, which is a folder of ``blinkgl/configs``."""
-    files = (resources.files("blinkgl.configs") / kind).iterdir()
-    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
 
 
 def shipped(kind: str, name: Any, what: str = "table", where: str = "") -> dict[str, Any]:

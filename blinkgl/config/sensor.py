@@ -30,8 +30,9 @@ from pydantic import AfterValidator, Discriminator, Field, Tag
 from blinkgl.config.base import Config, Refused, placed, rule
 from blinkgl.config.draw import corners, draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.names import shipped_names
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import read_table, shipped, shipped_names
+from blinkgl.config.reader import read_table, shipped
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 

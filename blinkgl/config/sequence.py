@@ -18,6 +18,7 @@ from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.names import shipped_names
 from blinkgl.config.over_time import ImuConfig, TracksConfig, check_imu, check_tracks
 from blinkgl.config.quality import DEFAULT, Quality
 from blinkgl.config.readout import ReadoutConfig, drain_us
@@ -249,9 +250,8 @@ class SequenceConfig(Config):
     render: RenderConfig = Field(RenderConfig(), description="quality of drawing")
     sensor: Sensor | None = Field(
         None,
-        description="davis240c, davis346, dvxplorer, gen31_vga, imx636, or the path of a sensor file (or its "
-        "table): sets camera.width, camera.height, events and readout; keys given beside it override "
-        "it",
+        description=f"{', '.join(shipped_names('sensors'))}, or the path of a sensor file (or its table): sets "
+        "camera.width, camera.height, events and readout; keys given beside it override it",
     )
     events: EmulatorConfig = Field(EsimConfig(), description="event camera model and parameters")
     readout: ReadoutConfig | None = Field(

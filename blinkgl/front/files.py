@@ -194,7 +194,7 @@ def calibrate(
     interpolate : between them, "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their
     times, ms; None: estimated.   starts : of the search.   time_unit, size … : of the recording, as of
     :func:`open_events`.   Raises AssetError, EventDataError, ConfigError."""
-    from blinkgl.front.sections import events_tree
+    from blinkgl.front.sections import section_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
     from blinkgl.recordings.decoding import Codes
@@ -215,7 +215,7 @@ def calibrate(
         check.path(recording, "recording"),
         None if frames is None else check.path(frames, "frames"),
         understood,
-        emulator=events_tree(emulator),
+        emulator=section_tree("emulator", emulator),
         fixed=keys,
         still=bool(still),
         declared=_declared(reading, "frames_time_unit"),
@@ -331,11 +331,11 @@ def _options(
 ) -> tuple[FrameUse, dict[str, Any]]:
     """Return the conversion of frames to light, and the other arguments of :func:`frames_to_events`."""
     from blinkgl.config.sensor import load_sensor
-    from blinkgl.front.sections import events_tree
+    from blinkgl.front.sections import section_tree
     from blinkgl.recordings import simulation
     from blinkgl.recordings.decoding import Codes
 
-    tree = events_tree(emulator)
+    tree = section_tree("emulator", emulator)
     camera = None if sensor is None else load_sensor(sensor)
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}

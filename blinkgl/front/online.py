@@ -6,7 +6,9 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from blinkgl.config.problems import validate_field
 from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import OutputConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import load
@@ -84,8 +86,7 @@ class OnlineSequences(Closing):
         rank = check.whole(share.rank, "rank", 0, world - 1)
         if kind not in CUTS:
             raise ConfigError("unknown kind", where="kind", value=kind, accepted=", ".join(CUTS))
-        if split not in ("train", "test"):
-            raise ConfigError("unknown split", where="split", value=split, accepted="train, test")
+        validate_field(OutputConfig, "split", split)
         job = StreamJob(
             out="",
             base="",

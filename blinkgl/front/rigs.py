@@ -26,7 +26,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.poses import Piece, Vector
 from blinkgl.front.scenes import Camera
-from blinkgl.front.sections import SECTIONS, Section, sections
+from blinkgl.front.sections import Section, sections
 
 
 class RigSensor(Piece):
@@ -66,7 +66,7 @@ class RigSensor(Piece):
             matrix = check.array(matrix, "RigSensor.matrix", (4, 4), "an array (4, 4) of numbers, T_rig_sensor")
         place = check.given(position=position, euler=euler, quaternion=quaternion, matrix=matrix)
         given = dict(emulator=emulator, sensor=sensor, labels=labels, images=images, imu=imu, tracks=tracks)
-        tree = {**check.given(name=name, pair=pair), **sections(SECTIONS, given)}
+        tree = {**check.given(name=name, pair=pair), **sections(given)}
         tree["place"] = self._checked(PlaceConfig, place)
         if camera is not None:
             tree["camera"] = _camera_tree(camera)

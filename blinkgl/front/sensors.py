@@ -55,8 +55,8 @@ DvsVoltmeter.__doc__ = (
 
 @check.public()
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
-    """Return the values of an included camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
-    (case and punctuation do not matter), or of a sensor file by its path.
+    """Return the values of an included camera, by its name in docs/sensors.md (case and punctuation do not matter), or
+    of a sensor file by its path.
 
     ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …, None if the
     file does not contain it; ``values("v2e")`` gives an emulator's keys.

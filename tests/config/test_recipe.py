@@ -13,8 +13,8 @@ from scipy.stats import kstest
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.config.expansion import load_recipe
+from blinkgl.config.names import shipped_names
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import shipped_names
 from blinkgl.config.run import load_run
 from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan

@@ -91,18 +91,9 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
     return [(name or "all", here[name], count - apart[name]) for name, count in found.plan.counts.items()]
 
 
-def _example(e: Example) -> dict[str, Any]:
-    first = (
-        ("frame", e.image),
-        ("events: ON blue, OFF red", e.events),
-        ("flow: hue is direction, saturation speed", e.flow),
-    )
-    pictures = (*first, *e.others)
-    return {
-        "name": e.name,
-        "caption": e.caption,
-        "pictures": [(label, None if array is None else png(_small(array))) for label, array in pictures],
-    }
+def _example(example: Example) -> dict[str, Any]:
+    pictures = [(title, png(_small(array))) for title, array in example.pictures]
+    return {"name": example.name, "caption": example.caption, "pictures": pictures}
 
 
 def _distributions(q: dict[str, np.ndarray]) -> list[tuple]:

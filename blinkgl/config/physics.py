@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Former, Refused, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 from blinkgl.config.trajectory import RateRange, SpeedRange
 from blinkgl.config.values import as_pair, ordered
 
@@ -71,7 +71,7 @@ class RandomPhysicsConfig(PhysicsConfig):
     density: _range_of(_Density) = Field((100.0, 2000.0), description="kg/m³: a number or [low, high]; log-uniform")
     friction: _range_of(_Friction) = Field((0.2, 0.9), description="a number or [low, high]; uniform")
     restitution: _range_of(_Restitution) = Field((0.1, 0.8), description="a number or [low, high]; uniform")
-    rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, as a fraction of a body's radius")
+    former: ClassVar[Any] = {"rolling": always(0.01)}
 
 
 class BodyConfig(Config):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Former, Refused, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 
 _Rate = Annotated[float, Field(ge=0, le=1e4)]
 
@@ -93,14 +93,10 @@ class FrameResetsConfig(Config):
     kick: float = Field(
         gt=0, le=5, description="Height of the jump, in units of the smaller of the emulator's ON and OFF thresholds."
     )
-    length_ms: float = Field(1.0, gt=0, le=1000, description="Time until the signal has returned, ms.")
+    length_ms: ClassVar[float] = 1.0
+    """Time until the signal has returned, ms; shorter than any interval."""
+    former: ClassVar[Any] = {"length_ms": always(length_ms)}
     first_ms: float = Field(0.0, ge=0, le=10_000, description="Time of the first reset after the first frame, ms.")
-
-    @rule("interval_ms", "length_ms")
-    def _over_before_the_next(interval: float, length: float):
-        if length + 1 > interval:
-            raise Refused("the jump does not end before the next one", where="length_ms", value=length,
-                          accepted=f"at most {interval - 1:g}, a millisecond less than interval_ms")  # fmt: skip
 
 
 class ReadoutConfig(Config):

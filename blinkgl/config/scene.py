@@ -115,11 +115,10 @@ class TexturesConfig(Config):
 class SkyConfig(Config):
     """Textured box around the scene, seen from inside, unlit."""
 
-    kind: Literal["box"] = "box"
     size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
-    subdivisions: int = Field(
-        4, ge=1, le=256, description="cells per edge; 1 loses a third of the flow's precision, more than 4 gains none"
-    )
+    subdivisions: ClassVar[int] = 4
+    """Cells per edge; 1 loses a third of the flow's precision, more than 4 gains none."""
+    former: ClassVar[Any] = {"kind": always("box"), "subdivisions": always(subdivisions)}
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
     per_face: bool = Field(True, description="true: one texture per face; false: one for all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
@@ -142,11 +141,11 @@ class SkyConfig(Config):
 
 
 class GroundConfig(Config):
-    """Textured square at a constant height."""
+    """Textured square at z = 0, as wide as the sky."""
 
-    size: float | None = Field(None, gt=0, le=1e6, description="edge length, m; null: that of the sky box")
-    height: float = Field(0.0, description="z of the ground, m")
-    subdivisions: int = Field(8, ge=1, le=1024, description="cells per edge; more gains no precision and costs time")
+    subdivisions: ClassVar[int] = 8
+    """Cells per edge; more gains no precision and costs time."""
+    former: ClassVar[Any] = {"size": always(None), "height": always(0), "subdivisions": always(subdivisions)}
     tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
 
 

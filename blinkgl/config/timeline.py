@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Former, Refused, one_of, rule
+from blinkgl.config.base import Config, Former, Refused, always, one_of, rule
 
 _NO_RECONSTRUCTION = {
     "reconstruction": Former(
@@ -79,12 +79,9 @@ class BrightnessTimeline(_AdaptiveTimeline):
     pixels."""
 
     kind: Literal["brightness"] = "brightness"
-    sample_every: int = Field(
-        4,
-        ge=1,
-        le=64,
-        description="the step is chosen from a small picture with every n-th pixel in x and y; 1: all",
-    )
+    sample_every: ClassVar[int] = 4
+    """The step is chosen from a small picture with every n-th pixel in x and y."""
+    former: ClassVar[Any] = {**_NO_RECONSTRUCTION, "sample_every": always(sample_every)}
     max_fraction_of_threshold: float = Field(
         1.0,
         gt=0,

@@ -54,7 +54,7 @@ def signed_by(model: type[Config], **called: str) -> Callable[[type[P]], type[P]
     called : argument names of the model's keys."""
 
     def sign(kind: type[P]) -> type[P]:
-        kind._called = called
+        kind._called = called  # noqa: SLF001 - of the class that it decorates
         own = [p for p in inspect.signature(kind.__init__).parameters.values() if p.name not in ("self", "keys")]
         there = {parameter.name for parameter in own}
         more = [

@@ -6,7 +6,7 @@ Lengths are fractions of the mesh's size, so that one setting suits any mesh. Th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -177,7 +177,7 @@ class AnimationConfig(Config):
         True, description="true: repeats; false: holds the first pose before it and the last pose after it"
     )
 
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         "blend": Former("one clip; mix two in Blender and export the mixture", lambda value: value is None),
         "share": Former("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
     }

@@ -277,7 +277,7 @@ class V2eConfig(_TwoThresholds):
 
     presets = V2E_PRESETS
     fitted = _V2E_FITTED
-    former: ClassVar[Any] = {**_NO_COMPAT, **_NO_CORRELATION, **_NO_SECOND_CORNER}
+    former: ClassVar[dict[str, Former]] = {**_NO_COMPAT, **_NO_CORRELATION, **_NO_SECOND_CORNER}
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."

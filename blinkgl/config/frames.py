@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -82,7 +82,7 @@ class FramesConfig(Config):
         description="99th percentile of the given flow, px, above which frames are too far apart to interpolate "
         "and their sequence is skipped; null: no check",
     )
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         "qualify": Former("max_displacement", lambda value: value is None or isinstance(value, dict)),
         "factor": Former(
             "the key left out: it belonged to interpolate: cubic, which was removed", lambda value: value == 4

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from blinkgl.config.base import Config, Refused, always, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 
 NS_PER_S, NS_PER_US = 1_000_000_000, 1000
 MAX_IMAGES = 1_000_000
@@ -32,7 +32,7 @@ class AutoExposureConfig(Config):
     )
     shortest_us: ClassVar[float] = 20.0
     """Shortest exposure, µs."""
-    former: ClassVar[Any] = {"shortest_us": always(shortest_us)}
+    former: ClassVar[dict[str, Former]] = {"shortest_us": always(shortest_us)}
     longest_us: float = Field(20000.0, ge=shortest_us, le=1e9, description="longest exposure, µs; the shortest is 20")
     max_gain_db: float = Field(24.0, ge=0, le=60, description="highest gain, dB")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -82,7 +82,9 @@ class EnvironmentConfig(Config):
     )
     heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn as a sky at infinity")
-    former: ClassVar[Any] = {"size": Former("the key left out: a panorama is at infinity", lambda value: value == 100)}
+    former: ClassVar[dict[str, Former]] = {
+        "size": Former("the key left out: a panorama is at infinity", lambda value: value == 100)
+    }
 
 
 class LightConfig(Config):
@@ -158,7 +160,7 @@ class RandomLightsConfig(Config):
     """Strength of further suns; log-uniform."""
     saturation: ClassVar[float] = 0.5
     """Largest saturation of a colour; the brightest channel is 1 and all hues are equally likely."""
-    former: ClassVar[Any] = {"sun_strength": always(sun_strength), "saturation": always(saturation)}
+    former: ClassVar[dict[str, Former]] = {"sun_strength": always(sun_strength), "saturation": always(saturation)}
     height: PositiveRange = Field((2.0, 6.0), description="above the ground, m; uniform")
     angle: PositiveRange = Field((30.0, 100.0), description="angle of a spot light's cone, degrees; uniform")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import Field
 
@@ -55,7 +55,7 @@ class MaterialConfig(Config):
     )
     cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="threshold of the mask; 1 is white or opaque")
 
-    former: ClassVar[Any] = {"double_sided": Former("both_sides: true", lambda value: value is False)}
+    former: ClassVar[dict[str, Former]] = {"double_sided": Former("both_sides: true", lambda value: value is False)}
 
     _one = at_most_one("texture", "procedural", "photograph")
 

@@ -4,7 +4,7 @@ clock, in this order. Parts that are not given are absent."""
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -95,7 +95,7 @@ class FrameResetsConfig(Config):
     )
     length_ms: ClassVar[float] = 1.0
     """Time until the signal has returned, ms; shorter than any interval."""
-    former: ClassVar[Any] = {"length_ms": always(length_ms)}
+    former: ClassVar[dict[str, Former]] = {"length_ms": always(length_ms)}
     first_ms: float = Field(0.0, ge=0, le=10_000, description="Time of the first reset after the first frame, ms.")
 
 
@@ -103,7 +103,7 @@ class ReadoutConfig(Config):
     """The bus between pixels and time stamps (:mod:`blinkgl.events.camera`), and before it the pixels' noise
     (:mod:`blinkgl.events.pixels`)."""
 
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         "filters": Former("events filtered after they were written", lambda value: not value),
         "latency": Former("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
     }

@@ -7,7 +7,7 @@ models define only shapes, units and limits.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WrapValidator
 
@@ -78,7 +78,7 @@ class PoolConfig(Config):
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
     max_file_mb: ClassVar[float] = 512.0
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         "urdfs": Former("folders: [...]", lambda value: value in (False, "auto")),
         "max_file_mb": always(max_file_mb),
     }
@@ -118,7 +118,7 @@ class SkyConfig(Config):
     size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
     subdivisions: ClassVar[int] = 4
     """Cells per edge; 1 loses a third of the flow's precision, more than 4 gains none."""
-    former: ClassVar[Any] = {"kind": always("box"), "subdivisions": always(subdivisions)}
+    former: ClassVar[dict[str, Former]] = {"kind": always("box"), "subdivisions": always(subdivisions)}
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
     per_face: bool = Field(True, description="true: one texture per face; false: one for all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
@@ -145,7 +145,11 @@ class GroundConfig(Config):
 
     subdivisions: ClassVar[int] = 8
     """Cells per edge; more gains no precision and costs time."""
-    former: ClassVar[Any] = {"size": always(None), "height": always(0), "subdivisions": always(subdivisions)}
+    former: ClassVar[dict[str, Former]] = {
+        "size": always(None),
+        "height": always(0),
+        "subdivisions": always(subdivisions),
+    }
     tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
 
 
@@ -156,7 +160,7 @@ class RegionConfig(Config):
     height: float = Field(8.0, gt=0, le=1e6, description="m")
     camera_height: ClassVar[tuple[float, float]] = (1.0, 3.5)
     """Height of the camera's first position above the ground, m; uniform."""
-    former: ClassVar[Any] = {"camera_height": always(camera_height)}
+    former: ClassVar[dict[str, Former]] = {"camera_height": always(camera_height)}
 
 
 class RandomSceneConfig(Config):
@@ -182,7 +186,7 @@ class RandomSceneConfig(Config):
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         "walls": Former(
             "scene: {kind: explicit} with objects of category: wall",
             lambda value: value is False or (isinstance(value, dict) and not value.get("count")),
@@ -241,7 +245,7 @@ class MeshConfig(Config):
     )
     uv_size: ClassVar[float] = 1.0
     """Edge of one repeat of projected texture coordinates, m."""
-    former: ClassVar[Any] = {"project_uvs": always(False), "uv_size": always(uv_size)}
+    former: ClassVar[dict[str, Former]] = {"project_uvs": always(False), "uv_size": always(uv_size)}
 
     @rule("primitive", "file")
     def _one(primitive, file):
@@ -360,7 +364,7 @@ class ExplicitSceneConfig(Config):
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
     max_faces: ClassVar[int] = 5_000_000
-    former: ClassVar[Any] = {"max_faces": always(max_faces)}
+    former: ClassVar[dict[str, Former]] = {"max_faces": always(max_faces)}
 
     @rule("objects.*.mesh", "#meshes")
     def _meshes_are_known(used, known):
@@ -428,7 +432,7 @@ class FileSceneConfig(Config):
     )
     max_faces: ClassVar[int] = 5_000_000
     max_texture_size: ClassVar[int] = 2048
-    former: ClassVar[Any] = {"max_faces": always(max_faces), "max_texture_size": always(max_texture_size)}
+    former: ClassVar[dict[str, Former]] = {"max_faces": always(max_faces), "max_texture_size": always(max_texture_size)}
 
     @rule("lights", "light.unlit")
     def _lit(lights, unlit):

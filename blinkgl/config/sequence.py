@@ -163,7 +163,7 @@ class RenderConfig(Config):
         le=8,
         description="added to the mip level, log2: -1 doubles the sharpness, with more aliasing",
     )
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         "lod": Former(
             "meshes that are as fine as you want them drawn",
             lambda value: isinstance(value, dict) and value.get("enabled", False) is False,
@@ -178,7 +178,7 @@ class PreviewConfig(Config):
     rate: float = Field(30.0, gt=0, le=1e4, description="frames per second of simulated time, Hz")
     slowdown: ClassVar[float] = 2.0
     """The video plays this many times slower than the simulation."""
-    former: ClassVar[Any] = {"slowdown": always(slowdown)}
+    former: ClassVar[dict[str, Former]] = {"slowdown": always(slowdown)}
 
 
 def _file_name(name: str) -> str:

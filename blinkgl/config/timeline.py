@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -18,7 +18,7 @@ _NO_RECONSTRUCTION = {
 
 
 class _Timeline(Config):
-    former: ClassVar[Any] = _NO_RECONSTRUCTION
+    former: ClassVar[dict[str, Former]] = _NO_RECONSTRUCTION
 
 
 class UniformTimeline(_Timeline):
@@ -49,7 +49,7 @@ class DisplacementTimeline(_AdaptiveTimeline):
     """Event frames between which surfaces move at most ``max_px``, everywhere in the step: by the speeds of the scene's
     geometry in the picture, hidden surfaces included."""
 
-    former: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         **_NO_RECONSTRUCTION,
         "sample_every": Former("the key left out: no picture is drawn for the step", lambda value: True),
         "first_look": Former("the key left out, or quality: fast for fewer frames", lambda value: value is False),
@@ -81,7 +81,7 @@ class BrightnessTimeline(_AdaptiveTimeline):
     kind: Literal["brightness"] = "brightness"
     sample_every: ClassVar[int] = 4
     """The step is chosen from a small picture with every n-th pixel in x and y."""
-    former: ClassVar[Any] = {**_NO_RECONSTRUCTION, "sample_every": always(sample_every)}
+    former: ClassVar[dict[str, Former]] = {**_NO_RECONSTRUCTION, "sample_every": always(sample_every)}
     max_fraction_of_threshold: float = Field(
         1.0,
         gt=0,

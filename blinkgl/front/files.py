@@ -25,15 +25,6 @@ if TYPE_CHECKING:
 _SIDE = 65535
 
 
-def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
-    from blinkgl.config.sensor import load_sensor
-
-    if sensor is None:
-        return None
-    camera = load_sensor(sensor)
-    return camera.height, camera.width
-
-
 @check.public()
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
@@ -266,7 +257,7 @@ def simulate(
         raise ConfigError(
             "not frames", where="frames", value=frames, accepted="an iterable of arrays; of a file, simulate_file"
         )
-    use, options = _options(**frame_options)
+    use, options, _ = _options(**frame_options)
     if unit not in ("ns", "us", "ms", "s"):
         raise ConfigError("unknown unit of time", where="unit", value=unit, accepted="s, ms, us or ns")
     return simulation.frames_to_events(_frames(frames), use, unit=unit, report=report, **options)
@@ -299,7 +290,7 @@ def simulate_file(
     notes on what was left out … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
-    use, options = _options(**frames)
+    use, options, sensor_size = _options(**frames)
     given: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
     given |= {"stream": stream, "damaged": damaged}
     options = {key: options[key] for key in ("emulator", "seed", "readout")}
@@ -307,7 +298,7 @@ def simulate_file(
         check.path(source, "source"),
         check.path(target, "target"),
         declared=_declared(given),
-        size=_sensor_size(frames.get("sensor")) if size is None else checked_size(size),
+        size=sensor_size if size is None else checked_size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
         use=use,
@@ -328,17 +319,14 @@ def _options(
     keep_noise: bool = False,
     seed: int = 0,
     sensor: str | None = None,
-) -> tuple[FrameUse, dict[str, Any]]:
-    """Return the conversion of frames to light, and the other arguments of :func:`frames_to_events`."""
-    from blinkgl.config.sensor import load_sensor
+) -> tuple[FrameUse, dict[str, Any], tuple[int, int] | None]:
+    """Return the conversion of frames to light, the other arguments of :func:`frames_to_events`, and the sensor's
+    height and width, px."""
     from blinkgl.front.sections import section_tree
     from blinkgl.recordings import simulation
     from blinkgl.recordings.decoding import Codes
 
-    tree = section_tree("emulator", emulator)
-    camera = None if sensor is None else load_sensor(sensor)
-    if camera is not None:
-        tree = {**camera.values(tree.get("emulator", "esim")), **tree}
+    chosen, camera = simulation.with_sensor(section_tree("emulator", emulator), sensor)
     declared = _declared({"white_level": white_level, "range": range, "fps": fps})
     use = simulation.FrameUse(
         Codes(gamma, declared.white_level, declared.range, simulation.own_frames(camera)),
@@ -346,13 +334,14 @@ def _options(
         check.number(max_px, "max_px", above=0, most=1e4),
         bool(keep_noise),
     )
-    return use, dict(
+    options = dict(
         fps=declared.fps,
         zero_time=bool(zero_time),
-        emulator=simulation.emulator_config(tree),
+        emulator=chosen,
         seed=check.seed(seed),
         readout=None if camera is None else camera.readout,
     )
+    return use, options, None if camera is None else (camera.height, camera.width)
 
 
 def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:

@@ -88,7 +88,7 @@ def _emulator(
 ) -> _Fitted:
     gamma, *said = (options.pop(key) for key in ("gamma", "interpolate", "max_px", "frame_delay_ms"))
     options["declared"] = Declared(**options.pop("declared"))
-    base = emulator_options(emulator, None, overrides, sensor)["emulator"]
+    base, _ = emulator_options(emulator, None, overrides, sensor)
     fixed = [item.partition("=")[0].strip() for item in overrides]
     result = calibrate(recording, frames, FrameReading(Codes(gamma), *said), emulator=base, fixed=fixed, **options)
     heads = ("", "recorded", "before", "fitted", "recorded, other half", "before", "fitted")

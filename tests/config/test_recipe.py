@@ -285,8 +285,8 @@ def test_what_is_no_recipe(tmp_path):
 
 
 def test_a_video_takes_the_middle():
-    data = emulator_options("esim", None, ["recipe=etap"])["emulator"]
-    assert data["contrast_threshold"] == pytest.approx(0.25)
+    emulator, _ = emulator_options("esim", None, ["recipe=etap"])
+    assert emulator.contrast_threshold == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("model", [EsimConfig, V2eConfig])

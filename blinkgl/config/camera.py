@@ -141,6 +141,20 @@ def camera_radius(camera: CameraModel, clearance: float) -> float:
     return max(clearance, 1.01 * camera.near_corner)
 
 
+def room_for(camera: CameraModel, clearance: float, height: float) -> float:
+    """Return :func:`camera_radius` in a random world's region of this height, m. Raises Refused for a lower one."""
+    least = camera_radius(camera, clearance)
+    if least > height:
+        raise Refused(
+            "the region is too low for the camera's clearance",
+            where="scene.region.height",
+            value=height,
+            accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near plane's corners: "
+            "camera.near and camera.fov)",
+        )
+    return least
+
+
 def calibrated(camera: Any, base: Path) -> Any:
     """Return a ``camera:`` table with its calibration, read from ``base``, replaced by the calibration's keys. A table
     without a calibration is returned unchanged. Raises ConfigError."""

@@ -319,9 +319,9 @@ class ObjectConfig(KeyedMotionConfig):
             )
 
 
-def _known(used, known, key: str, table: str, at=None) -> None:
-    for number, name in zip(at if at is not None else range(len(used)), used):
-        if name not in known:
+def _known(used: tuple[str | None, ...], known: tuple[str, ...], key: str, table: str) -> None:
+    for number, name in enumerate(used):
+        if name is not None and name not in known:
             raise Refused(
                 f"no such name under {table}",
                 where=f"objects.{number}.{key}",
@@ -367,7 +367,7 @@ class ExplicitSceneConfig(Config):
     former: ClassVar[dict[str, Former]] = {"max_faces": always(max_faces)}
 
     @rule("objects.*.mesh", "#meshes")
-    def _meshes_are_known(used, known):
+    def _meshes_are_known(used: tuple[str, ...], known: tuple[str, ...]):
         _known(used, known, "mesh", "scene.meshes")
 
     @rule("?physics", "objects.*.physics.kind")
@@ -391,14 +391,8 @@ class ExplicitSceneConfig(Config):
         object_names(names, meshes)
 
     @rule("objects.*.material", "#materials")
-    def _materials_are_known(used, known):
-        _known(
-            [name for name in used if name is not None],
-            known,
-            "material",
-            "scene.materials",
-            at=[k for k, n in enumerate(used) if n is not None],
-        )
+    def _materials_are_known(used: tuple[str | None, ...], known: tuple[str, ...]):
+        _known(used, known, "material", "scene.materials")
 
 
 class FileSceneConfig(Config):

@@ -156,15 +156,8 @@ def sensor_table(name: Any) -> dict[str, Any]:
     """Return a copy of a sensor file's table, distributions included. Raises ConfigError as :func:`load_sensor`."""
     if is_sensor_file(name):
         return read_table(name, "a sensor: name, width, height, ...")
-    known = known_sensor(name)
-    if known is None:
-        raise ConfigError(
-            "unknown sensor",
-            where="sensor",
-            value=name,
-            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
-        )
-    return shipped("sensors", known)
+    with placed("sensor"):
+        return shipped("sensors", known_sensor(_sensor(name)))
 
 
 def is_sensor_file(name: Any) -> bool:
@@ -216,7 +209,7 @@ def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
     return said if camera.readout is None else {**said, "readout": camera.readout.model_dump()}
 
 
-def _sensor(name: str) -> str:
+def _sensor(name: Any) -> Any:
     if known_sensor(name) is None:
         raise Refused(
             "unknown sensor",

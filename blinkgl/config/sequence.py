@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Former, Refused, always, rule
-from blinkgl.config.camera import CameraConfig, camera_radius
+from blinkgl.config.camera import CameraConfig, room_for
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
@@ -395,15 +395,6 @@ class SequenceConfig(Config):
             check_images(rate, times, lasts, readout_us(height, row_us), start, count / label_rate)
 
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
-    def _room_for_the_camera(kind, height, clearance, camera):
-        if kind != "random":
-            return
-        least = camera_radius(camera.model, clearance)
-        if least > height:
-            raise Refused(
-                "the region is too low for the camera's clearance",
-                where="scene.region.height",
-                value=height,
-                accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
-                "plane's corners: camera.near and camera.fov)",
-            )
+    def _room_for_the_camera(kind: str, height: float, clearance: float, camera: CameraConfig):
+        if kind == "random":
+            room_for(camera.model, clearance, height)

@@ -17,7 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.camera import camera_radius
+from blinkgl.config.base import placed
+from blinkgl.config.camera import room_for
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import RandomSceneConfig, SkyConfig
@@ -69,17 +70,18 @@ def random_world(
     omissions: dict[str, None] = {}
 
     T_cam, target = _viewpoint(config, rng)
-    clearance = _clearance(config, camera)
+    with placed(str):
+        clearance = room_for(camera, config.camera_clearance, config.region.height)
     backdrop, panorama = _backdrop(config, textures, rng, rng_texture, split, base, log)
     items: list[_Item] = [(name, category, parts, StaticPath(T, t0_ns, t1_ns)) for name, category, parts, T in backdrop]
 
     dice = rng, rng_texture, rng_shape
-    placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, log, omissions)
+    placements = _place(config, camera, objects, textures, dice, split, T_cam, clearance, log, omissions)
     # Objects with their own motion are not thrown.
-    lifeless = [one.name for one in placed if gait(one.parts)[0] == "free"]
+    lifeless = [one.name for one in placements if gait(one.parts)[0] == "free"]
     bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
-    room = _Room(config, placed, T_cam, clearance)
-    for k, one in enumerate(placed):
+    room = _Room(config, placements, T_cam, clearance)
+    for k, one in enumerate(placements):
         path = (
             StaticPath(one.pose, t0_ns, t1_ns)
             if one.name in bodies
@@ -108,20 +110,6 @@ def random_world(
         omissions=tuple(omissions),
         dynamics=dynamics,
     )
-
-
-def _clearance(config: RandomSceneConfig, camera: CameraModel) -> float:
-    """Return the distance that everything keeps from the camera. Raises ConfigError: the region is too small for it."""
-    clearance = camera_radius(camera, config.camera_clearance)
-    if clearance > config.region.height:
-        raise ConfigError(
-            "the region is too low for the camera's clearance",
-            where="scene.region.height",
-            value=config.region.height,
-            accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
-            "distance of the near plane's corners: camera.near and camera.fov)",
-        )
-    return clearance
 
 
 class _Placed(NamedTuple):

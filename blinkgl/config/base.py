@@ -56,16 +56,16 @@ def placed(
     kind: type[Any] = ConfigError,
     *,
     of: tuple[type[Any], ...] = (Refused, ConfigError),
-    said: str = "",
+    before: str = "",
 ) -> Iterator[None]:
     """Raise the errors ``of`` the code inside as a ``kind`` of error at another place.
 
-    where : the place, or what makes it of the place there.   said : what comes before the problem."""
+    where : the place, or what makes it of the place there.   before : what comes before the problem."""
     try:
         yield
     except of as error:
         place = where if isinstance(where, str) else where(error.where or "")
-        raise kind(said + error.problem, where=place, value=error.value, accepted=error.accepted) from None
+        raise kind(before + error.problem, where=place, value=error.value, accepted=error.accepted) from None
 
 
 @dataclass(frozen=True)

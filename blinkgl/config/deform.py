@@ -35,8 +35,8 @@ class DeformConfig(Config):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         """Draw a deformer of this kind for a random world. strength : of the motion, 1: the defaults.   period : s."""
-        given = {"period": period, "phase": float(rng.uniform(-180, 180))}
-        return cls(**{key: value for key, value in given.items() if key in cls.model_fields})
+        keys = {"period": period, "phase": float(rng.uniform(-180, 180))}
+        return cls(**{key: value for key, value in keys.items() if key in cls.model_fields})
 
 
 def _two_axes(rng: np.random.Generator) -> tuple[str, str]:
@@ -56,9 +56,9 @@ class _Waving(DeformConfig):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         (along, towards), wavelength = _two_axes(rng), float(rng.uniform(*cls.wavelengths))
-        given = super().drawn(rng, strength, period).model_dump()
+        keys = super().drawn(rng, strength, period).model_dump()
         amplitude = min(cls.model_fields["amplitude"].default * strength, 1.0)
-        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+        return cls(**keys | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
 
 
 class WaveConfig(_Waving):
@@ -114,8 +114,8 @@ class TwistConfig(DeformConfig):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         along, held = "xyz"[rng.integers(3)], float(rng.random())
-        given = super().drawn(rng, strength, period).model_dump()
-        return cls(**given | {"along": along, "held": held, "angle": min(60.0 * strength, 720.0)})
+        keys = super().drawn(rng, strength, period).model_dump()
+        return cls(**keys | {"along": along, "held": held, "angle": min(60.0 * strength, 720.0)})
 
 
 class BendConfig(DeformConfig):
@@ -136,8 +136,8 @@ class BendConfig(DeformConfig):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         (along, towards), held = _two_axes(rng), float(rng.random())
-        given = super().drawn(rng, strength, period).model_dump()
-        return cls(**given | {"along": along, "towards": towards, "held": held, "angle": min(35.0 * strength, 180.0)})
+        keys = super().drawn(rng, strength, period).model_dump()
+        return cls(**keys | {"along": along, "towards": towards, "held": held, "angle": min(35.0 * strength, 180.0)})
 
 
 class BreatheConfig(DeformConfig):

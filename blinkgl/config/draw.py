@@ -205,13 +205,13 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
 
 def _share_at(u: float, spec: list[dict[str, Any]]) -> Any:
     """Return the value whose part of [0, 1) contains u."""
-    given = [part for part in spec if _number(part["share"]) > 0]
+    parts = [part for part in spec if _number(part["share"]) > 0]
     upper = 0.0
-    for part in given:
+    for part in parts:
         upper += _number(part["share"])
         if u < upper:
             return part["value"]
-    return given[-1]["value"]
+    return parts[-1]["value"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -259,20 +259,20 @@ def _lay(under: Any, over: Any) -> Any:
 def sites(tree: Any) -> dict[Path, int]:
     """Return the paths of all distributions and their numbers of options, outermost first, including those inside the
     choices of others. Raises ConfigError for a bad one."""
-    found: dict[Path, int] = {}
+    counts: dict[Path, int] = {}
 
     def walk(node: Any, path: Path) -> None:
         if is_distribution(node):
-            given = options(path, node)
-            found[path] = found.get(path, 0) + len(given)
-            for option in given:
+            drawn = options(path, node)
+            counts[path] = counts.get(path, 0) + len(drawn)
+            for option in drawn:
                 walk(option, path)
         else:
             for step, child in _children(node):
                 walk(child, (*path, step))
 
     walk(tree, ())
-    return found
+    return counts
 
 
 def corners(tree: Any) -> Iterator[Any]:

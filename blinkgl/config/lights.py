@@ -128,13 +128,13 @@ class LightConfig(Config):
 
     @rule("#lights")
     def _not_too_many(lights):
-        if (given := len([*lights])) > MAX_LIGHTS:
-            raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
+        if (count := len([*lights])) > MAX_LIGHTS:
+            raise Refused("too many lights", where="lights", value=count, accepted=f"at most {MAX_LIGHTS}")
 
     @rule("unlit", "#lights", "?environment", "shadows")
     def _lit(unlit, lights, environment, shadows):
-        for where, given in (("lights", [*lights]), ("environment", environment), ("shadows", shadows != "off")):
-            if unlit and given:
+        for where, used in (("lights", [*lights]), ("environment", environment), ("shadows", shadows != "off")):
+            if unlit and used:
                 raise Refused("these lights have no effect", where=where, value="unlit: true", accepted="unlit: false")
 
 

@@ -77,11 +77,11 @@ class MaterialConfig(Config):
 
     @rule("unlit", "normal_map", "metallic_roughness_map", "emission_map")
     def _maps_of_what_is_lit(unlit, *maps):
-        given = [k for k, v in zip(("normal_map", "metallic_roughness_map", "emission_map"), maps) if v is not None]
-        if unlit and given:
+        used = [k for k, v in zip(("normal_map", "metallic_roughness_map", "emission_map"), maps) if v is not None]
+        if unlit and used:
             raise Refused(
                 "this map has no effect on an unlit surface",
-                where=given[0],
+                where=used[0],
                 value=maps[0] or maps[1] or maps[2],
                 accepted="unlit: false, or no such map",
             )

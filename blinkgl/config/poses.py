@@ -214,6 +214,6 @@ class WayConfig(Config):
 
     @rule("#points", "closed")
     def _a_way(points, closed):
-        least, given = (3 if closed else 2), len([*points])
-        if given < least:
-            raise Refused(f"a way needs at least {least} points", where="points", value=given)
+        least, count = (3 if closed else 2), len([*points])
+        if count < least:
+            raise Refused(f"a way needs at least {least} points", where="points", value=count)

@@ -266,10 +266,10 @@ def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
 
 def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
     """Return ``tree`` with the table of each sensor in ``sensors:`` changed."""
-    given = tree.get("sensors")
-    if not isinstance(given, list):
+    sensors = tree.get("sensors")
+    if not isinstance(sensors, list):
         return tree
-    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in given]}
+    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in sensors]}
 
 
 def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
@@ -338,15 +338,15 @@ def shipped_runs() -> dict[str, Path]:
     return {path.stem: path for pattern in _RUNS for path in sorted(folder.glob(pattern))}
 
 
-def run_file(given: str | Path) -> Path:
-    """Return the file ``given`` or, where there is none, the shipped run of that name: "demo", "demo.yaml" and
+def run_file(name: str | Path) -> Path:
+    """Return the file ``name`` or, where there is none, the shipped run of that name: "demo", "demo.yaml" and
     "configs/demo.yaml" are the same. (A folder does not count: ``generate demo --out demo`` creates one.) Raises
     ConfigError."""
-    path = Path(given)
+    path = Path(name)
     shipped_one = shipped_runs().get(path.stem)
     if (path.exists() or path.is_symlink()) and not (path.is_dir() and str(path) == path.stem and shipped_one):
         return path
     named = shipped_one is not None and shipped_one.as_posix().endswith(f"/{path.with_suffix('.yaml').as_posix()}")
     if shipped_one is not None and (named or path.parent == Path()):
         return shipped_one
-    raise ConfigError("no such file", where=str(given), accepted="a YAML file, or a name that 'blinkgl configs' lists")
+    raise ConfigError("no such file", where=str(name), accepted="a YAML file, or a name that 'blinkgl configs' lists")

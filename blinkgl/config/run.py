@@ -167,7 +167,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
             tree["seed"] = validate_field(SequenceConfig, "seed", own["seed"])
         if isinstance(tree.setdefault("output", {}), dict):
             tree["output"].setdefault("name", name)
-        with placed(str, said=f"in group '{name}': "):
+        with placed(str, before=f"in group '{name}': "):
             made.append(_group(name, tree, template, enabled))
     folders: dict[tuple[str, str], str] = {}
     for group in made:

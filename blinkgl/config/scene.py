@@ -195,8 +195,8 @@ class RandomSceneConfig(Config):
 
     @rule("?lights", "sky.lights", "light.unlit", "?light.environment")
     def _lit(lights, sky_lights, unlit, environment):
-        for where, given in (("lights", lights), ("sky.lights", sky_lights)):
-            if given and unlit:
+        for where, used in (("lights", lights), ("sky.lights", sky_lights)):
+            if used and unlit:
                 raise Refused(
                     "these lights have no effect", where=where, value="light.unlit: true", accepted="light.unlit: false"
                 )

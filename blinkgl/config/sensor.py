@@ -116,8 +116,8 @@ class SensorConfig(Config):
         models = EmulatorConfig.members
         if not isinstance(emulator, str) or emulator not in models:
             return {}
-        said = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
-        return {**said, **copy.deepcopy(self.emulators.get(emulator, {}))}
+        known = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
+        return {**known, **copy.deepcopy(self.emulators.get(emulator, {}))}
 
     def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
         """Return the configuration of the emulator of this name with this sensor's values, then ``overrides``. Raises
@@ -202,11 +202,11 @@ def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
         camera = validate(SensorConfig, sensor) if isinstance(sensor, dict) else load_sensor(sensor)
     except ConfigError:  # the check of the key sensor reports this
         return {}
-    said = {
+    keys = {
         "camera": {"width": camera.width, "height": camera.height},
         "events": camera.values(EmulatorConfig.default_member if emulator is None else emulator),
     }
-    return said if camera.readout is None else {**said, "readout": camera.readout.model_dump()}
+    return keys if camera.readout is None else {**keys, "readout": camera.readout.model_dump()}
 
 
 def _sensor(name: Any) -> Any:

@@ -99,8 +99,8 @@ class TimeConfig(Config):
         whole = self.label_count / self.label_rate
         if self.duration - whole < 1e-6 * self.duration:
             return ()
-        said = f"time.duration: {self.duration:.6g} s are {whole:.6g} s, {self.label_count} intervals of labels"
-        return (f"{said} (a multiple of 1 / time.label_rate = {1 / self.label_rate:.6g} s is whole)",)
+        used = f"time.duration: {self.duration:.6g} s are {whole:.6g} s, {self.label_count} intervals of labels"
+        return (f"{used} (a multiple of 1 / time.label_rate = {1 / self.label_rate:.6g} s is whole)",)
 
     @property
     def t0_ns(self) -> int:

@@ -80,9 +80,9 @@ def read_trajectory(
     from blinkgl.io import trajectories
 
     per_second = None if rate is None else check.number(rate, "rate", above=0, most=1e9)
-    given = None if times is None else check.path(times, "times")
+    stamps = None if times is None else check.path(times, "times")
     declared = trajectories.PoseFile(
-        form=form, columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=per_second, times=given
+        form=form, columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=per_second, times=stamps
     )
     return trajectories.read_trajectory(check.path(path, "path"), declared, notes)
 
@@ -191,9 +191,9 @@ def calibrate(
     from blinkgl.recordings.decoding import Codes
 
     listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
-    given = tuple(fixed) if listed else (None,)
-    keys = tuple(key for key in given if isinstance(key, str))
-    if len(keys) != len(given):
+    items = tuple(fixed) if listed else (None,)
+    keys = tuple(key for key in items if isinstance(key, str))
+    if len(keys) != len(items):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
     delay = reading.get("frame_delay_ms")
     understood = FrameReading(
@@ -291,13 +291,13 @@ def simulate_file(
     from blinkgl.recordings import simulation
 
     use, options, sensor_size = _options(**frames)
-    given: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
-    given |= {"stream": stream, "damaged": damaged}
+    declared: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
+    declared |= {"stream": stream, "damaged": damaged}
     options = {key: options[key] for key in ("emulator", "seed", "readout")}
     return simulation.file_to_events(
         check.path(source, "source"),
         check.path(target, "target"),
-        declared=_declared(given),
+        declared=_declared(declared),
         size=sensor_size if size is None else checked_size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
@@ -344,22 +344,22 @@ def _options(
     return use, options, None if camera is None else (camera.height, camera.width)
 
 
-def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:
+def _declared(options: Mapping[str, Any], unit: str = "time_unit") -> Declared:
     """Return what is declared of frames; ``unit`` is the key of the unit of their times. Raises ConfigError."""
     from blinkgl.io.frames import Declared
 
-    fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
+    fps, white, stamps = options.get("fps"), options.get("white_level"), options.get("timestamps")
     return Declared(
         fps=None if fps is None else check.number(fps, "fps", above=0, most=1e9),
         timestamps=None if stamps is None else check.path(stamps, "timestamps"),
-        time_unit=given.get(unit),
-        zero_time=bool(given.get("zero_time", False)),
+        time_unit=options.get(unit),
+        zero_time=bool(options.get("zero_time", False)),
         white_level=None if white is None else check.number(white, "white_level", above=0, most=1e9),
-        range=given.get("range"),
-        background=given.get("background"),
+        range=options.get("range"),
+        background=options.get("background"),
         # The events' stream is no frames' stream: which frames belong to it is found where both are opened.
-        stream=None if unit != "time_unit" or given.get("stream") is None else str(given["stream"]),
-        damaged=given.get("damaged", "refuse"),
+        stream=None if unit != "time_unit" or options.get("stream") is None else str(options["stream"]),
+        damaged=options.get("damaged", "refuse"),
     )
 
 

@@ -149,17 +149,17 @@ class OnlineSequences(Closing):
         self.stream.close()
 
 
-def _window_us(given: float | Sequence[float] | None) -> tuple[int, int] | None:
-    if given is None:
+def _window_us(length: float | Sequence[float] | None) -> tuple[int, int] | None:
+    if length is None:
         return None
-    ends = list(check.plain(given)) if isinstance(check.plain(given), list) else [given, given]
+    ends = list(check.plain(length)) if isinstance(check.plain(length), list) else [length, length]
     if len(ends) != 2:
         raise ConfigError(
-            "not lengths of windows", where="window_ms", value=given, accepted="a number of ms, or (shortest, longest)"
+            "not lengths of windows", where="window_ms", value=length, accepted="a number of ms, or (shortest, longest)"
         )
     low, high = (check.number(end, "window_ms", least=0.001, most=MAX_WINDOW_MS) for end in ends)
     if low > high:
         raise ConfigError(
-            "the shortest is longer than the longest", where="window_ms", value=given, accepted="(shortest, longest)"
+            "the shortest is longer than the longest", where="window_ms", value=length, accepted="(shortest, longest)"
         )
     return round(1000 * low), round(1000 * high)

@@ -92,14 +92,14 @@ class Material(Piece):
                 check.existing(file, f"Material.{key}")
 
 
-def _is_file(given: Any) -> bool:
-    return isinstance(given, (str, os.PathLike))
+def _is_file(image: Any) -> bool:
+    return isinstance(image, (str, os.PathLike))
 
 
-def _pixels(given: Any, key: str, accepted: str) -> np.ndarray:
+def _pixels(image: Any, key: str, accepted: str) -> np.ndarray:
     """Return an array (h, w, 3), of a mask (h, w). Raises ConfigError."""
     where, shape = f"Material.{key}", (None, None) if key == "mask" else (None, None, 3)
-    pixels = check.array(given, where, shape, accepted)
+    pixels = check.array(image, where, shape, accepted)
     if not pixels.size or max(pixels.shape) > 16384:
         raise ConfigError("size out of range", where=where, value=pixels.shape, accepted="1 to 16384 rows and columns")
     light = pixels.dtype.kind == "f" and key == "image"
@@ -110,9 +110,9 @@ def _pixels(given: Any, key: str, accepted: str) -> np.ndarray:
     return np.array(pixels, np.float32 if light else np.uint8, order="C")  # a copy: the scene is a value
 
 
-def _map(given: Any, key: str) -> np.ndarray:
+def _map(image: Any, key: str) -> np.ndarray:
     """Return an array (h, w, 3) uint8, of a mask (h, w)."""
-    return _pixels(given, key, f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8")
+    return _pixels(image, key, f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8")
 
 
 def _texture(image: Any) -> data.Texture:

@@ -104,7 +104,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         unreadable.append(str(error))
     if not sequences and plan is None:
         raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
-    found = Collected(
+    collected = Collected(
         root,
         sequences,
         plan,
@@ -116,28 +116,30 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         damaged=damaged,
     )
     rng = np.random.default_rng(seed)
-    _sample(found, rng, examples)
-    _parameters(found, rng)
-    return found
+    _sample(collected, rng, examples)
+    _parameters(collected, rng)
+    return collected
 
 
-def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
+def _sample(collected: Collected, rng: np.random.Generator, examples: int) -> None:
     """Collect displacements, speeds, depths and numbers of objects from some labels, and rates from every sequence."""
     values: dict[str, list] = {k: [] for k in ("displacement", "speed", "depth", "objects", "share")}
-    found.quantities["rate"] = np.array(
+    collected.quantities["rate"] = np.array(
         [
             1e6 * s["events"] / s["duration_us"] / (s["height"] * s["width"])
-            for s in found.sequences
+            for s in collected.sequences
             if s["duration_us"] and s["events"] is not None
         ]
     )
-    found.quantities["events"] = np.array([s["events"] for s in found.sequences if s["events"] is not None], float)
-    order = rng.permutation(len(found.sequences))[:SAMPLED_SEQUENCES]
-    order = [number for number in order if found.sequences[number]["path"] not in found.damaged]
-    shown = set(_spread(found.sequences, order, examples))
+    collected.quantities["events"] = np.array(
+        [s["events"] for s in collected.sequences if s["events"] is not None], float
+    )
+    order = rng.permutation(len(collected.sequences))[:SAMPLED_SEQUENCES]
+    order = [number for number in order if collected.sequences[number]["path"] not in collected.damaged]
+    shown = set(_spread(collected.sequences, order, examples))
     for number in order:
-        line = found.sequences[number]
-        folder = found.root / line["path"]
+        line = collected.sequences[number]
+        folder = collected.root / line["path"]
         try:
             flows = sorted((folder / _FLOW.forms[0].folder).glob("*.png"))
             if not flows:
@@ -164,11 +166,11 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
             k = picks[len(picks) // 2]
             if number in shown and (pictures := _pictures(folder, line, int(flows[k].stem), pairs[k][0])):
                 caption = f"{line['emulator'] or ''}, t = {pairs[k][0] / 1e6:.3f} s"
-                found.examples.append(Example(line["path"], caption, pictures))
+                collected.examples.append(Example(line["path"], caption, pictures))
         except (BlinkGLError, OSError, ValueError, IndexError) as error:
-            found.unreadable.append(f"{line['path']}: {' '.join(str(error).split())[:160]}")
-    found.examples.sort(key=lambda e: e.name)
-    found.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
+            collected.unreadable.append(f"{line['path']}: {' '.join(str(error).split())[:160]}")
+    collected.examples.sort(key=lambda e: e.name)
+    collected.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
 
 
 def _value(folder: Path, name: str, flow: Path) -> Any:
@@ -232,21 +234,21 @@ def _rgb(image: np.ndarray) -> np.ndarray:
 # ---- parameters ------------------------------------------------------------------------------------------------------
 
 
-def _parameters(found: Collected, rng: np.random.Generator) -> None:
+def _parameters(collected: Collected, rng: np.random.Generator) -> None:
     """Collect every distribution of the recipe with the drawn values of the sequences' config.yaml."""
-    if found.plan is None:
+    if collected.plan is None:
         return
-    here = {task_of(s) for s in found.sequences if s["path"] not in found.damaged}
-    numbers = sorted(n for name in here if (n := found.plan.tasks.number(name)) is not None)
-    tasks = [found.plan.tasks[numbers[i]] for i in sorted(rng.permutation(len(numbers))[:MAX_CONFIGS])]
+    here = {task_of(s) for s in collected.sequences if s["path"] not in collected.damaged}
+    numbers = sorted(n for name in here if (n := collected.plan.tasks.number(name)) is not None)
+    tasks = [collected.plan.tasks[numbers[i]] for i in sorted(rng.permutation(len(numbers))[:MAX_CONFIGS])]
     configs: dict[str, list[dict]] = {}
     for task in tasks:
         try:
-            configs.setdefault(task.group, []).append(read_table(found.root / task.name / "config.yaml"))
+            configs.setdefault(task.group, []).append(read_table(collected.root / task.name / "config.yaml"))
         except ConfigError as error:
-            found.unreadable.append(f"{task.name}/config.yaml: {error.problem}")
-    for group in found.plan.used:
-        _walk(group.name, group.template.tree, (), configs.get(group.name, []), found.parameters)
+            collected.unreadable.append(f"{task.name}/config.yaml: {error.problem}")
+    for group in collected.plan.used:
+        _walk(group.name, group.template.tree, (), configs.get(group.name, []), collected.parameters)
 
 
 def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], into: list[Parameter]) -> None:

@@ -298,25 +298,17 @@ class ObjectConfig(KeyedMotionConfig):
         if way and (keyframes or any(position) or any(o is not None for o in orientation)):
             raise Refused("give a way, a fixed pose or keyframes, not several of them")
 
-    @rule("physics.kind", "?trajectory")
-    def _the_engine_or_a_trajectory(kind, trajectory):
-        if kind == "dynamic" and trajectory:
-            raise Refused(
-                "a dynamic body has no trajectory: the engine moves it",
-                where="physics.kind",
-                value=kind,
-                accepted="fixed, which pushes what it meets on its way",
-            )
-
-    @rule("physics.kind", "#keyframes")
-    def _the_engine_or_key_frames(kind, keyframes):
-        if kind == "dynamic" and keyframes:
-            raise Refused(
-                "a dynamic body has no key frames: the engine moves it",
-                where="physics.kind",
-                value=kind,
-                accepted="fixed, which pushes what it meets on its way, or a pose without key frames",
-            )
+    @rule("physics.kind", "?trajectory", "#keyframes")
+    def _the_engine_moves_it(kind, trajectory, keyframes):
+        ways = (("trajectory", trajectory, ""), ("key frames", keyframes, ", or a pose without key frames"))
+        for way, there, otherwise in ways:
+            if kind == "dynamic" and there:
+                raise Refused(
+                    f"a dynamic body has no {way}: the engine moves it",
+                    where="physics.kind",
+                    value=kind,
+                    accepted=f"fixed, which pushes what it meets on its way{otherwise}",
+                )
 
 
 def _known(used: tuple[str | None, ...], known: tuple[str, ...], key: str, table: str) -> None:

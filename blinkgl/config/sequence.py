@@ -305,25 +305,15 @@ class SequenceConfig(Config):
             if frames and there:
                 raise Refused(f"recorded frames {problem}", where=key, accepted=instead)
 
-    @rule("?sensors", "scene.intrinsics")
-    def _own_intrinsics(sensors: bool, intrinsics: str | None):
-        if sensors and intrinsics == "file":
-            raise Refused(
-                "the file's camera cannot be used for a rig",
-                where="scene.intrinsics",
-                value=intrinsics,
-                accepted="config",
-            )
-
-    @rule("camera.lens", "scene.intrinsics")
-    def _one_lens(lens: str, intrinsics: str | None):
-        if lens != "pinhole" and intrinsics == "file":
-            raise Refused(
-                "the file's camera is a pin-hole camera",
-                where="scene.intrinsics",
-                value=intrinsics,
-                accepted="config, or camera.lens: pinhole",
-            )
+    @rule("?sensors", "camera.lens", "scene.intrinsics")
+    def _the_files_own_camera(sensors: bool, lens: str, intrinsics: str | None):
+        cannot = (
+            (sensors, "the file's camera cannot be used for a rig", "config"),
+            (lens != "pinhole", "the file's camera is a pin-hole camera", "config, or camera.lens: pinhole"),
+        )
+        for other, problem, accepted in cannot:
+            if other and intrinsics == "file":
+                raise Refused(problem, where="scene.intrinsics", value=intrinsics, accepted=accepted)
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
     def _late_events_fit(duration: float, label_rate: float, rate: float | None, row_ns: float, queue: int):

@@ -18,7 +18,8 @@ _HOMES = {
     "blinkgl.front.surfaces": ("Light", "Material"),
     "blinkgl.front.scenes": ("Animation", "Body", "Camera", "Deform", "Mesh", "Primitive", "Scene", "Way"),
     "blinkgl.front.rigs": ("Rig", "RigSensor"),
-    "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
+    "blinkgl.front.sections": ("Timeline",),
+    "blinkgl.front.runs": ("generate", "load", "verify"),
     "blinkgl.front.sequences": (
         "Recording",
         "RigRecording",
@@ -69,8 +70,9 @@ if TYPE_CHECKING:  # for type checkers and editors; a test compares it with the 
     from blinkgl.front.online import OnlineSequences
     from blinkgl.front.poses import Keyframes, Pose, Trajectory, look_at
     from blinkgl.front.rigs import Rig, RigSensor
-    from blinkgl.front.runs import Timeline, generate, load, verify
+    from blinkgl.front.runs import generate, load, verify
     from blinkgl.front.scenes import Animation, Body, Camera, Deform, Mesh, Primitive, Scene, Way
+    from blinkgl.front.sections import Timeline
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, RigRecording, record, record_rig, simulate_rig, simulate_sequence
     from blinkgl.front.surfaces import Light, Material

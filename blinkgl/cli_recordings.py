@@ -6,7 +6,10 @@ from typing import Annotated
 
 import typer
 
+from blinkgl.config.names import shipped_names
 from blinkgl.machine import event_options as of_events
+
+SENSORS = shipped_names("sensors")
 
 # What may be declared of frames, in every command that reads them.
 Fps = Annotated[float | None, typer.Option(help="Frames per second (default: the file's own times).")]
@@ -56,8 +59,8 @@ def simulate(
         str | None,
         typer.Option(
             "--sensor",
-            help="davis240c, davis346, dvxplorer, gen31_vga or imx636, or a sensor file (.yaml): its size, thresholds, "
-            "noise and read-out limit.",
+            help=f"{', '.join(SENSORS[:-1])} or {SENSORS[-1]}, or a sensor file (.yaml): its size, thresholds, noise "
+            "and read-out limit.",
         ),
     ] = None,
     size: Annotated[

@@ -396,6 +396,17 @@ def test_wrong_calls_say_what_to_do(call, said):
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("argument", ["emulator", "images", "imu", "tracks"])
+def test_a_message_offers_what_is_accepted(argument):
+    with pytest.raises(blinkgl.ConfigError) as caught:
+        blinkgl.simulate_sequence(box_scene(), **{argument: 3})
+    names = str(caught.value).partition("expected ")[2].partition(", or a table")[0].split(", ")
+    assert len(names) >= 2
+    for name in names:
+        with blinkgl.simulate_sequence(box_scene(), **{argument: name}):
+            pass
+
+
 # --- what changes its shape, and goes its way -------------------------------------------------------------------------
 
 

@@ -54,7 +54,6 @@ WORLDS: dict[str, dict[str, Any]] = {
     },
     "one sky": {
         "sky": {"per_face": False, "size": 60, "brightness": [0.5, 0.9], "repeat": [2, 5]},
-        "ground": {"height": -0.5, "subdivisions": 4},
     },
     "shaken": {
         "camera_motion": {"shake": 2.0, "rotation_rate": 90, "view_cone": 10, "roll": 3, "speed": [1, 2]},

@@ -20,9 +20,9 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
+from itertools import repeat
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import (
@@ -56,16 +56,16 @@ def placed(
     kind: type[Any] = ConfigError,
     *,
     of: tuple[type[Any], ...] = (Refused, ConfigError),
-    said: str = "",
+    before: str = "",
 ) -> Iterator[None]:
     """Raise the errors ``of`` the code inside as a ``kind`` of error at another place.
 
-    where : the place, or what makes it of the place there.   said : what comes before the problem."""
+    where : the place, or what makes it of the place there.   before : what comes before the problem."""
     try:
         yield
     except of as error:
         place = where if isinstance(where, str) else where(error.where or "")
-        raise kind(said + error.problem, where=place, value=error.value, accepted=error.accepted) from None
+        raise kind(before + error.problem, where=place, value=error.value, accepted=error.accepted) from None
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,13 @@ class Rule:
 
     keys: tuple[str, ...]
     check: Callable[..., None]
+    paths: tuple[Path, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "paths", tuple(tuple(key.lstrip("?#").split(".")) for key in self.keys))
 
     def __call__(self, model: Config) -> None:
-        self.check(*(_value(model, key) for key in self.keys))
+        self.check(*map(_value, repeat(model), self.keys, self.paths))
 
 
 def rule(*keys: str) -> Callable[[Callable[..., None]], Rule]:
@@ -86,28 +90,32 @@ def rule(*keys: str) -> Callable[[Callable[..., None]], Rule]:
     return lambda function: Rule(keys, function)
 
 
-_known: ContextVar[dict[tuple[type, int], tuple[Any, Any]] | None] = ContextVar("known", default=None)
+def at_most_one(*keys: str) -> Rule:
+    """Return the rule that at most one of the keys has a value."""
+
+    def check(*values: object) -> None:
+        used = [key for key, value in zip(keys, values) if value is not None]
+        if len(used) > 1:
+            raise Refused(f"only one of {', '.join(keys)} may be given, not {' and '.join(used)}")
+
+    return Rule(keys, check)
 
 
-@contextmanager
-def remembering() -> Iterator[None]:
-    """Validate a table only once inside this context: the same table object gives the same model object. Used for many
-    trees that share tables; the tables must not be changed meanwhile."""
-    token = _known.set({})
-    try:
-        yield
-    finally:
-        _known.reset(token)
-
-
-class Removed(NamedTuple):
+class Former(NamedTuple):
     """A key of earlier versions. It is accepted where its value means the present behaviour, because the
     ``config.yaml`` files of those versions contain it, and refused otherwise.
 
     instead : what to write instead, the end of a sentence.   is_off : whether a value means the present behaviour."""
 
     instead: str
-    is_off: Callable[[Any], bool]
+    is_off: Callable[[object], bool]
+
+
+def always(constant: object) -> Former:
+    """Return the former key whose value is ``constant`` now."""
+    # YAML has lists where constants are tuples.
+    accepted = (constant, list(constant)) if isinstance(constant, tuple) else (constant,)
+    return Former(f"{constant}, which holds always", lambda value: value in accepted)
 
 
 class Config(BaseModel):
@@ -115,9 +123,8 @@ class Config(BaseModel):
     because YAML 1.1 reads ``1e-4`` as a string.
 
     presets : defaults of the other keys for each value of the key ``preset``.
-    instead : key -> the key that it replaces; the replaced key is then null unless it is given itself.
-    removed : keys of earlier versions; see :class:`Removed`.
-    fixed : keys of earlier versions whose value is now a constant of the class.
+    former : keys of earlier versions; see :class:`Former`.
+    rules : the checks of several values together, see :func:`rule`, those of the base classes first.
     members : of a base model, which as a field's annotation accepts any of them: models by the value of their key
     ``tag``, in the order in which they were added; ``default_member`` where it is not given. Plug-ins may add some."""
 
@@ -125,9 +132,7 @@ class Config(BaseModel):
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
     )
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    instead: ClassVar[Mapping[str, str]] = {}
-    removed: ClassVar[Mapping[str, Removed]] = {}
-    fixed: ClassVar[tuple[str, ...]] = ()
+    former: ClassVar[Mapping[str, Former]] = {}
     rules: ClassVar[tuple[Rule, ...]] = ()
     members: ClassVar[dict[str, type[Any]]]
     tag: ClassVar[str]
@@ -143,55 +148,30 @@ class Config(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        found = {
-            name: value
-            # From the base class down, so that a subclass may replace a rule of the same name.
-            for base in reversed(cls.__mro__)
-            for name, value in vars(base).items()
-            if isinstance(value, Rule)
-        }
-        cls.rules = tuple(found.values())
-        for name, one in found.items():
-            for key in one.keys:
-                # Without this check, a rule of a renamed key would silently never run again.
-                if not _fits(cls, _steps(key)):
-                    raise TypeError(f"{cls.__name__}.{name}: there is no key {key}")
+        # From the base class down, so that a subclass may replace a rule of the same name.
+        bodies = [vars(base) for base in reversed(cls.__mro__)]
+        rules = {name: value for body in bodies for name, value in body.items() if isinstance(value, Rule)}
+        cls.rules = tuple(rules.values())
+        # Without this check, a rule of a renamed key would silently never run again. A private base class has rules of
+        # keys that its subclasses define.
+        for name, path in [(name, path) for name, check in rules.items() for path in check.paths]:
+            if not cls.__name__.startswith("_") and not _fits(cls, path):
+                raise TypeError(f"{cls.__name__}.{name}: there is no key {'.'.join(path)}")
 
     @model_validator(mode="before")
     @classmethod
-    def _fill_preset(cls, data: Any) -> Any:
-        if isinstance(data, dict) and not {*cls.removed, *cls.fixed}.isdisjoint(data):
-            data = {key: value for key, value in data.items() if not cls._is_removed(key, value)}
-        if cls.presets and isinstance(data, dict):
-            name = data.get("preset", cls.model_fields["preset"].default)
-            # Later tables win: the preset, then null for what another key replaces, then what is given.
-            data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **cls._left_out(data), **data}
-        return cls.completed(data) if isinstance(data, dict) else data
-
-    @classmethod
-    def _is_removed(cls, key: str, value: Any) -> bool:
-        """Return whether a key of an earlier version may be ignored. Raises Refused where its value would matter."""
-        if key in cls.fixed:
-            now = getattr(cls, key)
-            # YAML has lists where constants are tuples.
-            if value not in (now, list(now) if isinstance(now, tuple) else now):
-                raise Refused("this key was removed", where=key, value=value, accepted=f"{now}, which holds always")
-            return True
-        if key not in cls.removed:
-            return False
-        if not cls.removed[key].is_off(value):
-            raise Refused("this key was removed", where=key, value=value, accepted=cls.removed[key].instead)
-        return True
-
-    @classmethod
-    def _left_out(cls, data: dict[str, Any]) -> dict[str, None]:
-        return {other: None for key, other in cls.instead.items() if data.get(key) is not None}
-
-    @classmethod
-    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """Return ``data`` with the keys that follow from other given keys. Invalid values are left as they are:
-        validation, which comes next, refuses them."""
-        return data
+    def _present_keys(cls, data: Any) -> Any:
+        """Return the given keys over those of the preset, without those of earlier versions."""
+        if not isinstance(data, dict):
+            return data
+        former = [key for key in data if key in cls.former]
+        for key in former:
+            if not cls.former[key].is_off(data[key]):
+                accepted = cls.former[key].instead
+                raise Refused("this key was removed", where=key, value=data[key], accepted=accepted)
+        name = data.get("preset", cls.model_fields["preset"].default) if cls.presets else None
+        preset = cls.presets.get(name, {}) if isinstance(name, str) else {}
+        return {**preset, **{key: value for key, value in data.items() if key not in former}}
 
     @model_validator(mode="after")
     def check_rules(self) -> Config:
@@ -199,18 +179,6 @@ class Config(BaseModel):
         for one in self.rules:
             one(self)
         return self
-
-    @model_validator(mode="wrap")  # last, so that it wraps the other validators
-    @classmethod
-    def _remembered(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
-        # The corners of one template share most of their tables; each shared table is validated once.
-        known = _known.get()
-        if known is None or not isinstance(data, dict):
-            return handler(data)
-        found = known.get((cls, id(data)))
-        if found is None:
-            found = known[cls, id(data)] = data, handler(data)  # keep the data alive: its id must not be reused
-        return found[1]
 
 
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
@@ -300,18 +268,13 @@ def _fits(annotation: Any, path: Iterable[str]) -> bool:
     return bool(here)
 
 
-@lru_cache(maxsize=4096)
-def _steps(key: str) -> Path:
-    return tuple(key.lstrip("?#").split("."))
-
-
-def _value(model: Any, key: str) -> Any:
-    found = _get(model, _steps(key))
-    if key.startswith("?"):
-        return found is not None
-    if key.startswith("#"):
-        return tuple(found) if isinstance(found, dict) else tuple(range(len(found or ())))
-    return found
+def _value(model: Any, key: str, path: Path) -> Any:
+    value = _get(model, path)
+    if key[0] == "?":
+        return value is not None
+    if key[0] == "#":
+        return tuple(value) if isinstance(value, dict) else tuple(range(len(value or ())))
+    return value
 
 
 def _get(node: Any, path: Path) -> Any:

@@ -98,18 +98,18 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
         raise ConfigError("the file has no camera", where=where, value=sorted(map(str, tree))[:5], accepted=accepted)
     key = "camera_matrix" if dsec else "intrinsics"
     raw = [name for name in names if not (dsec and name.startswith("camRect"))]
-    found = {name: _camera(tables[name], f"{where}: {name}", key) for name in raw}
-    for k, (name, one) in enumerate(found.items()):
-        given, key = tables[name].get("T_cn_cnm1"), "T_cn_cnm1"
+    cameras = {name: _camera(tables[name], f"{where}: {name}", key) for name in raw}
+    for k, (name, one) in enumerate(cameras.items()):
+        matrix, key = tables[name].get("T_cn_cnm1"), "T_cn_cnm1"
         if dsec and isinstance(places, dict) and k:
             key = f"T_{k}{k - 1}"
-            given = places.get(key)
-        before = None if given is None else _rigid(given, f"{where}: {name}.{key}")
+            matrix = places.get(key)
+        before = None if matrix is None else _rigid(matrix, f"{where}: {name}.{key}")
         unit = next((k for k in ("T_cam_imu", "T_imu_cam") if tables[name].get(k) is not None), None)
         T = None if unit is None else _rigid(tables[name][unit], f"{where}: {name}.{unit}")
-        found[name] = Calibrated(one.camera, before, np.linalg.inv(T) if T is not None and unit == "T_imu_cam" else T)
+        cameras[name] = Calibrated(one.camera, before, np.linalg.inv(T) if T is not None and unit == "T_imu_cam" else T)
     rectified_ = {name: _camera(tables[name], f"{where}: {name}", "camera_matrix") for name in names if name not in raw}
-    return found | rectified_
+    return cameras | rectified_
 
 
 def _tree(text: str, where: str) -> dict[str, Any]:
@@ -135,17 +135,17 @@ def _of_matrix(tree: dict[str, Any], where: str) -> Calibrated | None:
     size = next((table[k] for k in ("img_size", "image_size", "resolution") if k in table), None)
     size = [table.get("image_width"), table.get("image_height")] if size is None else size
     numbers = next((name for name in _COEFFICIENTS if name in table), None)
-    given = [] if numbers is None else _flat(table[numbers])
+    coefficients = [] if numbers is None else _flat(table[numbers])
     model = table.get("distortion_model", table.get("type", table.get("camera_model")))
-    if model in _NONE and any(given or ()):
+    if model in _NONE and any(coefficients or ()):
         model = "equidistant" if table.get("fisheye_model") else "radtan"
     plain = {"resolution": size, "intrinsics": [K[0], K[4], K[2], K[5]], "distortion_model": model}
-    return _camera(plain | {"distortion_coeffs": given}, where, "intrinsics")
+    return _camera(plain | {"distortion_coeffs": coefficients}, where, "intrinsics")
 
 
-def _flat(given: Any) -> list[float] | None:
+def _flat(matrix: Any) -> list[float] | None:
     """Return the numbers of a matrix of OpenCV (rows, cols, data), of ROS, or a list of rows; None: none of these."""
-    data = given.get("data") if isinstance(given, dict) else given
+    data = matrix.get("data") if isinstance(matrix, dict) else matrix
     if not isinstance(data, list):
         return None
     flat = [value for row in data for value in (row if isinstance(row, list) else [row])]
@@ -154,7 +154,7 @@ def _flat(given: Any) -> list[float] | None:
 
 def _colmap(text: str, where: str) -> dict[str, Calibrated]:
     """Return the cameras of COLMAP's cameras.txt: CAMERA_ID MODEL WIDTH HEIGHT PARAMS."""
-    found: dict[str, Calibrated] = {}
+    cameras: dict[str, Calibrated] = {}
     for line in text.splitlines():
         fields = line.split()
         if not fields or fields[0].startswith("#"):
@@ -172,12 +172,12 @@ def _colmap(text: str, where: str) -> dict[str, Calibrated]:
         # Its pixels begin at 0, ours are centred there.
         intrinsics = [*focal, by["cx"] - 0.5, by["cy"] - 0.5]
         order = ("k1", "k2", "k3", "k4") if kind == "equidistant" else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        given = [by.get(name, 0.0) for name in order] if kind else []
+        coefficients = [by.get(name, 0.0) for name in order] if kind else []
         table = {"resolution": [_number(fields[2]), _number(fields[3])], "intrinsics": intrinsics}
-        found[f"cam{fields[0]}"] = _camera(
-            table | {"distortion_model": kind, "distortion_coeffs": given}, place, "intrinsics"
+        cameras[f"cam{fields[0]}"] = _camera(
+            table | {"distortion_model": kind, "distortion_coeffs": coefficients}, place, "intrinsics"
         )
-    return found
+    return cameras
 
 
 def _number(text: str) -> Any:
@@ -191,13 +191,13 @@ def read_place_on_body(path: str | Path) -> np.ndarray:
     tree = _tree(read_text(path), str(path))
     tables = [tree, *(value for value in tree.values() if isinstance(value, dict))]
     names = ("T_BS", "T_body_sensor", "T_imu_cam", "T_cam_imu")
-    found = next(((table, key) for table in tables for key in names if key in table), None)
-    if found is None:
+    place = next(((table, key) for table in tables for key in names if key in table), None)
+    if place is None:
         accepted = "T_BS, T_body_sensor, T_cam_imu or T_imu_cam"
         raise ConfigError("no place on a body", where=str(path), value=sorted(map(str, tree))[:5], accepted=accepted)
-    table, key = found
-    given = table[key]
-    data = given.get("data") if isinstance(given, dict) else given
+    table, key = place
+    matrix = table[key]
+    data = matrix.get("data") if isinstance(matrix, dict) else matrix
     if isinstance(data, list) and len(data) == 16:
         data = [data[k : k + 4] for k in range(0, 16, 4)]
     T = rigid_matrix(_rigid(data, f"{path}: {key}"))
@@ -272,48 +272,48 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
     known = f"one of {', '.join(_COUNTS)}, none"
     if kind not in ("pinhole", *_COUNTS):
         raise ConfigError("unknown distortion model", where=f"{where}.distortion_model", value=lens, accepted=known)
-    given = _flat(table.get(numbers)) or []
-    if kind == "pinhole" and any(given):
+    values = _flat(table.get(numbers)) or []
+    if kind == "pinhole" and any(values):
         # They are never dropped.
         stated = (
             "distortion coefficients without a model" if lens is None else f"coefficients of a lens of model {lens}"
         )
         accepted = f"distortion_model: {known}, and no coefficients with none"
-        raise ConfigError(stated, where=f"{where}.{numbers}", value=given, accepted=accepted)
-    if kind == "radtan" and len(given) > 5:
-        if any(given[5:]):
+        raise ConfigError(stated, where=f"{where}.{numbers}", value=values, accepted=accepted)
+    if kind == "radtan" and len(values) > 5:
+        if any(values[5:]):
             raise ConfigError(
                 "the rational model's further coefficients (k4, k5, k6 …) are not supported",
                 where=f"{where}.{numbers}",
-                value=given[5:],
+                value=values[5:],
                 accepted="k1 k2 p1 p2 k3: a calibration without CALIB_RATIONAL_MODEL",
             )
-        table = {**table, numbers: given[:5]}
+        table = {**table, numbers: values[:5]}
     elif isinstance(table.get(numbers), dict):
-        table = {**table, numbers: given}
-    given = [] if kind == "pinhole" else _numbers(table, numbers, _COUNTS[kind], where)
+        table = {**table, numbers: values}
+    values = [] if kind == "pinhole" else _numbers(table, numbers, _COUNTS[kind], where)
     with placed(where):
-        coefficients = dict(zip(CAMERA_MODELS[kind].coefficients, given))
+        coefficients = dict(zip(CAMERA_MODELS[kind].coefficients, values))
         return Calibrated(CAMERA_MODELS[kind](int(size[0]), int(size[1]), *intrinsics, **coefficients))
 
 
 def _numbers(table: dict[str, Any], key: str, counts: tuple[int, ...], where: str) -> list[float]:
-    given = table.get(key)
+    listed = table.get(key)
     try:
-        values = [float(v) for v in given if not isinstance(v, (bool, list, dict))]  # type: ignore[union-attr]
+        values = [float(v) for v in listed if not isinstance(v, (bool, list, dict))]  # type: ignore[union-attr]
     except (TypeError, ValueError):
         values = []
-    if not isinstance(given, list) or len(values) != len(given) or len(values) not in counts:
-        said = " or ".join(map(str, counts))
-        raise ConfigError("wrong numbers", where=f"{where}.{key}", value=given, accepted=f"a list of {said} numbers")
+    if not isinstance(listed, list) or len(values) != len(listed) or len(values) not in counts:
+        accepted = f"a list of {' or '.join(map(str, counts))} numbers"
+        raise ConfigError("wrong numbers", where=f"{where}.{key}", value=listed, accepted=accepted)
     if not all(map(math.isfinite, values)):
-        raise ConfigError("not finite", where=f"{where}.{key}", value=given, accepted="finite numbers")
+        raise ConfigError("not finite", where=f"{where}.{key}", value=listed, accepted="finite numbers")
     return values
 
 
-def _rigid(given: Any, where: str) -> np.ndarray:
+def _rigid(matrix: Any, where: str) -> np.ndarray:
     try:
-        T = np.array(given, np.float64)
+        T = np.array(matrix, np.float64)
     except (TypeError, ValueError):
         T = np.zeros(0)
     right = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[3], [0, 0, 0, 1])
@@ -321,7 +321,7 @@ def _rigid(given: Any, where: str) -> np.ndarray:
         raise ConfigError(
             "not a rigid transform",
             where=where,
-            value=given,
+            value=matrix,
             accepted="4 rows of 4 numbers: a rotation and a translation",
         )
     return T

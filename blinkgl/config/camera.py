@@ -112,15 +112,15 @@ class CameraConfig(Config):
         """Return the keys of a camera with the same view and ``factor`` times the pixels in x and y, rounded to whole
         pixels."""
         # Pixel centres are at whole numbers, so the picture begins at -0.5.
-        said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
-        said |= {key: value * factor for key in ("focal", "fx", "fy") if (value := getattr(self, key)) is not None}
-        said |= {"fov": self.fov} if self.fov is not None else {}
-        said |= {"lens": self.lens, "distortion": list(self.distortion)} if self.lens != "pinhole" else {}
+        keys = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
+        keys |= {key: value * factor for key in ("focal", "fx", "fy") if (value := getattr(self, key)) is not None}
+        keys |= {"fov": self.fov} if self.fov is not None else {}
+        keys |= {"lens": self.lens, "distortion": list(self.distortion)} if self.lens != "pinhole" else {}
         return {
             "width": max(1, round(self.width * factor)),
             "height": max(1, round(self.height * factor)),
             "near": self.near,
-            **said,
+            **keys,
         }
 
 
@@ -141,6 +141,20 @@ def camera_radius(camera: CameraModel, clearance: float) -> float:
     return max(clearance, 1.01 * camera.near_corner)
 
 
+def room_for(camera: CameraModel, clearance: float, height: float) -> float:
+    """Return :func:`camera_radius` in a random world's region of this height, m. Raises Refused for a lower one."""
+    least = camera_radius(camera, clearance)
+    if least > height:
+        raise Refused(
+            "the region is too low for the camera's clearance",
+            where="scene.region.height",
+            value=height,
+            accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near plane's corners: "
+            "camera.near and camera.fov)",
+        )
+    return least
+
+
 def calibrated(camera: Any, base: Path) -> Any:
     """Return a ``camera:`` table with its calibration, read from ``base``, replaced by the calibration's keys. A table
     without a calibration is returned unchanged. Raises ConfigError."""
@@ -149,8 +163,8 @@ def calibrated(camera: Any, base: Path) -> Any:
     from blinkgl.config.camchain import read_camchain
 
     own = {key: value for key, value in camera.items() if key not in ("calibration", "calibration_name")}
-    given, name = camera["calibration"], camera.get("calibration_name")
-    for key, value in (("calibration", given), ("calibration_name", name)):
+    file, name = camera["calibration"], camera.get("calibration_name")
+    for key, value in (("calibration", file), ("calibration_name", name)):
         if is_distribution(value) or not isinstance(value, (str, type(None))):
             raise ConfigError(
                 "not text", where=f"camera.{key}", value=value, accepted="text, the same for the whole run"
@@ -162,7 +176,7 @@ def calibrated(camera: Any, base: Path) -> Any:
             value=own[twice[0]],
             accepted="either camera.calibration or the key",
         )
-    chain = read_camchain(base / given)
+    chain = read_camchain(base / file)
     if name is None:
         name = next(iter(chain)) if len(chain) == 1 else "cam0"
     if name not in chain:
@@ -192,9 +206,9 @@ def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:
 
     from blinkgl.config.camchain import read_camchain
 
-    camera, said = table.get("camera"), {}
+    camera, keys = table.get("camera"), {}
     if not isinstance(camera, dict) or not isinstance(camera.get("calibration"), str):
-        return said
+        return keys
     chain = list(read_camchain(base / camera["calibration"]).items())
     number = next((k for k, (name, _) in enumerate(chain) if name == camera.get("calibration_name")), 0)
     links = [one.T_cam_before for _, one in chain[1 : number + 1]]
@@ -202,16 +216,16 @@ def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:
         T = np.eye(4)
         for link in links:  # from the axes of the camera before to its own
             T = np.asarray(link) @ T
-        said["place"] = {"matrix": np.linalg.inv(T).tolist()}
+        keys["place"] = {"matrix": np.linalg.inv(T).tolist()}
     imu, place = table.get("imu"), chain[number][1].T_cam_imu if chain else None
     if isinstance(imu, dict) and place is not None and not {"position", "rotation"} & set(imu):
         turned = Rotation.from_matrix(place[:3, :3]).as_euler("xyz", degrees=True)
-        said["imu"] = {**imu, "position": place[:3, 3].tolist(), "rotation": turned.tolist()}
-    return said
+        keys["imu"] = {**imu, "position": place[:3, 3].tolist(), "rotation": turned.tolist()}
+    return keys
 
 
 def camera_keys(camera: CameraModel) -> dict[str, Any]:
     """Return the keys of ``camera:`` that describe a camera model, without ``near``."""
-    said: dict[str, Any] = {"width": camera.width, "height": camera.height}
-    said |= zip(("fx", "fy", "cx", "cy"), camera.intrinsics)
-    return said | ({"lens": camera.kind, "distortion": list(camera.distortion)} if camera.coefficients else {})
+    keys: dict[str, Any] = {"width": camera.width, "height": camera.height}
+    keys |= zip(("fx", "fy", "cx", "cy"), camera.intrinsics)
+    return keys | ({"lens": camera.kind, "distortion": list(camera.distortion)} if camera.coefficients else {})

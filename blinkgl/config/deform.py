@@ -6,11 +6,11 @@ Lengths are fractions of the mesh's size, so that one setting suits any mesh. Th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 from blinkgl.config.values import as_pair, ordered
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ class DeformConfig(Config):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         """Draw a deformer of this kind for a random world. strength : of the motion, 1: the defaults.   period : s."""
-        given = {"period": period, "phase": float(rng.uniform(-180, 180))}
-        return cls(**{key: value for key, value in given.items() if key in cls.model_fields})
+        keys = {"period": period, "phase": float(rng.uniform(-180, 180))}
+        return cls(**{key: value for key, value in keys.items() if key in cls.model_fields})
 
 
 def _two_axes(rng: np.random.Generator) -> tuple[str, str]:
@@ -56,9 +56,9 @@ class _Waving(DeformConfig):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         (along, towards), wavelength = _two_axes(rng), float(rng.uniform(*cls.wavelengths))
-        given = super().drawn(rng, strength, period).model_dump()
+        keys = super().drawn(rng, strength, period).model_dump()
         amplitude = min(cls.model_fields["amplitude"].default * strength, 1.0)
-        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+        return cls(**keys | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
 
 
 class WaveConfig(_Waving):
@@ -114,8 +114,8 @@ class TwistConfig(DeformConfig):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         along, held = "xyz"[rng.integers(3)], float(rng.random())
-        given = super().drawn(rng, strength, period).model_dump()
-        return cls(**given | {"along": along, "held": held, "angle": min(60.0 * strength, 720.0)})
+        keys = super().drawn(rng, strength, period).model_dump()
+        return cls(**keys | {"along": along, "held": held, "angle": min(60.0 * strength, 720.0)})
 
 
 class BendConfig(DeformConfig):
@@ -136,8 +136,8 @@ class BendConfig(DeformConfig):
     @classmethod
     def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
         (along, towards), held = _two_axes(rng), float(rng.random())
-        given = super().drawn(rng, strength, period).model_dump()
-        return cls(**given | {"along": along, "towards": towards, "held": held, "angle": min(35.0 * strength, 180.0)})
+        keys = super().drawn(rng, strength, period).model_dump()
+        return cls(**keys | {"along": along, "towards": towards, "held": held, "angle": min(35.0 * strength, 180.0)})
 
 
 class BreatheConfig(DeformConfig):
@@ -177,9 +177,9 @@ class AnimationConfig(Config):
         True, description="true: repeats; false: holds the first pose before it and the last pose after it"
     )
 
-    removed: ClassVar[Any] = {
-        "blend": Removed("one clip; mix two in Blender and export the mixture", lambda value: value is None),
-        "share": Removed("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
+    former: ClassVar[dict[str, Former]] = {
+        "blend": Former("one clip; mix two in Blender and export the mixture", lambda value: value is None),
+        "share": Former("no share: two clips are no longer mixed", lambda value: value in (0.5, None)),
     }
 
 

@@ -205,13 +205,13 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
 
 def _share_at(u: float, spec: list[dict[str, Any]]) -> Any:
     """Return the value whose part of [0, 1) contains u."""
-    given = [part for part in spec if _number(part["share"]) > 0]
+    parts = [part for part in spec if _number(part["share"]) > 0]
     upper = 0.0
-    for part in given:
+    for part in parts:
         upper += _number(part["share"])
         if u < upper:
             return part["value"]
-    return given[-1]["value"]
+    return parts[-1]["value"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -259,20 +259,20 @@ def _lay(under: Any, over: Any) -> Any:
 def sites(tree: Any) -> dict[Path, int]:
     """Return the paths of all distributions and their numbers of options, outermost first, including those inside the
     choices of others. Raises ConfigError for a bad one."""
-    found: dict[Path, int] = {}
+    counts: dict[Path, int] = {}
 
     def walk(node: Any, path: Path) -> None:
         if is_distribution(node):
-            given = options(path, node)
-            found[path] = found.get(path, 0) + len(given)
-            for option in given:
+            drawn = options(path, node)
+            counts[path] = counts.get(path, 0) + len(drawn)
+            for option in drawn:
                 walk(option, path)
         else:
             for step, child in _children(node):
                 walk(child, (*path, step))
 
     walk(tree, ())
-    return found
+    return counts
 
 
 def corners(tree: Any) -> Iterator[Any]:
@@ -281,10 +281,22 @@ def corners(tree: Any) -> Iterator[Any]:
     if not (every := sites(tree)):
         yield tree
         return
-    yield _chosen(tree, (), lambda path, node: options(path, node)[0])
+    varying = {path[:depth] for path in every for depth in range(len(path) + 1)}
+
+    def chosen(node: Any, path: Path, pick: Callable[[Path, dict[str, Any]], Any]) -> Any:
+        if path not in varying:
+            return node
+        if is_distribution(node):
+            return chosen(pick(path, node), path, pick)
+        values = [chosen(child, (*path, step), pick) for step, child in _children(node)]
+        if isinstance(node, dict):
+            return dict(zip(node, values))
+        return values if isinstance(node, list) else node
+
+    yield chosen(tree, (), lambda path, node: options(path, node)[0])
     dealer = _Dealer()
     for _ in range(min(max(LEAST, _EACH * sum(every.values())), MOST)):
-        yield _chosen(tree, (), dealer.deal)
+        yield chosen(tree, (), dealer.deal)
 
 
 class _Dealer:
@@ -302,17 +314,6 @@ class _Dealer:
             self._random.shuffle(deck)
             self._decks[path, id(node)] = deck
         return deck.pop()
-
-
-def _chosen(node: Any, path: Path, pick: Callable[[Path, dict[str, Any]], Any]) -> Any:
-    """Return the node with every distribution replaced by ``pick``'s option; the same object where there is none."""
-    if is_distribution(node):
-        return _chosen(pick(path, node), path, pick)
-    children = _children(node)
-    values = [_chosen(child, (*path, step), pick) for step, child in children]
-    if all(value is child for value, (_, child) in zip(values, children)):
-        return node
-    return dict(zip(node, values)) if isinstance(node, dict) else values
 
 
 def _children(node: Any) -> list[tuple[str, Any]]:

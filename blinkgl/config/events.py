@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 
 _MAX_EVENTS = Field(
     2**25,
@@ -120,20 +120,6 @@ class EmulatorConfig(Config):
         sensor : a :class:`~blinkgl.config.sensor.SensorConfig`, which knows the emulators' keys."""
 
 
-def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any]:
-    """Return ``data`` with the missing threshold computed from the given one and ``threshold_ratio``."""
-    ratio, off = data.get("threshold_ratio"), data.get("contrast_threshold_off")
-    if ratio is None or (off is not None and "contrast_threshold" in data):
-        return data
-    given, other = "contrast_threshold", "contrast_threshold_off"
-    if off is not None:
-        given, other = other, given
-    try:
-        return {**data, other: float(data.get(given, default)) * float(ratio)}
-    except (TypeError, ValueError, OverflowError):
-        return data
-
-
 def _pixel(sensor: Any) -> dict[str, Any]:
     return dict(
         contrast_threshold=sensor.contrast_threshold,
@@ -143,20 +129,42 @@ def _pixel(sensor: Any) -> dict[str, Any]:
     )
 
 
-class _TwoThresholds:
+class _TwoThresholds(EmulatorConfig):
     """Shared by emulators with ``contrast_threshold``, ``contrast_threshold_off`` and ``threshold_ratio``."""
 
+    spread: ClassVar[float | None] = None
+    """Standard deviation of the thresholds by the threshold itself: the default of ``threshold_sigma`` where a
+    threshold is given."""
+
     if TYPE_CHECKING:
-        model_fields: ClassVar[dict[str, Any]]
+        contrast_threshold: float
+        contrast_threshold_off: float | None
 
     @property
-    def thresholds(self: Any) -> tuple[float, float]:
+    def thresholds(self) -> tuple[float, float]:
         """Return C+ and C-, ln units."""
         return self.contrast_threshold, self.contrast_threshold_off or self.contrast_threshold
 
+    @model_validator(mode="before")
     @classmethod
-    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
-        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
+    def _completed(cls, data: Any) -> Any:
+        """Return the keys with those that follow from others: the missing threshold from the given one and the ratio,
+        and the spread. Values that are no numbers are left to validation."""
+        if not isinstance(data, dict):
+            return data
+        ratio, default = data.get("threshold_ratio"), cls.model_fields["contrast_threshold"].default
+        basis, missing = "contrast_threshold", "contrast_threshold_off"
+        if data.get(missing) is not None:
+            basis, missing = missing, basis
+        if ratio is not None and data.get(missing) is None:
+            try:
+                data = {**data, missing: float(data.get(basis, default)) * float(ratio)}
+            except (TypeError, ValueError, OverflowError):
+                return data
+        threshold = data.get("contrast_threshold")
+        if cls.spread is not None and "threshold_sigma" not in data and isinstance(threshold, int | float):
+            data = {**data, "threshold_sigma": cls.spread * threshold or cls.model_fields["threshold_sigma"].default}
+        return data
 
     @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
     def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
@@ -169,19 +177,16 @@ class _TwoThresholds:
             )
 
 
-_NO_CORRELATION = {"threshold_correlation": Removed("the key left out", lambda value: value == 0)}
+_NO_CORRELATION = {"threshold_correlation": Former("the key left out", lambda value: value == 0)}
 
 
-_SPREAD = 0.105
-"""Standard deviation of ESIM's thresholds by the threshold itself: 0.021 of 0.2. An absolute one would make a pixel
-that is set to a small threshold fire at many others."""
-
-
-class EsimConfig(_TwoThresholds, EmulatorConfig):
+class EsimConfig(_TwoThresholds):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
     fitted = _ESIM_FITTED
-    removed = _NO_CORRELATION
+    former = _NO_CORRELATION
+    # 0.021 of 0.2. An absolute one would make a pixel that is set to a small threshold fire at many others.
+    spread = 0.105
     emulator: Literal["esim"] = "esim"
     contrast_threshold: float = Field(
         0.2,
@@ -231,14 +236,6 @@ class EsimConfig(_TwoThresholds, EmulatorConfig):
     device: Device = _DEVICE
 
     @classmethod
-    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
-        data = super().completed(data)
-        threshold = data.get("contrast_threshold", 0)
-        if "threshold_sigma" in data or not isinstance(threshold, int | float) or not threshold:
-            return data
-        return {**data, "threshold_sigma": _SPREAD * threshold}
-
-    @classmethod
     def from_sensor(cls, sensor: Any) -> dict[str, Any]:
         return _pixel(sensor)
 
@@ -267,20 +264,20 @@ V2E_PRESETS = {
 
 
 _NO_COMPAT = {
-    "compat": Removed(
+    "compat": Former(
         "the key left out; docs/sensors.md says how these events differ from those of the authors' programs",
         lambda value: value == "none",
     )
 }
-_NO_SECOND_CORNER = {"second_cutoff_hz": Removed("the key left out, and a lower cutoff_hz", lambda value: value == 0)}
+_NO_SECOND_CORNER = {"second_cutoff_hz": Former("the key left out, and a lower cutoff_hz", lambda value: value == 0)}
 
 
-class V2eConfig(_TwoThresholds, EmulatorConfig):
+class V2eConfig(_TwoThresholds):
     """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
 
     presets = V2E_PRESETS
     fitted = _V2E_FITTED
-    removed: ClassVar[Any] = {**_NO_COMPAT, **_NO_CORRELATION, **_NO_SECOND_CORNER}
+    former: ClassVar[dict[str, Former]] = {**_NO_COMPAT, **_NO_CORRELATION, **_NO_SECOND_CORNER}
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
@@ -381,7 +378,7 @@ class VoltmeterConfig(EmulatorConfig):
 
     presets = VOLTMETER_PRESETS
     fitted = _VOLTMETER_FITTED
-    removed = _NO_COMPAT
+    former = _NO_COMPAT
     one_threshold = True
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field(

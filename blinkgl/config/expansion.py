@@ -60,8 +60,8 @@ def expanded(tree: Table, base: Path) -> Table:
     }
 
     def spelled_out(table: Table) -> Table:
-        said = {key: each_option(table[key], meaning) for key, meaning in meanings.items() if key in table}
-        return {**table, **said}
+        meant = {key: each_option(table[key], meaning) for key, meaning in meanings.items() if key in table}
+        return {**table, **meant}
 
     def placed(table: Table) -> Table:
         return {**spelled_out(table), **placed_by_calibration(table, base)}
@@ -104,12 +104,12 @@ def with_scenes(tree: Table, base: Path) -> Table:
 
 
 def _scene_from(own: Table, where: str, base: Path) -> Table:
-    given = own.pop("from")
-    if not isinstance(given, str):
-        raise ConfigError("not a file", where=where, value=given, accepted="a YAML file with a scene")
-    scene = read_table(base / given).get("scene")
+    file = own.pop("from")
+    if not isinstance(file, str):
+        raise ConfigError("not a file", where=where, value=file, accepted="a YAML file with a scene")
+    scene = read_table(base / file).get("scene")
     if not isinstance(scene, dict) or "from" in scene:
         raise ConfigError(
-            "the file has no table scene", where=where, value=given, accepted="a file with the table scene"
+            "the file has no table scene", where=where, value=file, accepted="a file with the table scene"
         )
     return merge(scene, own)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, rule
 from blinkgl.config.values import Paths
 
 CURVES = ("srgb", "linear", "pq", "hlg")
+ACCEPTED_CURVES = f"{', '.join(CURVES)} or an exponent up to 10"
 FLOW_FORMATS = ("dsec", "kitti", "vkitti2", "tartanair2", "flo", "pfm", "flo5", "npy")
 MAX_SPAN_S = (2**32 - 1) * 1e-6
 """Longest recording of one event file, s: DSEC stores microseconds in 32 bits."""
@@ -81,19 +82,18 @@ class FramesConfig(Config):
         description="99th percentile of the given flow, px, above which frames are too far apart to interpolate "
         "and their sequence is skipped; null: no check",
     )
-    removed: ClassVar[Any] = {
-        "qualify": Removed("max_displacement", lambda value: value is None or isinstance(value, dict)),
-        "factor": Removed(
+    former: ClassVar[dict[str, Former]] = {
+        "qualify": Former("max_displacement", lambda value: value is None or isinstance(value, dict)),
+        "factor": Former(
             "the key left out: it belonged to interpolate: cubic, which was removed", lambda value: value == 4
         ),
-        "backward": Removed("the key left out: it has no effect", lambda value: value is None),
+        "backward": Former("the key left out: it has no effect", lambda value: value is None),
     }
 
     @rule("gamma")
     def _a_curve(gamma: str | float | None):
         if (isinstance(gamma, str) and gamma not in CURVES) or (isinstance(gamma, float) and not 0 < gamma <= 10):
-            accepted = f"{', '.join(CURVES)} or an exponent up to 10"
-            raise Refused("unknown transfer curve", where="gamma", value=gamma, accepted=accepted)
+            raise Refused("unknown transfer curve", where="gamma", value=gamma, accepted=ACCEPTED_CURVES)
 
     @rule("flow_format")
     def _a_format(flow_format: str):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 
 NS_PER_S, NS_PER_US = 1_000_000_000, 1000
 MAX_IMAGES = 1_000_000
@@ -34,19 +34,11 @@ class AutoExposureConfig(Config):
     lag: float = Field(
         0.2, ge=0, le=1e4, description="time constant, s, after which 63 % of a change is done; 0: immediate"
     )
-    shortest_us: float = Field(20.0, ge=1, le=1e9, description="shortest exposure, µs")
-    longest_us: float = Field(20000.0, ge=1, le=1e9, description="longest exposure, µs")
+    shortest_us: ClassVar[float] = 20.0
+    """Shortest exposure, µs."""
+    former: ClassVar[dict[str, Former]] = {"shortest_us": always(shortest_us)}
+    longest_us: float = Field(20000.0, ge=shortest_us, le=1e9, description="longest exposure, µs; the shortest is 20")
     max_gain_db: float = Field(24.0, ge=0, le=60, description="highest gain, dB")
-
-    @rule("shortest_us", "longest_us")
-    def _ordered(shortest, longest):
-        if shortest > longest:
-            raise Refused(
-                "the shortest exposure exceeds the longest",
-                where="shortest_us",
-                value=shortest,
-                accepted=f"at most longest_us = {longest:g}",
-            )
 
 
 class ImagesConfig(Config):
@@ -82,8 +74,6 @@ class ImagesConfig(Config):
             "also": ["clean"],
         },
     }
-
-    instead: ClassVar[dict[str, str]] = {"times": "rate"}
 
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
         "plain",
@@ -148,12 +138,17 @@ class ImagesConfig(Config):
         "shutter, pinhole, no noise. clean: the same image without noise",
     )
 
-    @rule(
-        "auto_exposure.shortest_us", "auto_exposure.longest_us", "auto_exposure.max_gain_db", "exposure_us", "gain_db"
-    )
-    def _begins_inside(shortest, longest, most_db, exposure, gain):
-        if shortest is None:
+    @model_validator(mode="before")
+    @classmethod
+    def _times_instead_of_a_rate(cls, data: Any) -> Any:
+        """Return the keys with a rate of null beside times: the rate of a preset or the default would contradict."""
+        return {"rate": None, **data} if isinstance(data, dict) and data.get("times") is not None else data
+
+    @rule("auto_exposure.longest_us", "auto_exposure.max_gain_db", "exposure_us", "gain_db")
+    def _begins_inside(longest, most_db, exposure, gain):
+        if longest is None:
             return
+        shortest = AutoExposureConfig.shortest_us
         if not shortest <= exposure <= longest:
             raise Refused(
                 "the first exposure is outside the limits of auto_exposure",

@@ -6,10 +6,11 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from blinkgl.config.base import Config, Refused
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.problems import nearest
 
 _ACCEPTED = (
     "forward, backward, or an interval in s: a number or a fraction such as 1/100, from 1e-6 to 4300, negative: back"
@@ -58,11 +59,28 @@ def _a_table(value: Any) -> Any:
     return value
 
 
-class LabelsConfig(Config):
+class LabelsConfig(Config, extra="allow"):
     """Ground truth at label times. A pass that no label needs is not compiled, allocated or run."""
 
     settings: ClassVar[Any] = ("events", "pixels", "flow", "float_flow", "occlusion")
     """Keys that do not name a label."""
+    added: ClassVar[list[str]] = []
+    """Keys of the labels of plug-ins, true or false."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_added(cls, data: Any) -> Any:
+        """Return the keys with those of plug-ins, false unless they are given. Raises Refused for an unknown key."""
+        if not isinstance(data, dict):
+            return data
+        known = {*cls.model_fields, *cls.added}
+        for key, value in data.items():
+            if isinstance(key, str) and key not in known:
+                raise Refused("unknown key", where=key, accepted=nearest(key, sorted(known)))
+            if key in cls.added and not isinstance(value, bool):
+                raise Refused("not true or false", where=key, value=value, accepted="true or false")
+        return {**dict.fromkeys(cls.added, False), **data}
+
     events: bool = Field(
         False,
         description="source of each event: instance, depth and image velocity of the surface, and the cause "

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, Removed, one_of, rule
+from blinkgl.config.base import Config, Former, Refused, always, one_of, rule
 from blinkgl.config.materials import Radiance
 from blinkgl.config.poses import KeyedMotionConfig
 from blinkgl.config.values import (
@@ -97,8 +97,8 @@ class EnvironmentConfig(Config):
     )
     heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn as a sky at infinity")
-    removed: ClassVar[Any] = {
-        "size": Removed("the key left out: a panorama is at infinity", lambda value: value == 100)
+    former: ClassVar[dict[str, Former]] = {
+        "size": Former("the key left out: a panorama is at infinity", lambda value: value == 100)
     }
 
 
@@ -148,14 +148,14 @@ class LightConfig(Config):
 
     @rule("#lights")
     def _not_too_many(lights):
-        if (given := len([*lights])) > MAX_LIGHTS:
-            raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
+        if (count := len([*lights])) > MAX_LIGHTS:
+            raise Refused("too many lights", where="lights", value=count, accepted=f"at most {MAX_LIGHTS}")
 
     @rule("unlit", "#lights", "?environment", "?over_time", "shadows")
     def _lit(unlit, lights, environment, over_time, shadows):
         effects = {"lights": [*lights], "environment": environment, "over_time": over_time, "shadows": shadows != "off"}
-        for where, given in effects.items():
-            if unlit and given:
+        for where, used in effects.items():
+            if unlit and used:
                 raise Refused("these lights have no effect", where=where, value="unlit: true", accepted="unlit: false")
 
 
@@ -177,11 +177,11 @@ class RandomLightsConfig(Config):
     strength: PositiveRange = Field(
         (3.0, 30.0), description="strength of point and spot lights, see light.lights; log-uniform"
     )
-    sun_strength: ClassVar[Any] = (0.1, 0.6)
+    sun_strength: ClassVar[tuple[float, float]] = (0.1, 0.6)
     """Strength of further suns; log-uniform."""
-    saturation: ClassVar[Any] = 0.5
+    saturation: ClassVar[float] = 0.5
     """Largest saturation of a colour; the brightest channel is 1 and all hues are equally likely."""
-    fixed: ClassVar[Any] = ("sun_strength", "saturation")
+    former: ClassVar[dict[str, Former]] = {"sun_strength": always(sun_strength), "saturation": always(saturation)}
     height: PositiveRange = Field((2.0, 6.0), description="above the ground, m; uniform")
     angle: PositiveRange = Field((30.0, 100.0), description="angle of a spot light's cone, degrees; uniform")
 

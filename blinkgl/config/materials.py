@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, at_most_one, rule
 from blinkgl.config.waveforms import OVER_TIME, WaveformConfig
 
-TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
+TEXTURE_KINDS: tuple[str, ...] = get_args(TextureKind)
 Radiance = Annotated[float, Field(ge=0, le=1e9)]
 Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
 
@@ -57,13 +57,9 @@ class MaterialConfig(Config):
     )
     cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="threshold of the mask; 1 is white or opaque")
 
-    removed: ClassVar[Any] = {"double_sided": Removed("both_sides: true", lambda value: value is False)}
+    former: ClassVar[dict[str, Former]] = {"double_sided": Former("both_sides: true", lambda value: value is False)}
 
-    @rule("texture", "procedural", "photograph")
-    def _one(*sources):
-        given = [k for k, v in zip(("texture", "procedural", "photograph"), sources) if v is not None]
-        if len(given) > 1:
-            raise Refused("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
+    _one = at_most_one("texture", "procedural", "photograph")
 
     @property
     def files(self) -> dict[str, str]:
@@ -92,11 +88,11 @@ class MaterialConfig(Config):
 
     @rule("unlit", "normal_map", "metallic_roughness_map", "emission_map")
     def _maps_of_what_is_lit(unlit, *maps):
-        given = [k for k, v in zip(("normal_map", "metallic_roughness_map", "emission_map"), maps) if v is not None]
-        if unlit and given:
+        used = [k for k, v in zip(("normal_map", "metallic_roughness_map", "emission_map"), maps) if v is not None]
+        if unlit and used:
             raise Refused(
                 "this map has no effect on an unlit surface",
-                where=given[0],
+                where=used[0],
                 value=maps[0] or maps[1] or maps[2],
                 accepted="unlit: false, or no such map",
             )

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused
+from blinkgl.config.base import Config, Refused, always
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The ``imu:`` section: the inertial unit on the camera (:mod:`blinkgl.sequence.inertial`).
@@ -49,9 +49,7 @@ class ImuConfig(Config):
     accelerometer_random_walk: float = Field(0.0, **_NOISE, description="random walk of the bias, m/s³/√Hz")
     gyroscope_noise_density: float = Field(0.0, **_NOISE, description="white noise, rad/s/√Hz")
     gyroscope_random_walk: float = Field(0.0, **_NOISE, description="random walk of the bias, rad/s²/√Hz")
-    accelerometer_bias: ClassVar[Any] = (0.0, 0.0, 0.0)
-    gyroscope_bias: ClassVar[Any] = (0.0, 0.0, 0.0)
-    fixed: ClassVar[Any] = ("accelerometer_bias", "gyroscope_bias")
+    former = dict.fromkeys(("accelerometer_bias", "gyroscope_bias"), always((0.0, 0.0, 0.0)))
 
     @property
     def noisy(self) -> bool:

@@ -13,11 +13,11 @@ scene:
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 from blinkgl.config.trajectory import RateRange, SpeedRange
 from blinkgl.config.values import as_pair, ordered
 
@@ -71,7 +71,7 @@ class RandomPhysicsConfig(PhysicsConfig):
     density: _range_of(_Density) = Field((100.0, 2000.0), description="kg/m³: a number or [low, high]; log-uniform")
     friction: _range_of(_Friction) = Field((0.2, 0.9), description="a number or [low, high]; uniform")
     restitution: _range_of(_Restitution) = Field((0.1, 0.8), description="a number or [low, high]; uniform")
-    rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, as a fraction of a body's radius")
+    former: ClassVar[dict[str, Former]] = {"rolling": always(0.01)}
 
 
 class BodyConfig(Config):
@@ -99,7 +99,9 @@ class BodyConfig(Config):
         (0.0, 0.0, 0.0), description="angular velocity at the start about the world's axes, deg/s"
     )
 
-    removed: ClassVar[Any] = {"shape": Removed("the mesh's own hull, box or ball", lambda value: value == "auto")}
+    former: ClassVar[dict[str, Former]] = {
+        "shape": Former("the mesh's own hull, box or ball", lambda value: value == "auto")
+    }
 
     @rule("kind", "velocity", "spin")
     def _only_what_moves_has_a_velocity(kind, velocity, spin):

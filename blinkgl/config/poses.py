@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, at_most_one, rule
 from blinkgl.config.values import (
     Fraction,
     Position,
@@ -70,12 +70,7 @@ class PoseConfig(Config):
         None, description="point towards which the camera's z axis, or an object's x axis, is turned"
     )
 
-    @rule("quaternion", "euler", "look_at")
-    def _one_orientation(quaternion, euler, look_at):
-        given = [k for k, v in (("quaternion", quaternion), ("euler", euler), ("look_at", look_at)) if v is not None]
-        if len(given) > 1:
-            raise Refused("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
-
+    _one_orientation = at_most_one("quaternion", "euler", "look_at")
     _some_rotation = some_rotation
 
     @rule("look_at", "position")
@@ -219,6 +214,6 @@ class WayConfig(Config):
 
     @rule("#points", "closed")
     def _a_way(points, closed):
-        least, given = (3 if closed else 2), len([*points])
-        if given < least:
-            raise Refused(f"a way needs at least {least} points", where="points", value=given)
+        least, count = (3 if closed else 2), len([*points])
+        if count < least:
+            raise Refused(f"a way needs at least {least} points", where="points", value=count)

@@ -212,7 +212,7 @@ _NUMBER_WORDS = {2: "two", 3: "three", 4: "four"}
 
 
 def _limits(info: FieldInfo | None) -> str:
-    said = []
+    limits = []
     for kind, attribute, words in (
         (annotated_types.Gt, "gt", "greater than"),
         (annotated_types.Ge, "ge", "at least"),
@@ -220,13 +220,13 @@ def _limits(info: FieldInfo | None) -> str:
         (annotated_types.Le, "le", "at most"),
         (annotated_types.MultipleOf, "multiple_of", "a multiple of"),
     ):
-        said += [
+        limits += [
             f"{words} {_plain(getattr(m, attribute))}"
             for m in (info.metadata if info is not None else ())
             if isinstance(m, kind)
         ]
-    text = " and ".join(said)
-    return re.sub(r"^ at least (\S+) and at most (\S+)$", r" from \1 to \2", f" {text}") if said else ""
+    text = " and ".join(limits)
+    return re.sub(r"^ at least (\S+) and at most (\S+)$", r" from \1 to \2", f" {text}") if limits else ""
 
 
 def _plain(number: Any) -> str:

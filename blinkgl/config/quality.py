@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from importlib import resources
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from blinkgl.config.reader import shipped
 
 Quality = Literal["fast", "balanced", "accurate", "reference"]
-QUALITIES = ("fast", "balanced", "accurate", "reference")
+QUALITIES: tuple[str, ...] = get_args(Quality)
 DEFAULT: Quality = "balanced"
 """The preset of a configuration without the key; ``quality: null`` leaves every key at its own default."""
 

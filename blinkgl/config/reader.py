@@ -24,6 +24,7 @@ from yaml.nodes import MappingNode, Node, ScalarNode
 from yaml.resolver import Resolver
 
 from blinkgl.config.draw import is_distribution
+from blinkgl.config.names import shipped_names
 from blinkgl.errors import ConfigError
 
 MAX_BYTES = 4 << 20
@@ -265,10 +266,10 @@ def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
 
 def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
     """Return ``tree`` with the table of each sensor in ``sensors:`` changed."""
-    given = tree.get("sensors")
-    if not isinstance(given, list):
+    sensors = tree.get("sensors")
+    if not isinstance(sensors, list):
         return tree
-    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in given]}
+    return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in sensors]}
 
 
 def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
@@ -311,13 +312,6 @@ def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
 # Files that ship with the program, by name: runs, and tables of sensors, rigs, quality presets and recipes.
 
 
-@lru_cache
-def shipped_names(kind: str) -> tuple[str, ...]:
-    """Return the sorted names of all tables of a kind, which is a folder of ``blinkgl/configs``."""
-    files = (resources.files("blinkgl.configs") / kind).iterdir()
-    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
-
-
 def shipped(kind: str, name: Any, what: str = "table", where: str = "") -> dict[str, Any]:
     """Return a copy of the table of this name. Raises ConfigError listing the known ones (:func:`shipped_names`).
 
@@ -344,15 +338,15 @@ def shipped_runs() -> dict[str, Path]:
     return {path.stem: path for pattern in _RUNS for path in sorted(folder.glob(pattern))}
 
 
-def run_file(given: str | Path) -> Path:
-    """Return the file ``given`` or, where there is none, the shipped run of that name: "demo", "demo.yaml" and
+def run_file(name: str | Path) -> Path:
+    """Return the file ``name`` or, where there is none, the shipped run of that name: "demo", "demo.yaml" and
     "configs/demo.yaml" are the same. (A folder does not count: ``generate demo --out demo`` creates one.) Raises
     ConfigError."""
-    path = Path(given)
+    path = Path(name)
     shipped_one = shipped_runs().get(path.stem)
     if (path.exists() or path.is_symlink()) and not (path.is_dir() and str(path) == path.stem and shipped_one):
         return path
     named = shipped_one is not None and shipped_one.as_posix().endswith(f"/{path.with_suffix('.yaml').as_posix()}")
     if shipped_one is not None and (named or path.parent == Path()):
         return shipped_one
-    raise ConfigError("no such file", where=str(given), accepted="a YAML file, or a name that 'blinkgl configs' lists")
+    raise ConfigError("no such file", where=str(name), accepted="a YAML file, or a name that 'blinkgl configs' lists")

@@ -4,11 +4,11 @@ clock, in this order. Parts that are not given are absent."""
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, rule
+from blinkgl.config.base import Config, Former, Refused, always, rule
 
 _Px = Annotated[int, Field(ge=0, le=16384)]
 _Rate = Annotated[float, Field(ge=0, le=1e4)]
@@ -94,23 +94,19 @@ class FrameResetsConfig(Config):
     kick: float = Field(
         gt=0, le=5, description="Height of the jump, in units of the smaller of the emulator's ON and OFF thresholds."
     )
-    length_ms: float = Field(1.0, gt=0, le=1000, description="Time until the signal has returned, ms.")
+    length_ms: ClassVar[float] = 1.0
+    """Time until the signal has returned, ms; shorter than any interval."""
+    former: ClassVar[dict[str, Former]] = {"length_ms": always(length_ms)}
     first_ms: float = Field(0.0, ge=0, le=10_000, description="Time of the first reset after the first frame, ms.")
-
-    @rule("interval_ms", "length_ms")
-    def _over_before_the_next(interval: float, length: float):
-        if length + 1 > interval:
-            raise Refused("the jump does not end before the next one", where="length_ms", value=length,
-                          accepted=f"at most {interval - 1:g}, a millisecond less than interval_ms")  # fmt: skip
 
 
 class ReadoutConfig(Config):
     """The bus between pixels and time stamps (:mod:`blinkgl.events.camera`), and before it the pixels' noise
     (:mod:`blinkgl.events.pixels`)."""
 
-    removed: ClassVar[Any] = {
-        "filters": Removed("events filtered after they were written", lambda value: not value),
-        "latency": Removed("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
+    former: ClassVar[dict[str, Former]] = {
+        "filters": Former("events filtered after they were written", lambda value: not value),
+        "latency": Former("the key left out: v2e's cutoff_hz makes events late", lambda value: value is None),
     }
 
     events_per_second: float | None = Field(

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from blinkgl.camera import PinHole
-from blinkgl.config.base import Config, Refused, rule
+from blinkgl.config.base import Config, Refused, at_most_one, rule
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.images import ImagesConfig
@@ -58,19 +58,14 @@ class PlaceConfig(Config):
         "(Kalibr's T_cn_cnm1 is the inverse of a camera's pose relative to the previous one)",
     )
 
-    @rule("euler", "quaternion", "matrix", "position")
-    def _one_place(euler, quaternion, matrix, position):
-        turned = [k for k, v in (("euler", euler), ("quaternion", quaternion), ("matrix", matrix)) if v is not None]
-        if len(turned) > 1:
-            raise Refused("only one of euler, quaternion, matrix may be given, not " + " and ".join(turned))
-        if matrix is not None and any(position):
-            raise Refused("the matrix contains the position", where="position", value=list(position))
-
+    _one_orientation = at_most_one("euler", "quaternion", "matrix")
     _some_rotation = some_rotation
 
-    @rule("matrix")
-    def _rigid(matrix):
+    @rule("matrix", "position")
+    def _whole_place(matrix, position):
         if matrix is not None:
+            if any(position):
+                raise Refused("the matrix contains the position", where="position", value=list(position))
             check_rigid(matrix, "matrix")
 
     @property
@@ -128,8 +123,8 @@ class RigSensorConfig(Config):
     @property
     def sees(self) -> bool:
         """Return whether it is a camera: of events, of images, or of labels alone."""
-        told = self.tracks is not None or self.labels != LabelsConfig(images=False, flow=())
-        return self.events is not None or self.images is not None or told
+        labelled = self.tracks is not None or self.labels != LabelsConfig(images=False, flow=())
+        return self.events is not None or self.images is not None or labelled
 
 
 def is_rig(tree: Any) -> bool:
@@ -178,8 +173,8 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
 def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     """Return ``tree`` with its own sensors laid over those of its preset. Repeating it changes nothing. Raises
     ConfigError for an unknown rig, no list of sensors, or two of one name."""
-    given = tree.get("sensors")
-    own = [] if given is None else given
+    sensors = tree.get("sensors")
+    own = [] if sensors is None else sensors
     if not isinstance(own, list):
         raise ConfigError("not a list", where="sensors", value=own, accepted="- {name: left, …}")
     for k, one in enumerate(own):
@@ -191,22 +186,22 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
 
 def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a preset's sensors, in its order, with those of the same names laid over them, then the others."""
-    said: dict[Any, dict[str, Any]] = {}
+    by_name: dict[Any, dict[str, Any]] = {}
     for k, one in enumerate(own):
         name = one.get("name")
         low = name.lower() if isinstance(name, str) else k
-        if low in said:
+        if low in by_name:
             raise ConfigError(
                 "two sensors have the same name",
                 where=f"sensors.{k}.name",
                 value=name,
                 accepted="different names, ignoring case",
             )
-        said[low] = one
+        by_name[low] = one
     under = {one["name"]: one for one in base}
     return [
-        *(_over_preset(one, said[name]) if name in said else one for name, one in under.items()),
-        *(copy.deepcopy(one) for name, one in said.items() if name not in under),
+        *(_over_preset(one, by_name[name]) if name in by_name else one for name, one in under.items()),
+        *(copy.deepcopy(one) for name, one in by_name.items() if name not in under),
     ]
 
 
@@ -269,8 +264,8 @@ _FOCAL = (("fov",), ("focal",), ("fx", "fy"))
 def _drop_other_focal(above: Any, own: Any) -> None:
     """Drop the top level's focal length where a sensor gives its own in another way."""
     if isinstance(above, dict) and isinstance(own, dict):
-        said = {key for keys in _FOCAL if any(own.get(key) is not None for key in keys) for key in keys}
-        for key in {key for keys in _FOCAL for key in keys} - said if said else ():
+        used = {key for keys in _FOCAL if any(own.get(key) is not None for key in keys) for key in keys}
+        for key in {key for keys in _FOCAL for key in keys} - used if used else ():
             above.pop(key, None)
 
 

@@ -30,7 +30,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from blinkgl.config.base import Refused, placed, remembering
+from blinkgl.config.base import Refused, placed
 from blinkgl.config.draw import Fill, corners, draw, is_distribution, sites
 from blinkgl.config.expansion import expanded, with_scenes
 from blinkgl.config.labels import fill_causes
@@ -117,8 +117,7 @@ class RunTemplate:
     def corners(self) -> list[SequenceConfig]:
         """Return configurations that represent all that can be drawn (:mod:`blinkgl.config.draw`). Raises
         ConfigError."""
-        with remembering():
-            return [_validated(tree) for tree in corners(with_default(self.tree))]
+        return [_validated(tree) for tree in corners(with_default(self.tree))]
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
             tree["seed"] = validate_field(SequenceConfig, "seed", own["seed"])
         if isinstance(tree.setdefault("output", {}), dict):
             tree["output"].setdefault("name", name)
-        with placed(str, said=f"in group '{name}': "):
+        with placed(str, before=f"in group '{name}': "):
             made.append(_group(name, tree, template, enabled))
     folders: dict[tuple[str, str], str] = {}
     for group in made:

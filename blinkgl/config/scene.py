@@ -7,11 +7,11 @@ models define only shapes, units and limits.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WrapValidator
 
-from blinkgl.config.base import Config, Refused, Removed, one_of, rule
+from blinkgl.config.base import Config, Former, Refused, always, one_of, rule
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.lights import FOG, FogConfig, LightConfig, RandomLightsConfig
 from blinkgl.config.materials import TEXTURE_KINDS, MaterialConfig, TextureKind
@@ -77,11 +77,11 @@ class PoolConfig(Config):
         description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for others",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
-    removed: ClassVar[Any] = {
-        "urdfs": Removed("folders: [...]", lambda value: value in (False, "auto")),
+    max_file_mb: ClassVar[float] = 512.0
+    former: ClassVar[dict[str, Former]] = {
+        "urdfs": Former("folders: [...]", lambda value: value in (False, "auto")),
+        "max_file_mb": always(max_file_mb),
     }
-    max_file_mb: ClassVar[Any] = 512.0
-    fixed: ClassVar[Any] = ("max_file_mb",)
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: Literal["auto"] | bool = Field(
         "auto",
@@ -115,11 +115,10 @@ class TexturesConfig(Config):
 class SkyConfig(Config):
     """Textured box around the scene, seen from inside, unlit."""
 
-    kind: Literal["box"] = "box"
     size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
-    subdivisions: int = Field(
-        4, ge=1, le=256, description="cells per edge; 1 loses a third of the flow's precision, more than 4 gains none"
-    )
+    subdivisions: ClassVar[int] = 4
+    """Cells per edge; 1 loses a third of the flow's precision, more than 4 gains none."""
+    former: ClassVar[dict[str, Former]] = {"kind": always("box"), "subdivisions": always(subdivisions)}
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
     per_face: bool = Field(True, description="true: one texture per face; false: one for all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
@@ -142,11 +141,15 @@ class SkyConfig(Config):
 
 
 class GroundConfig(Config):
-    """Textured square at a constant height."""
+    """Textured square at z = 0, as wide as the sky."""
 
-    size: float | None = Field(None, gt=0, le=1e6, description="edge length, m; null: that of the sky box")
-    height: float = Field(0.0, description="z of the ground, m")
-    subdivisions: int = Field(8, ge=1, le=1024, description="cells per edge; more gains no precision and costs time")
+    subdivisions: ClassVar[int] = 8
+    """Cells per edge; more gains no precision and costs time."""
+    former: ClassVar[dict[str, Former]] = {
+        "size": always(None),
+        "height": always(0),
+        "subdivisions": always(subdivisions),
+    }
     tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
 
 
@@ -155,9 +158,9 @@ class RegionConfig(Config):
 
     width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
     height: float = Field(8.0, gt=0, le=1e6, description="m")
-    camera_height: ClassVar[Any] = (1.0, 3.5)
+    camera_height: ClassVar[tuple[float, float]] = (1.0, 3.5)
     """Height of the camera's first position above the ground, m; uniform."""
-    fixed: ClassVar[Any] = ("camera_height",)
+    former: ClassVar[dict[str, Former]] = {"camera_height": always(camera_height)}
 
 
 class RandomSceneConfig(Config):
@@ -183,8 +186,8 @@ class RandomSceneConfig(Config):
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
-    removed: ClassVar[Any] = {
-        "walls": Removed(
+    former: ClassVar[dict[str, Former]] = {
+        "walls": Former(
             "scene: {kind: explicit} with objects of category: wall",
             lambda value: value is False or (isinstance(value, dict) and not value.get("count")),
         )
@@ -192,8 +195,8 @@ class RandomSceneConfig(Config):
 
     @rule("?lights", "sky.lights", "light.unlit", "?light.environment")
     def _lit(lights, sky_lights, unlit, environment):
-        for where, given in (("lights", lights), ("sky.lights", sky_lights)):
-            if given and unlit:
+        for where, used in (("lights", lights), ("sky.lights", sky_lights)):
+            if used and unlit:
                 raise Refused(
                     "these lights have no effect", where=where, value="light.unlit: true", accepted="light.unlit: false"
                 )
@@ -240,9 +243,9 @@ class MeshConfig(Config):
         description="upward axis of the file, which becomes the world's z: with y, the file's (x, y, z) is drawn "
         "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for others",
     )
-    project_uvs: ClassVar[Any] = False
-    uv_size: ClassVar[Any] = 1.0
-    fixed: ClassVar[Any] = ("project_uvs", "uv_size")
+    uv_size: ClassVar[float] = 1.0
+    """Edge of one repeat of projected texture coordinates, m."""
+    former: ClassVar[dict[str, Former]] = {"project_uvs": always(False), "uv_size": always(uv_size)}
 
     @rule("primitive", "file")
     def _one(primitive, file):
@@ -295,30 +298,22 @@ class ObjectConfig(KeyedMotionConfig):
         if way and (keyframes or any(position) or any(o is not None for o in orientation)):
             raise Refused("give a way, a fixed pose or keyframes, not several of them")
 
-    @rule("physics.kind", "?trajectory")
-    def _the_engine_or_a_trajectory(kind, trajectory):
-        if kind == "dynamic" and trajectory:
-            raise Refused(
-                "a dynamic body has no trajectory: the engine moves it",
-                where="physics.kind",
-                value=kind,
-                accepted="fixed, which pushes what it meets on its way",
-            )
-
-    @rule("physics.kind", "#keyframes")
-    def _the_engine_or_key_frames(kind, keyframes):
-        if kind == "dynamic" and keyframes:
-            raise Refused(
-                "a dynamic body has no key frames: the engine moves it",
-                where="physics.kind",
-                value=kind,
-                accepted="fixed, which pushes what it meets on its way, or a pose without key frames",
-            )
+    @rule("physics.kind", "?trajectory", "#keyframes")
+    def _the_engine_moves_it(kind, trajectory, keyframes):
+        ways = (("trajectory", trajectory, ""), ("key frames", keyframes, ", or a pose without key frames"))
+        for way, there, otherwise in ways:
+            if kind == "dynamic" and there:
+                raise Refused(
+                    f"a dynamic body has no {way}: the engine moves it",
+                    where="physics.kind",
+                    value=kind,
+                    accepted=f"fixed, which pushes what it meets on its way{otherwise}",
+                )
 
 
-def _known(used, known, key: str, table: str, at=None) -> None:
-    for number, name in zip(at if at is not None else range(len(used)), used):
-        if name not in known:
+def _known(used: tuple[str | None, ...], known: tuple[str, ...], key: str, table: str) -> None:
+    for number, name in enumerate(used):
+        if name is not None and name not in known:
             raise Refused(
                 f"no such name under {table}",
                 where=f"objects.{number}.{key}",
@@ -360,11 +355,11 @@ class ExplicitSceneConfig(Config):
     fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
-    max_faces: ClassVar[Any] = 5_000_000
-    fixed: ClassVar[Any] = ("max_faces",)
+    max_faces: ClassVar[int] = 5_000_000
+    former: ClassVar[dict[str, Former]] = {"max_faces": always(max_faces)}
 
     @rule("objects.*.mesh", "#meshes")
-    def _meshes_are_known(used, known):
+    def _meshes_are_known(used: tuple[str, ...], known: tuple[str, ...]):
         _known(used, known, "mesh", "scene.meshes")
 
     @rule("?physics", "objects.*.physics.kind")
@@ -388,14 +383,8 @@ class ExplicitSceneConfig(Config):
         object_names(names, meshes)
 
     @rule("objects.*.material", "#materials")
-    def _materials_are_known(used, known):
-        _known(
-            [name for name in used if name is not None],
-            known,
-            "material",
-            "scene.materials",
-            at=[k for k, n in enumerate(used) if n is not None],
-        )
+    def _materials_are_known(used: tuple[str | None, ...], known: tuple[str, ...]):
+        _known(used, known, "material", "scene.materials")
 
 
 class FileSceneConfig(Config):
@@ -427,9 +416,9 @@ class FileSceneConfig(Config):
         description="factor on the file's lights; their lux and candela are divided by 683 lm/W, the factor of "
         "Blender's exporter",
     )
-    max_faces: ClassVar[Any] = 5_000_000
-    max_texture_size: ClassVar[Any] = 2048
-    fixed: ClassVar[Any] = ("max_faces", "max_texture_size")
+    max_faces: ClassVar[int] = 5_000_000
+    max_texture_size: ClassVar[int] = 2048
+    former: ClassVar[dict[str, Former]] = {"max_faces": always(max_faces), "max_texture_size": always(max_texture_size)}
 
     @rule("lights", "light.unlit")
     def _lit(lights, unlit):

@@ -30,8 +30,9 @@ from pydantic import AfterValidator, Discriminator, Field, Tag
 from blinkgl.config.base import Config, Refused, placed, rule
 from blinkgl.config.draw import corners, draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.names import shipped_names
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import read_table, shipped, shipped_names
+from blinkgl.config.reader import read_table, shipped
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 
@@ -115,8 +116,8 @@ class SensorConfig(Config):
         models = EmulatorConfig.members
         if not isinstance(emulator, str) or emulator not in models:
             return {}
-        said = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
-        return {**said, **copy.deepcopy(self.emulators.get(emulator, {}))}
+        known = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
+        return {**known, **copy.deepcopy(self.emulators.get(emulator, {}))}
 
     def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
         """Return the configuration of the emulator of this name with this sensor's values, then ``overrides``. Raises
@@ -155,15 +156,8 @@ def sensor_table(name: Any) -> dict[str, Any]:
     """Return a copy of a sensor file's table, distributions included. Raises ConfigError as :func:`load_sensor`."""
     if is_sensor_file(name):
         return read_table(name, "a sensor: name, width, height, ...")
-    known = known_sensor(name)
-    if known is None:
-        raise ConfigError(
-            "unknown sensor",
-            where="sensor",
-            value=name,
-            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
-        )
-    return shipped("sensors", known)
+    with placed("sensor"):
+        return shipped("sensors", known_sensor(_sensor(name)))
 
 
 def is_sensor_file(name: Any) -> bool:
@@ -208,14 +202,14 @@ def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
         camera = validate(SensorConfig, sensor) if isinstance(sensor, dict) else load_sensor(sensor)
     except ConfigError:  # the check of the key sensor reports this
         return {}
-    said = {
+    keys = {
         "camera": {"width": camera.width, "height": camera.height},
         "events": camera.values(EmulatorConfig.default_member if emulator is None else emulator),
     }
-    return said if camera.readout is None else {**said, "readout": camera.readout.model_dump()}
+    return keys if camera.readout is None else {**keys, "readout": camera.readout.model_dump()}
 
 
-def _sensor(name: str) -> str:
+def _sensor(name: Any) -> Any:
     if known_sensor(name) is None:
         raise Refused(
             "unknown sensor",

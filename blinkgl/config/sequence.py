@@ -11,14 +11,14 @@ import re
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
-from pydantic.fields import FieldInfo
 
-from blinkgl.config.base import Config, Refused, Removed, rule
-from blinkgl.config.camera import CameraConfig, camera_radius
+from blinkgl.config.base import Config, Former, Refused, always, rule
+from blinkgl.config.camera import CameraConfig, room_for
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.labels import LabelsConfig
+from blinkgl.config.names import shipped_names
 from blinkgl.config.optics import OpticsConfig
 from blinkgl.config.over_time import ImuConfig, TracksConfig, check_imu, check_tracks
 from blinkgl.config.quality import DEFAULT, Quality
@@ -100,8 +100,8 @@ class TimeConfig(Config):
         whole = self.label_count / self.label_rate
         if self.duration - whole < 1e-6 * self.duration:
             return ()
-        said = f"time.duration: {self.duration:.6g} s are {whole:.6g} s, {self.label_count} intervals of labels"
-        return (f"{said} (a multiple of 1 / time.label_rate = {1 / self.label_rate:.6g} s is whole)",)
+        used = f"time.duration: {self.duration:.6g} s are {whole:.6g} s, {self.label_count} intervals of labels"
+        return (f"{used} (a multiple of 1 / time.label_rate = {1 / self.label_rate:.6g} s is whole)",)
 
     @property
     def t0_ns(self) -> int:
@@ -168,8 +168,8 @@ class RenderConfig(Config):
         le=8,
         description="added to the mip level, log2: -1 doubles the sharpness, with more aliasing",
     )
-    removed: ClassVar[Any] = {
-        "lod": Removed(
+    former: ClassVar[dict[str, Former]] = {
+        "lod": Former(
             "meshes that are as fine as you want them drawn",
             lambda value: isinstance(value, dict) and value.get("enabled", False) is False,
         )
@@ -181,9 +181,9 @@ class PreviewConfig(Config):
 
     enabled: bool = Field(True, description="false: no preview")
     rate: float = Field(30.0, gt=0, le=1e4, description="frames per second of simulated time, Hz")
-    slowdown: ClassVar[Any] = 2.0
+    slowdown: ClassVar[float] = 2.0
     """The video plays this many times slower than the simulation."""
-    fixed: ClassVar[Any] = ("slowdown",)
+    former: ClassVar[dict[str, Former]] = {"slowdown": always(slowdown)}
 
 
 def _file_name(name: str) -> str:
@@ -259,9 +259,8 @@ class SequenceConfig(Config):
     render: RenderConfig = Field(RenderConfig(), description="quality of drawing")
     sensor: Sensor | None = Field(
         None,
-        description="davis240c, davis346, dvxplorer, gen31_vga, imx636, or the path of a sensor file (or its "
-        "table): sets camera.width, camera.height, events and readout; keys given beside it override "
-        "it",
+        description=f"{', '.join(shipped_names('sensors'))}, or the path of a sensor file (or its table): sets "
+        "camera.width, camera.height, events and readout; keys given beside it override it",
     )
     events: EmulatorConfig = Field(EsimConfig(), description="event camera model and parameters")
     readout: ReadoutConfig | None = Field(
@@ -315,25 +314,15 @@ class SequenceConfig(Config):
             if frames and there:
                 raise Refused(f"recorded frames {problem}", where=key, accepted=instead)
 
-    @rule("?sensors", "scene.intrinsics")
-    def _own_intrinsics(sensors: bool, intrinsics: str | None):
-        if sensors and intrinsics == "file":
-            raise Refused(
-                "the file's camera cannot be used for a rig",
-                where="scene.intrinsics",
-                value=intrinsics,
-                accepted="config",
-            )
-
-    @rule("camera.lens", "scene.intrinsics")
-    def _one_lens(lens: str, intrinsics: str | None):
-        if lens != "pinhole" and intrinsics == "file":
-            raise Refused(
-                "the file's camera is a pin-hole camera",
-                where="scene.intrinsics",
-                value=intrinsics,
-                accepted="config, or camera.lens: pinhole",
-            )
+    @rule("?sensors", "camera.lens", "scene.intrinsics")
+    def _the_files_own_camera(sensors: bool, lens: str, intrinsics: str | None):
+        cannot = (
+            (sensors, "the file's camera cannot be used for a rig", "config"),
+            (lens != "pinhole", "the file's camera is a pin-hole camera", "config, or camera.lens: pinhole"),
+        )
+        for other, problem, accepted in cannot:
+            if other and intrinsics == "file":
+                raise Refused(problem, where="scene.intrinsics", value=intrinsics, accepted=accepted)
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
     def _late_events_fit(duration: float, label_rate: float, rate: float | None, row_ns: float, queue: int):
@@ -405,22 +394,6 @@ class SequenceConfig(Config):
             check_images(rate, times, lasts, readout_us(height, row_us), start, count / label_rate)
 
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
-    def _room_for_the_camera(kind, height, clearance, camera):
-        if kind != "random":
-            return
-        least = camera_radius(camera.model, clearance)
-        if least > height:
-            raise Refused(
-                "the region is too low for the camera's clearance",
-                where="scene.region.height",
-                value=height,
-                accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
-                "plane's corners: camera.near and camera.fov)",
-            )
-
-
-def add_label(name: str, about: str) -> None:
-    """Add a key to ``labels:``, true or false, for a label of a plug-in."""
-    LabelsConfig.model_fields[name] = FieldInfo(annotation=bool, default=False, description=about)
-    for model in (LabelsConfig, RigSensorConfig, SequenceConfig):  # pydantic has frozen the keys of the present ones
-        model.model_rebuild(force=True)
+    def _room_for_the_camera(kind: str, height: float, clearance: float, camera: CameraConfig):
+        if kind == "random":
+            room_for(camera.model, clearance, height)

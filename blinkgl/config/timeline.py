@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, Removed, one_of, rule
+from blinkgl.config.base import Config, Former, Refused, always, one_of, rule
 
 _NO_RECONSTRUCTION = {
-    "reconstruction": Removed(
+    "reconstruction": Former(
         "the key left out (event times are interpolated linearly between frames; a smaller max_px "
         "makes them more accurate)",
         lambda value: value == "linear",
@@ -18,7 +18,7 @@ _NO_RECONSTRUCTION = {
 
 
 class _Timeline(Config):
-    removed: ClassVar[Any] = _NO_RECONSTRUCTION
+    former: ClassVar[dict[str, Former]] = _NO_RECONSTRUCTION
 
 
 class UniformTimeline(_Timeline):
@@ -49,10 +49,10 @@ class DisplacementTimeline(_AdaptiveTimeline):
     """Event frames between which surfaces move at most ``max_px``, everywhere in the step: by the speeds of the scene's
     geometry in the picture, hidden surfaces included."""
 
-    removed: ClassVar[Any] = {
+    former: ClassVar[dict[str, Former]] = {
         **_NO_RECONSTRUCTION,
-        "sample_every": Removed("the key left out: no picture is drawn for the step", lambda value: True),
-        "first_look": Removed("the key left out, or quality: fast for fewer frames", lambda value: value is False),
+        "sample_every": Former("the key left out: no picture is drawn for the step", lambda value: True),
+        "first_look": Former("the key left out, or quality: fast for fewer frames", lambda value: value is False),
     }
 
     kind: Literal["displacement"] = "displacement"
@@ -79,12 +79,9 @@ class BrightnessTimeline(_AdaptiveTimeline):
     pixels."""
 
     kind: Literal["brightness"] = "brightness"
-    sample_every: int = Field(
-        4,
-        ge=1,
-        le=64,
-        description="the step is chosen from a small picture with every n-th pixel in x and y; 1: all",
-    )
+    sample_every: ClassVar[int] = 4
+    """The step is chosen from a small picture with every n-th pixel in x and y."""
+    former: ClassVar[dict[str, Former]] = {**_NO_RECONSTRUCTION, "sample_every": always(sample_every)}
     max_fraction_of_threshold: float = Field(
         1.0,
         gt=0,

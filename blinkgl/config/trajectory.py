@@ -11,11 +11,11 @@ camera_motion: {kind: static}
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, Former, always
 from blinkgl.config.values import as_pair, ordered
 
 # Far beyond anything filmed; a larger value almost certainly has the wrong unit (float64 geometry would still be fine).
@@ -94,6 +94,6 @@ class CameraMotion(MotionConfig):
     shake: float = Field(
         0.0, ge=0, le=30, description="additional hand shake: standard deviation of the rotation about each axis, deg"
     )
-    shake_rate: ClassVar[Any] = 8.0
+    shake_rate: ClassVar[float] = 8.0
     """Shake impulses per second."""
-    fixed: ClassVar[Any] = ("shake_rate",)
+    former: ClassVar[dict[str, Former]] = {"shake_rate": always(shake_rate)}

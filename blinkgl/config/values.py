@@ -36,8 +36,8 @@ def word_or_list(words: tuple, kinds: tuple[str, ...] = ()) -> BeforeValidator:
             any(value is w or (isinstance(w, str) and value == w) for w in words)
             or (listed and all(v in kinds for v in value))
         ):
-            said = ", ".join(str(w).lower() for w in words)
-            raise ValueError(f"must be {said}" + (" or a list of " + ", ".join(kinds) if kinds else ""))
+            accepted = ", ".join(str(w).lower() for w in words)
+            raise ValueError(f"must be {accepted}" + (" or a list of " + ", ".join(kinds) if kinds else ""))
         return value
 
     return BeforeValidator(check)

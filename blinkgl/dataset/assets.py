@@ -34,7 +34,7 @@ def check_assets(plan: Plan) -> dict[str, str]:
     forget_pools()
     hashes: dict[str, str] = {}
     for group in plan.used:
-        with placed(str, said=f"in group '{group.name}': " if group.name else ""):
+        with placed(str, before=f"in group '{group.name}': " if group.name else ""):
             _check_group(group, plan.counts[group.name], hashes)
     return hashes
 

@@ -32,10 +32,10 @@ class EventOptions(TypedDict, total=False):
 
 def event_reading(declared: Mapping[str, Any]) -> EventReading:
     """Return what is declared of event files, among other arguments. Raises ConfigError."""
-    given = {key: value for key, value in declared.items() if key in EventOptions.__annotations__}
-    if given.get("size") is not None:
-        given["size"] = checked_size(given["size"])
-    return EventReading.of(**given)
+    options = {key: value for key, value in declared.items() if key in EventOptions.__annotations__}
+    if options.get("size") is not None:
+        options["size"] = checked_size(options["size"])
+    return EventReading.of(**options)
 
 
 @check.public(EventOptions)

@@ -25,15 +25,6 @@ if TYPE_CHECKING:
 _SIDE = 65535
 
 
-def _sensor_size(sensor: str | None) -> tuple[int, int] | None:
-    from blinkgl.config.sensor import load_sensor
-
-    if sensor is None:
-        return None
-    camera = load_sensor(sensor)
-    return camera.height, camera.width
-
-
 @check.public()
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Return flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
@@ -89,9 +80,9 @@ def read_trajectory(
     from blinkgl.io import trajectories
 
     per_second = None if rate is None else check.number(rate, "rate", above=0, most=1e9)
-    given = None if times is None else check.path(times, "times")
+    stamps = None if times is None else check.path(times, "times")
     declared = trajectories.PoseFile(
-        form=form, columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=per_second, times=given
+        form=form, columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=per_second, times=stamps
     )
     return trajectories.read_trajectory(check.path(path, "path"), declared, notes)
 
@@ -194,15 +185,15 @@ def calibrate(
     interpolate : between them, "motion" or "linear".   max_px : of "motion", px.   frame_delay_ms : added to their
     times, ms; None: estimated.   starts : of the search.   time_unit, size … : of the recording, as of
     :func:`open_events`.   Raises AssetError, EventDataError, ConfigError."""
-    from blinkgl.front.sections import events_tree
+    from blinkgl.front.sections import section_tree
     from blinkgl.recordings import calibration
     from blinkgl.recordings.clip import FrameReading
     from blinkgl.recordings.decoding import Codes
 
     listed = isinstance(fixed, Iterable) and not isinstance(fixed, str)
-    given = tuple(fixed) if listed else (None,)
-    keys = tuple(key for key in given if isinstance(key, str))
-    if len(keys) != len(given):
+    items = tuple(fixed) if listed else (None,)
+    keys = tuple(key for key in items if isinstance(key, str))
+    if len(keys) != len(items):
         raise ConfigError("not names of keys", where="fixed", value=fixed, accepted="a list of texts")
     delay = reading.get("frame_delay_ms")
     understood = FrameReading(
@@ -215,7 +206,7 @@ def calibrate(
         check.path(recording, "recording"),
         None if frames is None else check.path(frames, "frames"),
         understood,
-        emulator=events_tree(emulator),
+        emulator=section_tree("emulator", emulator),
         fixed=keys,
         still=bool(still),
         declared=_declared(reading, "frames_time_unit"),
@@ -266,7 +257,7 @@ def simulate(
         raise ConfigError(
             "not frames", where="frames", value=frames, accepted="an iterable of arrays; of a file, simulate_file"
         )
-    use, options = _options(**frame_options)
+    use, options, _ = _options(**frame_options)
     if unit not in ("ns", "us", "ms", "s"):
         raise ConfigError("unknown unit of time", where="unit", value=unit, accepted="s, ms, us or ns")
     return simulation.frames_to_events(_frames(frames), use, unit=unit, report=report, **options)
@@ -299,15 +290,15 @@ def simulate_file(
     notes on what was left out … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
-    use, options = _options(**frames)
-    given: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
-    given |= {"stream": stream, "damaged": damaged}
+    use, options, sensor_size = _options(**frames)
+    declared: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
+    declared |= {"stream": stream, "damaged": damaged}
     options = {key: options[key] for key in ("emulator", "seed", "readout")}
     return simulation.file_to_events(
         check.path(source, "source"),
         check.path(target, "target"),
-        declared=_declared(given),
-        size=_sensor_size(frames.get("sensor")) if size is None else checked_size(size),
+        declared=_declared(declared),
+        size=sensor_size if size is None else checked_size(size),
         preview=None if preview is None else check.path(preview, "preview"),
         overwrite=overwrite,
         use=use,
@@ -328,17 +319,14 @@ def _options(
     keep_noise: bool = False,
     seed: int = 0,
     sensor: str | None = None,
-) -> tuple[FrameUse, dict[str, Any]]:
-    """Return the conversion of frames to light, and the other arguments of :func:`frames_to_events`."""
-    from blinkgl.config.sensor import load_sensor
-    from blinkgl.front.sections import events_tree
+) -> tuple[FrameUse, dict[str, Any], tuple[int, int] | None]:
+    """Return the conversion of frames to light, the other arguments of :func:`frames_to_events`, and the sensor's
+    height and width, px."""
+    from blinkgl.front.sections import section_tree
     from blinkgl.recordings import simulation
     from blinkgl.recordings.decoding import Codes
 
-    tree = events_tree(emulator)
-    camera = None if sensor is None else load_sensor(sensor)
-    if camera is not None:
-        tree = {**camera.values(tree.get("emulator", "esim")), **tree}
+    chosen, camera = simulation.with_sensor(section_tree("emulator", emulator), sensor)
     declared = _declared({"white_level": white_level, "range": range, "fps": fps})
     use = simulation.FrameUse(
         Codes(gamma, declared.white_level, declared.range, simulation.own_frames(camera)),
@@ -346,31 +334,32 @@ def _options(
         check.number(max_px, "max_px", above=0, most=1e4),
         bool(keep_noise),
     )
-    return use, dict(
+    options = dict(
         fps=declared.fps,
         zero_time=bool(zero_time),
-        emulator=simulation.emulator_config(tree),
+        emulator=chosen,
         seed=check.seed(seed),
         readout=None if camera is None else camera.readout,
     )
+    return use, options, None if camera is None else (camera.height, camera.width)
 
 
-def _declared(given: Mapping[str, Any], unit: str = "time_unit") -> Declared:
+def _declared(options: Mapping[str, Any], unit: str = "time_unit") -> Declared:
     """Return what is declared of frames; ``unit`` is the key of the unit of their times. Raises ConfigError."""
     from blinkgl.io.frames import Declared
 
-    fps, white, stamps = given.get("fps"), given.get("white_level"), given.get("timestamps")
+    fps, white, stamps = options.get("fps"), options.get("white_level"), options.get("timestamps")
     return Declared(
         fps=None if fps is None else check.number(fps, "fps", above=0, most=1e9),
         timestamps=None if stamps is None else check.path(stamps, "timestamps"),
-        time_unit=given.get(unit),
-        zero_time=bool(given.get("zero_time", False)),
+        time_unit=options.get(unit),
+        zero_time=bool(options.get("zero_time", False)),
         white_level=None if white is None else check.number(white, "white_level", above=0, most=1e9),
-        range=given.get("range"),
-        background=given.get("background"),
+        range=options.get("range"),
+        background=options.get("background"),
         # The events' stream is no frames' stream: which frames belong to it is found where both are opened.
-        stream=None if unit != "time_unit" or given.get("stream") is None else str(given["stream"]),
-        damaged=given.get("damaged", "refuse"),
+        stream=None if unit != "time_unit" or options.get("stream") is None else str(options["stream"]),
+        damaged=options.get("damaged", "refuse"),
     )
 
 

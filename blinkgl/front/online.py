@@ -6,7 +6,9 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from blinkgl.config.problems import validate_field
 from blinkgl.config.run import RunTemplate
+from blinkgl.config.sequence import OutputConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import load
@@ -84,8 +86,7 @@ class OnlineSequences(Closing):
         rank = check.whole(share.rank, "rank", 0, world - 1)
         if kind not in CUTS:
             raise ConfigError("unknown kind", where="kind", value=kind, accepted=", ".join(CUTS))
-        if split not in ("train", "test"):
-            raise ConfigError("unknown split", where="split", value=split, accepted="train, test")
+        validate_field(OutputConfig, "split", split)
         job = StreamJob(
             out="",
             base="",
@@ -148,17 +149,17 @@ class OnlineSequences(Closing):
         self.stream.close()
 
 
-def _window_us(given: float | Sequence[float] | None) -> tuple[int, int] | None:
-    if given is None:
+def _window_us(length: float | Sequence[float] | None) -> tuple[int, int] | None:
+    if length is None:
         return None
-    ends = list(check.plain(given)) if isinstance(check.plain(given), list) else [given, given]
+    ends = list(check.plain(length)) if isinstance(check.plain(length), list) else [length, length]
     if len(ends) != 2:
         raise ConfigError(
-            "not lengths of windows", where="window_ms", value=given, accepted="a number of ms, or (shortest, longest)"
+            "not lengths of windows", where="window_ms", value=length, accepted="a number of ms, or (shortest, longest)"
         )
     low, high = (check.number(end, "window_ms", least=0.001, most=MAX_WINDOW_MS) for end in ends)
     if low > high:
         raise ConfigError(
-            "the shortest is longer than the longest", where="window_ms", value=given, accepted="(shortest, longest)"
+            "the shortest is longer than the longest", where="window_ms", value=length, accepted="(shortest, longest)"
         )
     return round(1000 * low), round(1000 * high)

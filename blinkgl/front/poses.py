@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, TypeVar, get_origin
+from typing import Any, ClassVar, Literal, TypeVar, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,25 +17,27 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 
 Vector = Sequence[float] | np.ndarray
-P = TypeVar("P")
+P = TypeVar("P", bound="Piece")
 
 
 class Piece:
     """A value that is checked at creation. ``tree``: itself as plain data, as in the YAML."""
 
     tree: dict[str, Any]
+    _called: ClassVar[Mapping[str, str]] = {}
+    """Arguments of the model's keys that have other names; "": the keys' own names."""
 
     def __init_subclass__(cls) -> None:
         if "__init__" in vars(cls):
             cls.__init__ = check.public()(cls.__init__)
 
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
-        """Return ``tree`` unchanged if the model accepts it. renamed : arguments of the model's keys
-        that have other names; "": the keys' own names."""
+        """Return ``tree`` unchanged if the model accepts it. renamed : further names, as of :attr:`_called`."""
+        names = {**self._called, **renamed}
 
         def called(where: str) -> str:
             first, *rest = where.split(".")
-            at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
+            at = [step for step in (names.get(first, first), *rest) if step not in ("", "config")]
             return ".".join([type(self).__name__, *at])
 
         with placed(called):
@@ -52,6 +54,7 @@ def signed_by(model: type[Config], **called: str) -> Callable[[type[P]], type[P]
     called : argument names of the model's keys."""
 
     def sign(kind: type[P]) -> type[P]:
+        kind._called = called  # noqa: SLF001 - of the class that it decorates
         own = [p for p in inspect.signature(kind.__init__).parameters.values() if p.name not in ("self", "keys")]
         there = {parameter.name for parameter in own}
         more = [

@@ -26,7 +26,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.poses import Piece, Vector
 from blinkgl.front.scenes import Camera
-from blinkgl.front.sections import SECTIONS, Section, sections
+from blinkgl.front.sections import Section, sections
 
 
 class RigSensor(Piece):
@@ -65,8 +65,8 @@ class RigSensor(Piece):
         if matrix is not None:
             matrix = check.array(matrix, "RigSensor.matrix", (4, 4), "an array (4, 4) of numbers, T_rig_sensor")
         place = check.given(position=position, euler=euler, quaternion=quaternion, matrix=matrix)
-        given = dict(emulator=emulator, sensor=sensor, labels=labels, images=images, imu=imu, tracks=tracks)
-        tree = {**check.given(name=name, pair=pair), **sections(SECTIONS, given)}
+        arguments = dict(emulator=emulator, sensor=sensor, labels=labels, images=images, imu=imu, tracks=tracks)
+        tree = {**check.given(name=name, pair=pair), **sections(arguments)}
         tree["place"] = self._checked(PlaceConfig, place)
         if camera is not None:
             tree["camera"] = _camera_tree(camera)
@@ -79,8 +79,8 @@ class RigSensor(Piece):
             table = readout.model_dump(exclude_unset=True) if isinstance(readout, Config) else readout
             check.one_of(table, "RigSensor.readout", Mapping, "a table of readout:")
             tree["readout"] = self._checked(ReadoutConfig, check.given(**table))
-        said = {key: value for key, value in tree.items() if key not in ("events", "sensor", "camera")}
-        self._checked(RigSensorConfig, said)  # these three are complete after merging with the run's
+        complete = {key: value for key, value in tree.items() if key not in ("events", "sensor", "camera")}
+        self._checked(RigSensorConfig, complete)  # these three are complete after merging with the run's
         self.tree = tree
 
 

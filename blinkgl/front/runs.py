@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
-from blinkgl.config.base import placed
 from blinkgl.config.draw import middle
 from blinkgl.config.expansion import expanded
 from blinkgl.config.problems import validate_field
@@ -18,7 +17,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.rigs import Rig
 from blinkgl.front.scenes import Scene
-from blinkgl.front.sections import SECTIONS, Section, sections
+from blinkgl.front.sections import Section, Timeline, sections
 from blinkgl.scene.types import Scene as SceneData
 
 if TYPE_CHECKING:
@@ -28,23 +27,6 @@ if TYPE_CHECKING:
 
 MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
-
-
-class Timeline:
-    """Times at which frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
-
-    kind : "uniform" (fps, Hz), "displacement" (max_px, px) or "brightness" (max_fraction_of_threshold).
-    values : keys of that kind, see ``timeline:`` in docs/configuration.md.
-    Raises ConfigError."""
-
-    @check.public()
-    def __init__(self, kind: str = "displacement", **values: Any):
-        self.tree = {"kind": check.plain(kind), **check.plain(values)}
-        with placed(lambda where: where.replace("timeline", "Timeline", 1)):
-            validate_field(SequenceConfig, "timeline", self.tree)
-
-    def __repr__(self) -> str:
-        return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
 
 
 @check.public()
@@ -121,18 +103,11 @@ def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verifi
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))
 
 
-_READERS = {
-    **SECTIONS,
-    "timeline": ("timeline", lambda given: check.one_of(given, "timeline", Timeline, "a Timeline").tree),
-    "quality": ("quality", check.plain),
-}
-
-
 def configured(source: Source, rig: Rig | str | None = None, **settings: Unpack[Settings]) -> RunTemplate:
     """Return ``source`` as a run, with the given values replacing its own. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load(path) gives")
     template = source.template() if isinstance(source, Scene) else source
-    own = sections(_READERS, settings)
+    own = sections(settings)
     if rig is not None:
         named = Rig(preset=rig) if isinstance(rig, str) else rig
         own |= check.one_of(named, "rig", Rig, "a Rig, or a preset's name").tree

@@ -65,12 +65,12 @@ class Camera(Piece):
         pose: Pose | Keyframes | Trajectory | Vector = (0.0, 0.0, 0.0),
         **keys: Any,
     ):
-        given = {"near": 0.05, **check.given(width=width, height=height, **keys)}
+        table = {"near": 0.05, **check.given(width=width, height=height, **keys)}
         if calibration is None:
-            given = {"width": 346, "height": 260, **given}
+            table = {"width": 346, "height": 260, **table}
         else:
-            given = calibrated({"calibration_name": None, **given, "calibration": os.fspath(calibration)}, Path.cwd())
-        self.tree = self._checked(CameraConfig, given)
+            table = calibrated({"calibration_name": None, **table, "calibration": os.fspath(calibration)}, Path.cwd())
+        self.tree = self._checked(CameraConfig, table)
         self.motion = motion_tree(pose, "Camera.pose")
 
 
@@ -175,8 +175,8 @@ class _Object(Piece):
         if deform is not None:
             tree["deform"] = check.one_of(deform, f"{kind}.deform", Deform, "a Deform").tree
         if animation is not None:
-            said = "an Animation, or a clip's name or number"
-            check.one_of(animation, f"{kind}.animation", (str, int, Animation), said)
+            accepted = "an Animation, or a clip's name or number"
+            check.one_of(animation, f"{kind}.animation", (str, int, Animation), accepted)
             tree["animation"] = animation.tree if isinstance(animation, Animation) else animation
         return self._checked(ObjectConfig, tree, way="pose")
 
@@ -214,11 +214,11 @@ class Primitive(_Object):
             self._checked(MeshConfig, self.mesh, primitive="kind")
             primitive_mesh(validate(MeshConfig, self.mesh), "mesh")
         except ConfigError as error:
-            _, said, key = (error.where or "").rpartition("parameters")
-            if said and not key and error.value in parameters:  # one that this kind does not have
+            _, parameter, key = (error.where or "").rpartition("parameters")
+            if parameter and not key and error.value in parameters:  # one that this kind does not have
                 key = f".{error.value}"
             raise ConfigError(
-                error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted
+                error.problem, where=f"Primitive{key}" if parameter else key, value=error.value, accepted=error.accepted
             ) from None
         if material is None and kind not in COATS:
             material = Material()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, members, placed
 from blinkgl.config.problems import validate_field
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
@@ -17,50 +17,37 @@ Section = str | Mapping[str, Any] | Config
 """A section of a configuration: the name of a preset or kind, a table of its keys, or the model itself."""
 
 
-def events_tree(emulator: Section) -> dict[str, Any]:
-    """Return ``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
+_EXAMPLES = {
+    "emulator": {"emulator": "v2e", "cutoff_hz": 200},
+    "images": {"exposure_us": 10000, "photon_noise": True},
+    "imu": {"rate": 400},
+    "tracks": {"points": 100},
+}
+"""Arguments that are a name, a table, or a configuration, and a table of each, for messages."""
+
+
+def section_tree(argument: str, section: Section) -> dict[str, Any]:
+    """Return the section that an argument of :data:`_EXAMPLES` gives, as plain data. A text sets the first choice that
+    the section's model has: an emulator, a preset, a way to choose points. Raises ConfigError."""
     from blinkgl.recordings.simulation import emulator_config
 
-    if not isinstance(emulator, (str, Mapping, Config)):
-        raise ConfigError(
-            "not an emulator",
-            where="emulator",
-            value=emulator,
-            accepted="a name, or a table such as {'emulator': 'v2e', 'cutoff_hz': 200}",
-        )
-    tree = (
-        emulator.model_dump()
-        if isinstance(emulator, Config)
-        else {"emulator": emulator}
-        if isinstance(emulator, str)
-        else check.plain(emulator)
-    )
-    emulator_config(tree)
-    return tree
-
-
-NAMED = {
-    "images": (
-        "preset",
-        "a frame camera",
-        "a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
-    ),
-    "imu": ("preset", "an inertial unit", "a preset's name, or a table such as {'rate': 400}"),
-    "tracks": ("choose", "point tracks", "grid, random, surface, or a table such as {'points': 100}"),
-}
-"""Sections of a configuration: the key set by a text, its description, the accepted values."""
-
-
-def section_tree(key: str, given: Any) -> dict[str, Any]:
-    """Return a section of :data:`NAMED`, from a name, a table, or a configuration. Raises ConfigError."""
-    named, what, accepted = NAMED[key]
-    if not isinstance(given, (str, Mapping, Config)):
-        raise ConfigError(f"not {what}", where=key, value=given, accepted=accepted)
-    if isinstance(given, Config):
-        tree = given.model_dump(exclude_unset=True)
+    key = _KEYS.get(argument, argument)
+    models = members(SequenceConfig.model_fields[key].annotation)
+    fields = models[0].model_fields.items()
+    named = next(name for name, field in fields if get_origin(field.annotation) is Literal)
+    if not isinstance(section, (str, Mapping, Config)):
+        names = ", ".join(word for model in models for word in get_args(model.model_fields[named].annotation))
+        accepted = f"{names}, or a table such as {_EXAMPLES[argument]}"
+        raise ConfigError("not a name or a table", where=argument, value=section, accepted=accepted)
+    if isinstance(section, Config):
+        # Of a union, the default choice may be the one that is meant, too.
+        tree = section.model_dump(exclude_unset=len(models) == 1)
     else:
-        tree = {named: given} if isinstance(given, str) else check.plain(given)
-    validate_field(SequenceConfig, key, tree)
+        tree = {named: section} if isinstance(section, str) else check.plain(section)
+    if key == "events":
+        emulator_config(tree)
+    else:
+        validate_field(SequenceConfig, key, tree)
     return tree
 
 
@@ -102,16 +89,37 @@ def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
     return {**tree, **{name: name in wanted for name in OF_EVENTS}}
 
 
-SECTIONS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "emulator": ("events", events_tree),
-    "labels": ("labels", labels_tree),
-    **{key: (key, partial(section_tree, key)) for key in NAMED},
-    "sensor": ("sensor", check.plain),
+class Timeline:
+    """Times at which frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
+
+    kind : "uniform" (fps, Hz), "displacement" (max_px, px) or "brightness" (max_fraction_of_threshold).
+    values : keys of that kind, see ``timeline:`` in docs/configuration.md.
+    Raises ConfigError."""
+
+    @check.public()
+    def __init__(self, kind: str = "displacement", **values: Any):
+        self.tree = {"kind": check.plain(kind), **check.plain(values)}
+        with placed(lambda where: where.replace("timeline", "Timeline", 1)):
+            validate_field(SequenceConfig, "timeline", self.tree)
+
+    def __repr__(self) -> str:
+        return f"Timeline({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
+
+
+_KEYS = {"emulator": "events"}
+"""Keys of the configuration by argument, where they differ."""
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "labels": labels_tree,
+    "timeline": lambda given: check.one_of(given, "timeline", Timeline, "a Timeline").tree,
+    **{argument: partial(section_tree, argument) for argument in _EXAMPLES},
 }
-"""Argument -> key of the configuration, and the function that reads it."""
 
 
-def sections(readers: Mapping[str, tuple[str, Callable[[Any], Any]]], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sections of the given arguments that are not None. readers : as :data:`SECTIONS`. Raises
+def sections(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sections of the configuration that the arguments give, without those that are None. Raises
     ConfigError."""
-    return {key: read(given[name]) for name, (key, read) in readers.items() if given.get(name) is not None}
+    return {
+        _KEYS.get(name, name): _READERS.get(name, check.plain)(value)
+        for name, value in arguments.items()
+        if value is not None
+    }

@@ -8,7 +8,7 @@ from blinkgl.config.sensor import SensorConfig, load_sensor as _load_sensor
 from blinkgl.events import Emulator
 from blinkgl.events.emulator import MAX_SIDE
 from blinkgl.front import arguments as check
-from blinkgl.recordings.simulation import emulator_config
+from blinkgl.recordings.simulation import with_sensor
 from blinkgl.tensors.choice import make_on_device
 
 _STEP = """
@@ -24,8 +24,7 @@ _STEP = """
 
 def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, values: dict[str, Any]) -> Emulator:
     height, width = check.whole(height, "height", 1, MAX_SIDE - 1), check.whole(width, "width", 1, MAX_SIDE - 1)
-    defaults = load_sensor(sensor).values(kind) if sensor is not None else {}
-    config = emulator_config({"emulator": kind, **defaults, **check.plain(values)})
+    config, _ = with_sensor({"emulator": kind, **check.plain(values)}, sensor)
     return make_on_device(config, height, width, check.seed(seed))
 
 
@@ -55,8 +54,8 @@ DvsVoltmeter.__doc__ = (
 
 @check.public()
 def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
-    """Return the values of an included camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
-    (case and punctuation do not matter), or of a sensor file by its path.
+    """Return the values of an included camera, by its name in docs/sensors.md (case and punctuation do not matter), or
+    of a sensor file by its path.
 
     ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …, None if the
     file does not contain it; ``values("v2e")`` gives an emulator's keys.

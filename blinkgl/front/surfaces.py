@@ -44,7 +44,7 @@ class Light(Piece):
         **keys: Any,
     ):
         check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
-        renamed = {"elevation": "sun_elevation", "azimuth": "sun_azimuth"}
+        renamed = {argument: key for key, argument in self._called.items()}
         tree = check.given(sun=sun, sky=sky, **{renamed.get(key, key): value for key, value in keys.items()})
         if environment is not None:
             tree["environment"] = check.given(**check.one_of(environment, "Light.environment", Mapping, "a table"))
@@ -52,7 +52,7 @@ class Light(Piece):
             for k, one in enumerate(lights):
                 check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")
             tree["lights"] = [check.given(**one) for one in lights]
-        self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
+        self.tree = self._checked(LightConfig, tree)
         if environment is not None:
             check.existing(tree["environment"]["map"], "Light.environment.map")
 
@@ -86,45 +86,35 @@ class Material(Piece):
             if keys.get("procedural") is not None or keys.get("photograph") is not None:
                 raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
         tree = check.given(**{**keys, "texture": image, **{key: f"<{key}>" for key in self.maps}})
-        self.tree = self._checked(MaterialConfig, tree, texture="image")
+        self.tree = self._checked(MaterialConfig, tree)
         for key, file in {"image": image, **maps}.items():
             if file is not None and _is_file(file):
                 check.existing(file, f"Material.{key}")
 
 
-def _is_file(given: Any) -> bool:
-    return isinstance(given, (str, os.PathLike))
+def _is_file(image: Any) -> bool:
+    return isinstance(image, (str, os.PathLike))
 
 
-def _map(given: Any, key: str) -> np.ndarray:
+def _pixels(image: Any, key: str, accepted: str) -> np.ndarray:
+    """Return an array (h, w, 3), of a mask (h, w). Raises ConfigError."""
+    where, shape = f"Material.{key}", (None, None) if key == "mask" else (None, None, 3)
+    pixels = check.array(image, where, shape, accepted)
+    if not pixels.size or max(pixels.shape) > 16384:
+        raise ConfigError("size out of range", where=where, value=pixels.shape, accepted="1 to 16384 rows and columns")
+    light = pixels.dtype.kind == "f" and key == "image"
+    if light and pixels.max() > 1:
+        raise ConfigError("values beyond 1", where=where, value=float(pixels.max()), accepted="0 to 1, or uint8 sRGB")
+    if not (light and np.isfinite(pixels).all() and pixels.min() >= 0) and pixels.dtype != np.uint8:
+        raise ConfigError("pixels cannot be used", where=where, value=str(pixels.dtype), accepted=accepted)
+    return np.array(pixels, np.float32 if light else np.uint8, order="C")  # a copy: the scene is a value
+
+
+def _map(image: Any, key: str) -> np.ndarray:
     """Return an array (h, w, 3) uint8, of a mask (h, w)."""
-    shape = (None, None) if key == "mask" else (None, None, 3)
-    accepted = f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8"
-    where = f"Material.{key}"
-    numbers = check.array(given, where, shape, accepted)
-    if not numbers.size or max(numbers.shape) > 16384:
-        raise ConfigError("size out of range", where=where, value=numbers.shape, accepted="1 to 16384 rows and columns")
-    if numbers.dtype != np.uint8:
-        raise ConfigError("pixels cannot be used", where=where, value=str(numbers.dtype), accepted=accepted)
-    return np.array(numbers, order="C")
+    return _pixels(image, key, f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8")
 
 
 def _texture(image: Any) -> data.Texture:
-    accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light from 0 to 1"
-    pixels = check.array(image, "Material.image", (None, None, 3), accepted)
-    if not pixels.size or max(pixels.shape) > 16384:
-        raise ConfigError(
-            "size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns"
-        )
-    if pixels.dtype != np.uint8:
-        if pixels.dtype.kind == "f" and pixels.max() > 1:
-            raise ConfigError(
-                "values beyond 1", where="Material.image", value=float(pixels.max()), accepted="0 to 1, or uint8 sRGB"
-            )
-        if pixels.dtype.kind != "f" or not (np.isfinite(pixels).all() and pixels.min() >= 0):
-            raise ConfigError(
-                "pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted
-            )
-        pixels = pixels.astype(np.float32)
-    pixels = np.array(pixels, order="C")  # a copy: the scene is a value
+    pixels = _pixels(image, "image", "a file, or an array (h, w, 3), uint8 sRGB or float linear light from 0 to 1")
     return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))

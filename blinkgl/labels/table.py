@@ -11,7 +11,6 @@ from importlib import resources
 from typing import Any
 
 from blinkgl.config.labels import LabelsConfig
-from blinkgl.config.sequence import add_label
 from blinkgl.labels.label import BUFFERS, KINDS, VARYINGS, Label
 
 LABELS: dict[str, Label] = {}
@@ -25,7 +24,7 @@ def register(label: Label) -> Label:
     nothing is then registered."""
     _checked(label)
     if _has_own_key(label) and label.name not in LabelsConfig.model_fields:
-        add_label(label.name, label.about)
+        LabelsConfig.added.append(label.name)
     LABELS[label.name] = label
     return label
 

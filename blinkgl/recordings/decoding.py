@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
+from blinkgl.config.frames import ACCEPTED_CURVES, CURVES
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.io.frames import FrameSource
 from blinkgl.machine.kernels import kernel
@@ -16,8 +17,6 @@ from blinkgl.srgb import LUMA, linear_from_srgb
 
 _REFERENCE_WHITE = 203.0
 """cd/m² of white in PQ, which is 1 here (ITU-R BT.2408, 2.1)."""
-CURVES = ("srgb", "linear", "pq", "hlg")
-_ACCEPTED_CURVES = "srgb, linear, pq, hlg or an exponent up to 10"
 
 
 class OwnFrames(NamedTuple):
@@ -83,7 +82,7 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
         gamma = codes.transfer
         if isinstance(gamma, str) and gamma not in CURVES:
             raise ConfigError(
-                "the file states a curve that is not read", where="--gamma", value=gamma, accepted=_ACCEPTED_CURVES
+                "the file states a curve that is not read", where="--gamma", value=gamma, accepted=ACCEPTED_CURVES
             )
     if gamma is None and codes.origin == "video":
         gamma = "srgb"  # made for viewing
@@ -217,4 +216,4 @@ def checked_gamma(gamma: str | float | None) -> str | float | None:
             return value
     except (TypeError, ValueError):
         pass
-    raise ConfigError("unknown transfer curve", where="gamma", value=gamma, accepted=_ACCEPTED_CURVES)
+    raise ConfigError("unknown transfer curve", where="gamma", value=gamma, accepted=ACCEPTED_CURVES)

@@ -458,6 +458,20 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     return validate(members[kind], data, where=kind)
 
 
+def with_sensor(emulator: dict[str, Any], sensor: str | None) -> tuple[EmulatorConfig, SensorConfig | None]:
+    """Return the emulator of a plain table, with the values of a sensor where the table gives none, and that sensor.
+    Raises ConfigError.
+
+    sensor : the name of a shipped one, or a sensor file; None: the emulator's defaults."""
+    from blinkgl.config.sensor import load_sensor
+
+    if sensor is None:
+        return emulator_config(emulator), None
+    camera = load_sensor(sensor)
+    values = camera.values(emulator.get("emulator", EmulatorConfig.default_member))
+    return emulator_config({**values, **emulator}), camera
+
+
 def timed(
     frames: Iterable, fps: float | None = None, unit: str = "ns", zero_time: bool = False
 ) -> Iterator[tuple[np.ndarray, int, str]]:

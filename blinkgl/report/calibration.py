@@ -38,39 +38,39 @@ def page(result: Calibration, sensor_text: str) -> str:
 
 def rows(result: Calibration) -> list[tuple[str, list[str]]]:
     """Return (quantity, [recorded, before, fitted] of the fitted half, then of the other) as text."""
-    found = []
+    table = []
     text = lambda v, form: "–" if np.isnan(v) else form.format(v)
     sides = list(zip(result.judged_before, result.judged))
     each = lambda recorded, of: [cell for b, f in sides for cell in (recorded(f), of(b), of(f))]
-    found.append(("events", each(lambda j: f"{j.recorded:,}", lambda j: f"{j.events:,}")))
-    found.append(("event ratio", each(lambda j: "1", lambda j: f"{j.rate_ratio:.3f}")))
-    found.append(("ON / OFF", each(lambda j: f"{j.recorded_on_off:.3f}", lambda j: f"{j.on_off:.3f}")))
-    found.append(("intervals, KS", each(lambda j: "0", lambda j: f"{j.interval_distance:.3f}")))
+    table.append(("events", each(lambda j: f"{j.recorded:,}", lambda j: f"{j.events:,}")))
+    table.append(("event ratio", each(lambda j: "1", lambda j: f"{j.rate_ratio:.3f}")))
+    table.append(("ON / OFF", each(lambda j: f"{j.recorded_on_off:.3f}", lambda j: f"{j.on_off:.3f}")))
+    table.append(("intervals, KS", each(lambda j: "0", lambda j: f"{j.interval_distance:.3f}")))
     if not np.isnan(result.judged[0].polarity_correlation):
-        found.append(("polarity, correlation", each(lambda j: "1", lambda j: f"{j.polarity_correlation:.3f}")))
-        found.append(("events of a pixel, correlation", each(lambda j: "1", lambda j: f"{j.count_correlation:.3f}")))
+        table.append(("polarity, correlation", each(lambda j: "1", lambda j: f"{j.polarity_correlation:.3f}")))
+        table.append(("events of a pixel, correlation", each(lambda j: "1", lambda j: f"{j.count_correlation:.3f}")))
     if not np.isnan(result.judged[0].still_hz):
-        found.append(
+        table.append(
             (
                 "still pixels, Hz",
                 each(lambda j: text(j.recorded_still_hz, "{:.3g}"), lambda j: text(j.still_hz, "{:.3g}")),
             )
         )
-    return found
+    return table
 
 
 def parameters(result: Calibration) -> list[tuple[str, str, str, str]]:
     """Return (key, before, fitted, remark) of every parameter that the fit may change."""
-    found = []
+    table = []
     for key in result.config.fitted:
         before, after = getattr(result.before, key), getattr(result.config, key)
         before = "" if before is None else f"{before:g}"
         if key in result.values:
-            found.append((key, before, f"{after:.4g} ± {result.uncertainty[key]:.2g}", ""))
+            table.append((key, before, f"{after:.4g} ± {result.uncertainty[key]:.2g}", ""))
         else:
-            said = result.undetermined.get(key, "kept fixed by request")
-            found.append((key, before, "" if after is None else f"{after:.4g}", said))
-    return found
+            remark = result.undetermined.get(key, "kept fixed by request")
+            table.append((key, before, "" if after is None else f"{after:.4g}", remark))
+    return table
 
 
 def picture(result: Calibration) -> bytes:

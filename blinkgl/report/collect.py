@@ -15,8 +15,6 @@ from blinkgl.dataset.cross_checks import plan_of
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
-from blinkgl.io.colour import count_events, event_colour, flow_colour
-from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
 from blinkgl.io.images import read_image
@@ -36,15 +34,11 @@ _FLOW = LABELS["flow_forward"]
 
 @dataclass(eq=False)
 class Example:
-    """Pictures of one label, RGB uint8 (H, W, 3), and their caption."""
+    """What a sequence's preview does not show of one label: heading and picture, RGB uint8 (H, W, 3)."""
 
     name: str
-    image: np.ndarray | None
-    events: np.ndarray
-    flow: np.ndarray
     caption: str
-    others: list[tuple[str, np.ndarray]] = field(default_factory=list)
-    """heading and picture of every further label of the sequence"""
+    pictures: list[tuple[str, np.ndarray]]
 
 
 @dataclass
@@ -110,7 +104,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         unreadable.append(str(error))
     if not sequences and plan is None:
         raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
-    found = Collected(
+    collected = Collected(
         root,
         sequences,
         plan,
@@ -122,28 +116,30 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         damaged=damaged,
     )
     rng = np.random.default_rng(seed)
-    _sample(found, rng, examples)
-    _parameters(found, rng)
-    return found
+    _sample(collected, rng, examples)
+    _parameters(collected, rng)
+    return collected
 
 
-def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
+def _sample(collected: Collected, rng: np.random.Generator, examples: int) -> None:
     """Collect displacements, speeds, depths and numbers of objects from some labels, and rates from every sequence."""
     values: dict[str, list] = {k: [] for k in ("displacement", "speed", "depth", "objects", "share")}
-    found.quantities["rate"] = np.array(
+    collected.quantities["rate"] = np.array(
         [
             1e6 * s["events"] / s["duration_us"] / (s["height"] * s["width"])
-            for s in found.sequences
+            for s in collected.sequences
             if s["duration_us"] and s["events"] is not None
         ]
     )
-    found.quantities["events"] = np.array([s["events"] for s in found.sequences if s["events"] is not None], float)
-    order = rng.permutation(len(found.sequences))[:SAMPLED_SEQUENCES]
-    order = [number for number in order if found.sequences[number]["path"] not in found.damaged]
-    shown = set(_spread(found.sequences, order, examples))
+    collected.quantities["events"] = np.array(
+        [s["events"] for s in collected.sequences if s["events"] is not None], float
+    )
+    order = rng.permutation(len(collected.sequences))[:SAMPLED_SEQUENCES]
+    order = [number for number in order if collected.sequences[number]["path"] not in collected.damaged]
+    shown = set(_spread(collected.sequences, order, examples))
     for number in order:
-        line = found.sequences[number]
-        folder = found.root / line["path"]
+        line = collected.sequences[number]
+        folder = collected.root / line["path"]
         try:
             flows = sorted((folder / _FLOW.forms[0].folder).glob("*.png"))
             if not flows:
@@ -167,12 +163,14 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
                     counts = counts[ids > 0]
                     values["objects"].append([len(counts)])
                     values["share"].append(counts / (line["height"] * line["width"]))
-            if number in shown:
-                found.examples.append(_example(folder, line, flows, pairs, picks[len(picks) // 2]))
+            k = picks[len(picks) // 2]
+            if number in shown and (pictures := _pictures(folder, line, int(flows[k].stem), pairs[k][0])):
+                caption = f"{line['emulator'] or ''}, t = {pairs[k][0] / 1e6:.3f} s"
+                collected.examples.append(Example(line["path"], caption, pictures))
         except (BlinkGLError, OSError, ValueError, IndexError) as error:
-            found.unreadable.append(f"{line['path']}: {' '.join(str(error).split())[:160]}")
-    found.examples.sort(key=lambda e: e.name)
-    found.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
+            collected.unreadable.append(f"{line['path']}: {' '.join(str(error).split())[:160]}")
+    collected.examples.sort(key=lambda e: e.name)
+    collected.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
 
 
 def _value(folder: Path, name: str, flow: Path) -> Any:
@@ -196,75 +194,19 @@ def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> li
     return chosen
 
 
-def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: int) -> Example:
-    flow, valid = read_flow_png(flows[k])
-    start, end = pairs[k]
-    with DsecEventReader(folder / "events.h5", size=(line["height"], line["width"])) as reader:
-        # A whole label interval is too dense to see: show the first part of it, about one event in five pixels.
-        window = end - start
-        events = reader.slice(start, end)
-        wanted = line["height"] * line["width"] // 5
-        if len(events) > wanted:
-            window = max(int(events.t[wanted]) - start, 1000)
-            events = reader.slice(start, start + window)
-    counts = np.zeros((2, line["height"], line["width"]), np.uint16)
-    count_events(events.x, events.y, events.p, counts)
-    picture = folder / f"images/{flows[k].stem}.png"
-    image = None
-    if picture.is_file():
-        image = read_image(picture)
-        image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
-    speed = np.hypot(flow[..., 0], flow[..., 1])[valid]
-    top = float(np.percentile(speed, 99)) if speed.size else 0.0
-    caption = (
-        f"{line['emulator'] or ''}, t = {start / 1e6:.3f} s; events of {window / 1000:.1f} ms ({len(events):,}); "
-        f"flow over {(end - start) / 1000:g} ms, full colour {top:.1f} px"
-    )
-    return Example(
-        line["path"],
-        image,
-        event_colour(counts),
-        flow_colour(flow, top or None, valid),
-        caption,
-        [
-            *_of_the_camera(folder, line, start),
-            *_others(folder, int(flows[k].stem), image),
-            *_over_time(folder, line, start, image),
-        ],
-    )
-
-
-def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[str, np.ndarray]]:
-    """Return a frame camera's image nearest to a time and what is written beside it, as 8-bit pictures."""
-    if not (folder / EXPOSURES).is_file():
-        return []
-    about, lines = read_manifest(folder)["frame_camera"], read_exposures(folder)
-    k = min(range(len(lines)), key=lambda k: abs(lines[k].middle_us - t_us))
-    pictures = []
-    for name in about["pictures"]:
-        codes = read_image(folder / picture_file(name, k)).astype(np.uint32) >> (about["bits"] - 8)
-        codes = codes.astype(np.uint8)
-        title = f"frame camera, {lines[k].exposure_us / 1000:g} ms" if name == "images" else f"frame camera, {name}"
-        pictures.append((title, np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes))
-    return pictures
-
-
-def _over_time(folder: Path, line: dict[str, Any], t_us: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
-    """Return point tracks drawn over the image of a time, with tails."""
-    pictures = []
-    if (folder / TRACKS).is_file():
-        tracks, size = read_tracks(folder), np.array([line["width"], line["height"]])
-        lines = TrackLines(tracks["t_us"], tracks["target_points"], tracks["occluded"], tracks["instance"], size)
-        under = np.full((line["height"], line["width"], 3), 24, np.uint8) if image is None else image
-        title = f"point tracks, {len(tracks['instance'])}"
-        pictures.append((title, with_tracks(under, lines, t_us)))
-    return pictures
-
-
-def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
-    """Return pictures of the labels that not every example shows. image : of the same time; labels that are not images
-    are drawn over it."""
-    pictures = []
+def _pictures(folder: Path, line: dict[str, Any], index: int, t_us: int) -> list[tuple[str, np.ndarray]]:
+    """Return headings and pictures of the frame camera, the labels but flow, and the tracks at a label's time."""
+    file, pictures = folder / LABELS["images"].forms[0].file(index), []
+    image = _rgb(read_image(file)) if file.is_file() else None
+    if (folder / EXPOSURES).is_file():
+        about, exposures = read_manifest(folder)["frame_camera"], read_exposures(folder)
+        k = min(range(len(exposures)), key=lambda k: abs(exposures[k].middle_us - t_us))
+        for name in about["pictures"]:
+            codes = read_image(folder / picture_file(name, k)).astype(np.uint32) >> (about["bits"] - 8)
+            title = (
+                f"frame camera, {exposures[k].exposure_us / 1000:g} ms" if name == "images" else f"frame camera, {name}"
+            )
+            pictures.append((title, _rgb(codes.astype(np.uint8))))
     for name, label in LABELS.items():
         form = label.forms[0]
         if name in ("images", _FLOW.name) or form.read is None or not (folder / form.file(index)).is_file():
@@ -277,27 +219,36 @@ def _others(folder: Path, index: int, image: np.ndarray | None) -> list[tuple[st
             for view in label.views
             if not (view.kind == "mask" and len(label.views) > 1)
         ]
+    if (folder / TRACKS).is_file():
+        tracks, size = read_tracks(folder), np.array([line["width"], line["height"]])
+        lines = TrackLines(tracks["t_us"], tracks["target_points"], tracks["occluded"], tracks["instance"], size)
+        under = np.full((line["height"], line["width"], 3), 24, np.uint8) if image is None else image
+        pictures.append((f"point tracks, {len(tracks['instance'])}", with_tracks(under, lines, t_us)))
     return pictures
+
+
+def _rgb(image: np.ndarray) -> np.ndarray:
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
 # ---- parameters ------------------------------------------------------------------------------------------------------
 
 
-def _parameters(found: Collected, rng: np.random.Generator) -> None:
+def _parameters(collected: Collected, rng: np.random.Generator) -> None:
     """Collect every distribution of the recipe with the drawn values of the sequences' config.yaml."""
-    if found.plan is None:
+    if collected.plan is None:
         return
-    here = {task_of(s) for s in found.sequences if s["path"] not in found.damaged}
-    numbers = sorted(n for name in here if (n := found.plan.tasks.number(name)) is not None)
-    tasks = [found.plan.tasks[numbers[i]] for i in sorted(rng.permutation(len(numbers))[:MAX_CONFIGS])]
+    here = {task_of(s) for s in collected.sequences if s["path"] not in collected.damaged}
+    numbers = sorted(n for name in here if (n := collected.plan.tasks.number(name)) is not None)
+    tasks = [collected.plan.tasks[numbers[i]] for i in sorted(rng.permutation(len(numbers))[:MAX_CONFIGS])]
     configs: dict[str, list[dict]] = {}
     for task in tasks:
         try:
-            configs.setdefault(task.group, []).append(read_table(found.root / task.name / "config.yaml"))
+            configs.setdefault(task.group, []).append(read_table(collected.root / task.name / "config.yaml"))
         except ConfigError as error:
-            found.unreadable.append(f"{task.name}/config.yaml: {error.problem}")
-    for group in found.plan.used:
-        _walk(group.name, group.template.tree, (), configs.get(group.name, []), found.parameters)
+            collected.unreadable.append(f"{task.name}/config.yaml: {error.problem}")
+    for group in collected.plan.used:
+        _walk(group.name, group.template.tree, (), configs.get(group.name, []), collected.parameters)
 
 
 def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], into: list[Parameter]) -> None:

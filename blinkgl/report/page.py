@@ -29,23 +29,23 @@ def write_report(
     out = Path(root) / "report.html" if out is None else Path(out)
     if not own and not overwrite and out.exists():  # before the work, not after it
         raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
-    found = collect(root, examples=examples)
+    collected = collect(root, examples=examples)
     if own:
         write_index(root)
-    write_whole(out, build_report(found))
+    write_whole(out, build_report(collected))
     return out
 
 
-def build_report(found: Collected) -> str:
+def build_report(collected: Collected) -> str:
     """Return the HTML text."""
-    sequences, costs = found.sequences, found.costs
-    groups = _groups(found)
+    sequences, costs = collected.sequences, collected.costs
+    groups = _groups(collected)
     kinds = Counter(f"{x['split']}, {x['emulator']}" for x in sequences)
     sizes = Counter(f"{x['width']}×{x['height']}" for x in sequences)
-    simulated_us = found.simulated_us
+    simulated_us = collected.simulated_us
     return render(
         "report/data_set.html",
-        title=f"Data set {found.root.resolve().name}",
+        title=f"Data set {collected.root.resolve().name}",
         most_listed=_MAX_LISTED,
         tiles=[
             (f"{len(simulated_us):,}", "sequences"),
@@ -60,12 +60,12 @@ def build_report(found: Collected) -> str:
         missing=any(made != wanted for _, made, wanted in groups),
         kinds=[(k, v, None) for k, v in sorted(kinds.items())],
         sizes=[(k, v, None) for k, v in sizes.most_common(8)],
-        environment=found.environment,
-        examples=[_example(e) for e in found.examples],
-        distributions=_distributions(found.quantities),
-        parameters=[_parameter(p) for p in found.parameters],
+        environment=collected.environment,
+        examples=[_example(e) for e in collected.examples],
+        distributions=_distributions(collected.quantities),
+        parameters=[_parameter(p) for p in collected.parameters],
         cost=_cost(costs) if costs else None,
-        failures=[*sorted(found.failed.items()), *(("", line) for line in found.unreadable)],
+        failures=[*sorted(collected.failed.items()), *(("", line) for line in collected.unreadable)],
         retried=[c for c in costs if c["attempts"] > 1],
     )
 
@@ -80,29 +80,20 @@ def _causes(sequences: list[dict[str, Any]]) -> list[tuple[str, str]]:
     return [(f"{n / pixel_seconds:.3g} Hz/px", f"{cause} events") for cause, n in counts.items()]
 
 
-def _groups(found: Collected) -> list[tuple[str, int, int]]:
+def _groups(collected: Collected) -> list[tuple[str, int, int]]:
     """Return (group, sequences made, requested) per group."""
-    if found.plan is None:
+    if collected.plan is None:
         return []
-    paths = {task_of(x) for x in found.sequences}
-    numbers = [number for path in paths if (number := found.plan.tasks.number(path)) is not None]
-    tasks, here = found.plan.tasks, Counter(found.plan.tasks[number].group for number in numbers)
-    apart = Counter(tasks[number].group for name in found.dropped if (number := tasks.number(name)) is not None)
-    return [(name or "all", here[name], count - apart[name]) for name, count in found.plan.counts.items()]
+    paths = {task_of(x) for x in collected.sequences}
+    numbers = [number for path in paths if (number := collected.plan.tasks.number(path)) is not None]
+    tasks, here = collected.plan.tasks, Counter(collected.plan.tasks[number].group for number in numbers)
+    apart = Counter(tasks[number].group for name in collected.dropped if (number := tasks.number(name)) is not None)
+    return [(name or "all", here[name], count - apart[name]) for name, count in collected.plan.counts.items()]
 
 
-def _example(e: Example) -> dict[str, Any]:
-    first = (
-        ("frame", e.image),
-        ("events: ON blue, OFF red", e.events),
-        ("flow: hue is direction, saturation speed", e.flow),
-    )
-    pictures = (*first, *e.others)
-    return {
-        "name": e.name,
-        "caption": e.caption,
-        "pictures": [(label, None if array is None else png(_small(array))) for label, array in pictures],
-    }
+def _example(example: Example) -> dict[str, Any]:
+    pictures = [(title, png(_small(array))) for title, array in example.pictures]
+    return {"name": example.name, "caption": example.caption, "pictures": pictures}
 
 
 def _distributions(q: dict[str, np.ndarray]) -> list[tuple]:
@@ -131,26 +122,26 @@ def _parameter(p: Parameter) -> dict[str, Any]:
     values = np.array(p.values, float)
     whole = p.kind == "integer"
     bins, span = (min(int(high - low) + 1, 40), (low - 0.5, high + 0.5)) if whole else (20, (low, high))
-    said, outside = _coverage(values, low, high, p.kind)
+    coverage, outside = _coverage(values, low, high, p.kind)
     return {
         **shown,
         "histogram": histogram(values, log=p.kind == "log_uniform", span=span, bins=bins),
-        "coverage": said,
+        "coverage": coverage,
         "outside": outside,
     }
 
 
 def _coverage(values: np.ndarray, low: float, high: float, kind: str) -> tuple[str, int]:
     """Return "9 of 10 tenths of [0.18, 0.25] hit", and the number of values outside."""
-    said = f"of [{number(low)}, {number(high)}]"
+    span = f"of [{number(low)}, {number(high)}]"
     if not values.size or high <= low:
-        return f"range {said}", 0
+        return f"range {span}", 0
     if kind == "integer":
-        return f"{len(set(values.tolist()))} of {int(high - low) + 1} values {said} drawn", 0
+        return f"{len(set(values.tolist()))} of {int(high - low) + 1} values {span} drawn", 0
     log = kind == "log_uniform"
     scaled = (np.log(values) - np.log(low)) / (np.log(high) - np.log(low)) if log else (values - low) / (high - low)
     hit = len(set(np.clip((scaled * 10).astype(int), 0, 9)))
-    return f"{hit} of 10 tenths {said} hit", int(((scaled < -1e-9) | (scaled > 1 + 1e-9)).sum())
+    return f"{hit} of 10 tenths {span} hit", int(((scaled < -1e-9) | (scaled > 1 + 1e-9)).sum())
 
 
 def _counts(p: Parameter) -> list[tuple[str, float, float | None]]:

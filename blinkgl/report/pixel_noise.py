@@ -34,13 +34,13 @@ def rows(result: PixelFit) -> list[tuple[str, str, str]]:
 
 def parameters(result: PixelFit) -> list[tuple[str, str, str]]:
     """Return (key, fitted, remark)."""
-    found = []
+    table = []
     for key, field in type(result.config).model_fields.items():
         value = getattr(result.config, key)
         if key in result.undetermined:
-            found.append((f"readout.pixels.{key}", "", result.undetermined[key]))
+            table.append((f"readout.pixels.{key}", "", result.undetermined[key]))
         elif value != field.default:
             spread = result.uncertainty.get(key)
             text = f"{value:.4g}" + (f" ± {spread:.2g}" if spread is not None else "")
-            found.append((f"readout.pixels.{key}", text, field.description or ""))
-    return found
+            table.append((f"readout.pixels.{key}", text, field.description or ""))
+    return table

@@ -280,10 +280,8 @@ def lamp_of_gltf(light: Mapping[str, Any], path: PosePath, gain: float) -> Lamp:
     return Lamp("spot", strength, path, reach, light["spot"]["innerConeAngle"], light["spot"]["outerConeAngle"])
 
 
-def random_lamps(
-    config: RandomLightsConfig, rng: np.random.Generator, half_width: float, floor: float
-) -> tuple[Lamp, ...]:
-    """Return the lamps of a random world. half_width : of the region, m.   floor : z of the ground."""
+def random_lamps(config: RandomLightsConfig, rng: np.random.Generator, half_width: float) -> tuple[Lamp, ...]:
+    """Return the lamps of a random world, whose ground is at z = 0. half_width : of the region, m."""
     lamps = []
     for _ in range(int(rng.integers(config.count[0], config.count[1] + 1))):
         kind = config.kinds[int(rng.integers(len(config.kinds)))]
@@ -293,8 +291,8 @@ def random_lamps(
         color = 0.5 + 0.5 * np.cos(hue + np.array([0.0, 2.0, 4.0]) * math.pi / 3)
         color = 1 - saturation * (1 - color / color.max())
         strength = _scaled(color, np.exp(rng.uniform(low, high)))
-        place = np.array([*rng.uniform(-half_width, half_width, 2), floor + rng.uniform(*config.height)])
-        target = np.array([*(place[:2] * rng.uniform(0, 1)), floor])
+        place = np.array([*rng.uniform(-half_width, half_width, 2), rng.uniform(*config.height)])
+        target = np.array([*(place[:2] * rng.uniform(0, 1)), 0.0])
         elevation, azimuth, angle = rng.uniform(25, 80), rng.uniform(-180, 180), rng.uniform(*config.angle)
         if kind == "sun":
             pose = lamp_pose(shines=-np.asarray(direction_of(elevation, azimuth)))

@@ -86,11 +86,11 @@ class _Fitted(NamedTuple):
 def _emulator(
     recording: str, frames: str | None, emulator: str, sensor: str | None, overrides: Sequence[str], **options: Any
 ) -> _Fitted:
-    gamma, *said = (options.pop(key) for key in ("gamma", "interpolate", "max_px", "frame_delay_ms"))
+    gamma, *reading = (options.pop(key) for key in ("gamma", "interpolate", "max_px", "frame_delay_ms"))
     options["declared"] = Declared(**options.pop("declared"))
-    base = emulator_options(emulator, None, overrides, sensor)["emulator"]
+    base, _ = emulator_options(emulator, None, overrides, sensor)
     fixed = [item.partition("=")[0].strip() for item in overrides]
-    result = calibrate(recording, frames, FrameReading(Codes(gamma), *said), emulator=base, fixed=fixed, **options)
+    result = calibrate(recording, frames, FrameReading(Codes(gamma), *reading), emulator=base, fixed=fixed, **options)
     heads = ("", "recorded", "before", "fitted", "recorded, other half", "before", "fitted")
     judged = [(quantity, *cells) for quantity, cells in rows(result)]
     tables = [
@@ -121,7 +121,7 @@ def _pixels(
     for option, value in (("--sensor", sensor), ("--set", overrides)):
         if value:
             raise ConfigError("this is an option of emulators", where=option, accepted=f"none with --emulator {PIXELS}")
-    result, said = fit_pixels(recording, options["events"], seed=options["seed"], progress=progress)
+    result, warnings = fit_pixels(recording, options["events"], seed=options["seed"], progress=progress)
     tables = [
         (
             f"noise of single pixels beside {Path(recording).name}, other half",
@@ -130,4 +130,4 @@ def _pixels(
         ),
         ("parameters", ("key", "fitted", ""), pixel_noise.parameters(result)),
     ]
-    return _Fitted(result, pixel_noise.page, tables, [], said)
+    return _Fitted(result, pixel_noise.page, tables, [], warnings)

@@ -10,19 +10,22 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import metadata
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.machine.cpu import bf16_instructions
 from blinkgl.machine.extras import EXTRAS, install, newer_than_tested, python
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.version import __version__
 
+if TYPE_CHECKING:
+    from blinkgl.gl import GLContext
+
 # ---------------------------------------------------------------------------------------------------------------------
-# ``blinkgl doctor``: what this machine offers, what is missing, and the command that installs it.
+# What a run needs, what is missing, and the command that installs it; then the extras, one line each.
 #
 # Every check *does* the operation (renders, encodes, compresses, compiles) and compares the result: a driver that
 # advertises 32-bit float targets but rounds them fails here and not in a data set.
@@ -80,7 +83,6 @@ def _system() -> Iterator[Check]:
         platform.python_version(),
         "" if new_enough else "use Python 3.11 or newer",
     )
-    yield Check("System", "platform", "info", platform.platform())
     newer = newer_than_tested()
     yield Check(
         "System",
@@ -88,17 +90,6 @@ def _system() -> Iterator[Check]:
         "info",
         ("newer than tested: " + ", ".join(newer)) if newer else "none is newer than tested",
     )
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    yield Check("System", "cores, memory", "info", f"{cores} cores, {memory:.1f} GiB")
-    names = ("LP_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "OMP_NUM_THREADS")
-    changed = [
-        f"{name}={value}"
-        for name, value in sorted(os.environ.items())
-        if name in names or name.startswith(("GLCONTEXT_", "LIBGL_", "GALLIUM_", "MESA_", "__EGL_", "EGL_"))
-    ]
-    if changed:
-        yield Check("System", "environment", "info", " ".join(changed))
 
 
 # --- OpenGL -----------------------------------------------------------------------------------------------------------
@@ -125,48 +116,12 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
         for note in gl.notes:
             yield Check(section, "tried before", "info", note)
         where = f"EGL device {gl.device}" if gl.backend == "egl" else "OSMesa"
-        yield Check(section, "context", "ok", f"{where}, drawn by the {'CPU (software)' if gl.is_software else 'GPU'}")
-        yield Check(section, "vendor", "info", gl.vendor)
-        yield Check(section, "renderer", "info", gl.renderer)
-        yield Check(section, "version", "ok", gl.version)
-        info = gl.ctx.info
-        yield Check(
-            section,
-            "limits",
-            "info",
-            f"texture {info['GL_MAX_TEXTURE_SIZE']} px, viewport "
-            f"{'x'.join(str(v) for v in info['GL_MAX_VIEWPORT_DIMS'])}, {info['GL_MAX_DRAW_BUFFERS']} draw buffers, "
-            f"{gl.ctx.max_samples} samples, anisotropy {gl.ctx.max_anisotropy:g}",
-        )
+        drawn_by = f"the {'CPU' if gl.is_software else 'GPU'}: {gl.renderer}, {gl.version}"
+        yield Check(section, "context", "ok", f"{where}, drawn by {drawn_by}")
         driver = "install a newer driver (OpenGL 4.5) or use 'gl: {backend: osmesa}'"
-        for name in ("R32F", "RG32F", "RGBA32F", "R32UI", "R16F", "RGBA8"):
+        for name in ("R32F", "RG32F", "RGBA32F", "R32UI"):
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
         yield _try(section, "32F depth, reversed-Z", lambda: _draw_depth(gl), driver)
-        yield _to_torch(gl, section)
-
-
-def _to_torch(gl, section: str) -> Check:
-    """Check the transfer of frames from this context to torch; on a GPU a frame is drawn, copied and compared."""
-    name = "frames for torch"
-    if gl.is_software:  # torch takes seconds to import
-        return Check(section, name, "info", "in the processor's memory, where they are drawn")
-    from blinkgl.gl import Target
-    from blinkgl.render.tensors import TextureReader
-
-    try:
-        with Target(gl, 8, 8, ("R32F",), depth=False) as target:
-            target.clear(0.25)
-            reader = TextureReader(gl, target, 0, "cuda")
-            reader.read()
-            way, why = reader.way, reader.why
-            reader.release()
-    except BlinkGLError as error:
-        return Check(section, name, "absent", error.problem, install("torch"))
-    except Exception as error:  # noqa: BLE001 - a broken torch; the line has to appear
-        return Check(section, name, "absent", " ".join(f"{type(error).__name__}: {error}".split())[:200])
-    if way == "interop":
-        return Check(section, name, "ok", "they stay on the card: CUDA reads what OpenGL draws")
-    return Check(section, name, "absent", f"over the bus: {why}", install("cuda-bindings") if "bindings" in why else "")
 
 
 _TRIANGLE = """#version 430 core
@@ -177,46 +132,35 @@ void main() {
 }"""
 
 
-def _full_screen(gl, output: str, expression: str):
+def _full_screen(gl: GLContext, output: str, expression: str) -> tuple[Any, Any]:
     program = gl.ctx.program(
         vertex_shader=_TRIANGLE, fragment_shader=f"#version 430 core\n{output}\nvoid main() {{ {expression} }}"
     )
     return program, gl.ctx.vertex_array(program, [])
 
 
-def _draw_exactly(gl, name: str) -> str:
+def _draw_exactly(gl: GLContext, name: str) -> str:
     """Draw values that only this format's full precision holds and read back the same bits."""
     from blinkgl.gl import Target
 
-    integer, bytes_ = name.endswith("UI"), name.endswith("8")
-    if integer:
-        expected = np.array([4_000_000_001], np.uint32)
-    elif bytes_:
-        expected = np.array([0, 51, 102, 255], np.uint8)
-    elif "16F" in name:
-        expected = np.array([0.333251953125, -2049, 65504, 6.103515625e-05], np.float16)
+    if name.endswith("UI"):
+        wanted, output, expression = np.array([4_000_000_001], np.uint32), "uint value", "4000000001u"
     else:
-        expected = np.array([16777215.0, -1.0000001, 1e-30, 3e38], np.float32)
-    values = expected / 255 if bytes_ else expected
-    literals = ", ".join(
-        f"{v}u" if integer else f"{float(v):.9g}{'' if 'e' in f'{float(v):.9g}' or '.' in f'{float(v):.9g}' else '.0'}"
-        for v in values
-    )
-    kind, expression = ("uint", literals) if integer else ("vec4", f"vec4({literals})")
-    program, vertices = _full_screen(gl, f"layout(location = 0) out {kind} value;", f"value = {expression};")
+        wanted = np.array([16777215.0, -1.0000001, 1e-30, 3e38], np.float32)
+        output, expression = "vec4 value", "vec4(16777215.0, -1.00000012, 1e-30, 3e38)"
+    program, vertices = _full_screen(gl, f"layout(location = 0) out {output};", f"value = {expression};")
     with Target(gl, 4, 4, (name,), depth=False) as target:
         target.clear()
         vertices.render(vertices=3)
-        seen = target.read()
+        seen = np.atleast_3d(target.read())
     vertices.release()
     program.release()
-    wanted = expected[: seen.shape[2]] if seen.ndim == 3 else expected[0]
-    if not np.all(seen == wanted):
+    if not np.all(seen == wanted[: seen.shape[2]]):
         raise ValueError(f"drew {wanted}, read {seen[0, 0]}")
     return "exact"
 
 
-def _draw_depth(gl) -> str:
+def _draw_depth(gl: GLContext) -> str:
     """Check near/z from 0.01 to 1e6 units to one float32 rounding, and that of two surfaces 1e-6 apart at 1e5 units the
     nearer one is drawn."""
     import moderngl
@@ -252,16 +196,14 @@ def _draw_depth(gl) -> str:
     return f"relative error {worst:.0e} up to 1e6 units, separates 1e-6 at 1e5 units"
 
 
+_REINSTALL = f"{python()} -m pip install --force-reinstall"
+
+
 # --- compute, codecs, extras ------------------------------------------------------------------------------------------
 
 
 def _numba() -> Iterator[Check]:
     section = "Kernels"
-
-    def version() -> str:
-        import numba
-
-        return f"{numba.__version__}, {numba.get_num_threads()} threads"
 
     def threads() -> str:
         import numba
@@ -279,16 +221,7 @@ def _numba() -> Iterator[Check]:
         run(mark, len(sums), (sums,), count)
         if not np.array_equal(sums, np.arange(len(sums))):
             raise ValueError("work divided between threads came out wrong")
-        return f"{count}, asleep when idle"
-
-    def simd() -> str:
-        from llvmlite import binding
-
-        features = binding.get_host_cpu_features()
-        widest = next(
-            (name for name in ("avx512f", "avx2", "avx", "sse4.2", "sve", "neon") if features.get(name)), "none found"
-        )
-        return f"{widest} on {binding.get_host_cpu_name()}"
+        return f"{numba.__version__}, {count} threads, asleep when idle"
 
     def kernels() -> str:
         from blinkgl.machine.kernels import kept
@@ -297,17 +230,9 @@ def _numba() -> Iterator[Check]:
         many = f"{count} compiled" if count else "none compiled yet: commands compile what they need"
         return f"{many}, in {folder} (blinkgl doctor --compile: all of them, about a minute)"
 
-    mend = f"{python()} -m pip install --force-reinstall numba"
-    yield _try(section, "numba", version, mend)
-    yield _try(section, "threads", threads, mend)
-    yield _try(section, "SIMD", simd, mend)
+    mend = f"{_REINSTALL} numba"
+    yield _try(section, "numba", threads, mend)
     yield _try(section, "kernels", kernels, mend)
-    yield Check(
-        section,
-        "bf16",
-        "info",
-        bf16_instructions() or "no instructions for it: eflow computes in fp32, whatever a recipe says",
-    )
 
 
 def _codecs() -> Iterator[Check]:
@@ -355,35 +280,22 @@ def _codecs() -> Iterator[Check]:
             raise ValueError("read other values than written")
         return f"round trip (OpenCV {cv2.__version__})"
 
-    pip = f"{python()} -m pip install --force-reinstall"
-    yield _try(section, "HDF5 blosc-zstd", blosc, f"{pip} h5py hdf5plugin")
-    yield _try(section, "libx264 video", x264, f"{pip} av")
-    yield _try(section, "16-bit RGB PNG", png16, f"{pip} opencv-python-headless")
-
-
-def _blender(value: str, purpose: str) -> tuple[list[str], str, str]:
-    """Return missing parts, a description and the remedy; Blender may run in another interpreter."""
-    from blinkgl.blender import process
-
-    missing = process.available()
-    if missing:
-        return ["bpy"], value, missing.partition(": ")[2] or missing
-    return [], value if process.interpreter() == sys.executable else f"by {process.interpreter()} ({purpose})", ""
+    yield _try(section, "HDF5 blosc-zstd", blosc, f"{_REINSTALL} h5py hdf5plugin")
+    yield _try(section, "libx264 video", x264, f"{_REINSTALL} av")
+    yield _try(section, "16-bit RGB PNG", png16, f"{_REINSTALL} opencv-python-headless")
 
 
 def _extras() -> Iterator[Check]:
-    for extra, (distributions, purpose) in EXTRAS.items():
-        found, lacking = [], []
-        for name in distributions:
-            try:
-                found.append(f"{name} {metadata.version(name)}")
-            except metadata.PackageNotFoundError:
-                lacking.append(name)
-        value = ", ".join(found + [f"no {name}" for name in lacking]) + f" ({purpose})"
+    from blinkgl.blender import process
+
+    for extra, (names, purpose) in EXTRAS.items():
+        here = {name: next((one.version for one in metadata.distributions(name=name)), None) for name in names}
+        lacking = [name for name in names if here[name] is None]
+        versions = ", ".join(f"no {name}" if version is None else f"{name} {version}" for name, version in here.items())
         remedy = install(*lacking) if lacking else ""
-        if extra == "cycles":
-            lacking, value, remedy = _blender(value, purpose)
-        yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", value, remedy)
+        if extra == "cycles" and lacking and not (remedy := process.available().partition(": ")[2]):
+            lacking, versions = [], f"by {process.interpreter()}"
+        yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", f"{versions} ({purpose})", remedy)
 
 
 _MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": ("absent", "yellow"), "info": ("", "")}

@@ -271,9 +271,9 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
         if name != "images" or s["images_s"]  # else no images were requested
     }
     for part in (counts, stages):
-        for name, said in part.items():
-            if said is not None:
-                table.add_row(name, said)
+        for name, text in part.items():
+            if text is not None:
+                table.add_row(name, text)
         table.add_section()
     console.print(table)
     folder = first.path

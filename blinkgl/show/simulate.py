@@ -17,6 +17,8 @@ from blinkgl.io.reading import parsed_size
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
 
 if TYPE_CHECKING:
+    from blinkgl.config.events import EmulatorConfig
+    from blinkgl.config.sensor import SensorConfig
     from blinkgl.recordings.simulation import SimulationReport
 
 FAR_PX = 2.0
@@ -25,30 +27,20 @@ FAR_PX = 2.0
 
 def emulator_options(
     name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None
-) -> dict[str, Any]:
-    """Return ``emulator``, ``readout``, ``size`` and the properties of a sensor's ``own`` frames from an emulator's
-    name, an optional YAML mapping (which may name the emulator itself), ``key=value`` overrides, and an optional sensor
-    that gives the defaults."""
-    data: dict[str, Any] = {}
-    if config is not None:
-        data = read_table(config, "emulator parameters, key: value")
-    data = {"emulator": name, **data}
+) -> tuple[EmulatorConfig, SensorConfig | None]:
+    """Return the emulator of a name, an optional YAML file (which may name the emulator itself) and ``key=value``
+    overrides, with the values of an optional sensor as defaults, and that sensor."""
+    from blinkgl.recordings.simulation import with_sensor
+
+    table = {"emulator": name, **(read_table(config, "emulator parameters, key: value") if config is not None else {})}
     for item in overrides:
         key, equals, value = item.partition("=")
         if not equals:
             raise ConfigError("not key=value", where="--set", value=item)
-        data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
-    if "recipe" in data:  # a video is one camera: the middle of the recipe's distributions
-        data = middle(expanded({"events": data}, Path.cwd())["events"])
-    if sensor is None:
-        return {"emulator": data, "readout": None, "size": None, "own": None}
-    from blinkgl.config.sensor import load_sensor
-    from blinkgl.recordings.simulation import emulator_config, own_frames
-
-    camera = load_sensor(sensor)
-    known = emulator_config({**camera.values(data["emulator"]), **data})
-    size = (camera.height, camera.width)
-    return {"emulator": known, "readout": camera.readout, "size": size, "own": own_frames(camera)}
+        table[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
+    if "recipe" in table:  # a video is one camera: the middle of the recipe's distributions
+        table = middle(expanded({"events": table}, Path.cwd())["events"])
+    return with_sensor(table, sensor)
 
 
 def run(
@@ -70,19 +62,20 @@ def run(
 ) -> int:
     """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``declared``: of the frames, as of
     :class:`~blinkgl.io.frames.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
-    from blinkgl.config.sensor import load_sensor
     from blinkgl.io.frames import Declared
     from blinkgl.machine.compiling import announced_compiling
     from blinkgl.recordings.decoding import Codes
-    from blinkgl.recordings.simulation import FrameUse, file_to_events
+    from blinkgl.recordings.simulation import FrameUse, file_to_events, own_frames
 
-    options |= emulator_options(emulator, config, overrides, sensor)
-    options["use"] = FrameUse(Codes(gamma, own=options.pop("own")), interpolate, max_px, keep_noise)
+    options["emulator"], camera = emulator_options(emulator, config, overrides, sensor)
+    options["use"] = FrameUse(Codes(gamma, own=own_frames(camera)), interpolate, max_px, keep_noise)
     options["declared"] = Declared(**(declared or {}))
+    if camera is not None:
+        options |= {"readout": camera.readout, "size": (camera.height, camera.width)}
     if size is not None:
         options["size"] = parsed_size(size)
     console = plain_console(quiet=quiet)
-    if sensor is not None and not load_sensor(sensor).threshold_known:
+    if camera is not None and not camera.threshold_known:
         say(console, f"the thresholds of {sensor} are not known: they are the emulator's defaults")
     bar = Progress(
         plain_column("{task.description}"),

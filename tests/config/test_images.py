@@ -72,7 +72,10 @@ def read(tmp_path, **changes):
             {"auto_exposure": {"longest_us": 40_000}},
             "images.auto_exposure.longest_us: the exposure is longer than the image interval (got 40000.0)",
         ),
-        ({"auto_exposure": {"shortest_us": 9e4}}, "images.auto_exposure.shortest_us: the shortest exposure exceeds"),
+        (
+            {"auto_exposure": {"longest_us": 5}},
+            "images.auto_exposure.longest_us: too small (got 5); expected a number fr",
+        ),
         ({"auto_exposure": {}, "gain_db": 30}, "images.gain_db: the first gain is above the limit of auto_exposure"),
     ],
 )

@@ -13,8 +13,8 @@ from scipy.stats import kstest
 from blinkgl.config.draw import draw, middle, options
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.config.expansion import load_recipe
+from blinkgl.config.names import shipped_names
 from blinkgl.config.problems import validate
-from blinkgl.config.reader import shipped_names
 from blinkgl.config.run import load_run
 from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan
@@ -285,8 +285,8 @@ def test_what_is_no_recipe(tmp_path):
 
 
 def test_a_video_takes_the_middle():
-    data = emulator_options("esim", None, ["recipe=etap"])["emulator"]
-    assert data["contrast_threshold"] == pytest.approx(0.25)
+    emulator, _ = emulator_options("esim", None, ["recipe=etap"])
+    assert emulator.contrast_threshold == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("model", [EsimConfig, V2eConfig])

@@ -6,7 +6,8 @@ import pytest
 import yaml
 from tiny_recipe import TINY
 
-from blinkgl.config.reader import read_table, shipped_names
+from blinkgl.config.names import shipped_names
+from blinkgl.config.reader import read_table
 from blinkgl.config.run import load_run
 from blinkgl.dataset.cross_checks import comparable, first_difference
 from blinkgl.dataset.generate import config_yaml

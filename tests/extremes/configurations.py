@@ -65,15 +65,9 @@ def timelines(interval: float):
         percentile,
     )
     brightness = st.builds(
-        lambda part, p, n: {
-            "kind": "brightness",
-            "max_fraction_of_threshold": part,
-            "percentile": p,
-            "sample_every": n,
-        },
+        lambda part, p: {"kind": "brightness", "max_fraction_of_threshold": part, "percentile": p},
         magnitude(1e-3, 100),
         percentile,
-        st.sampled_from([1, 4, 64]),
     )
     adaptive = st.builds(
         lambda way, longest: {**way, **longest},
@@ -197,8 +191,6 @@ def random_scenes():
                 "max_size": 16,
                 "test_fraction": 0,
             },
-            "sky": {"subdivisions": 2},
-            "ground": {"subdivisions": 2},
             "light": light,
             "object_motion": {"speed": speed, "rotation_rate": turn},
             "camera_motion": {"kind": "static"} if static else {"speed": speed, "rotation_rate": turn, "shake": shake},

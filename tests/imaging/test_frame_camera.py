@@ -204,7 +204,7 @@ def test_vignetting_is_the_fourth_power_of_the_cosine(gl, strength):
 
 def test_automatic_exposure_approaches_its_end_as_its_lag_says(gl):
     """A uniform scene that clips nowhere: the product of exposure and gain over the images, against the closed form."""
-    auto = {"target": 0.2, "lag": 0.15, "shortest_us": 1, "longest_us": 20_000, "max_gain_db": 40}
+    auto = {"target": 0.2, "lag": 0.15, "longest_us": 20_000, "max_gain_db": 40}
     with Renderer(gl, scene([], rig(), background=0.6), PLAIN) as renderer:
         camera = camera_of(renderer, rate=20, exposure_us=1500, white=2.0, auto_exposure=auto, **LINEAR)
         images = [camera.take() for _ in range(len(camera))]
@@ -325,7 +325,7 @@ def test_light_is_added_up_row_by_row_and_rows_without_weight_stay():
 
 # --- automatic exposure -----------------------------------------------------------------------------------------------
 
-AUTO = AutoExposureConfig(target=0.2, lag=0.3, shortest_us=1, longest_us=1e9, max_gain_db=60)
+AUTO = AutoExposureConfig(target=0.2, lag=0.3, longest_us=1e9, max_gain_db=60)
 
 
 def settings(config, scene_means, setting, dt_s):
@@ -348,13 +348,13 @@ def test_the_lag_is_first_order_in_the_logarithm_whatever_the_rate(dt_s):
 
 
 def test_time_changes_first_gain_beyond_it_and_both_keep_to_their_limits():
-    config = AutoExposureConfig(target=0.2, lag=0.0, shortest_us=100, longest_us=10_000, max_gain_db=20)
+    config = AutoExposureConfig(target=0.2, lag=0.0, longest_us=10_000, max_gain_db=20)
     now = Setting(1_000_000, 1.0)
     assert next_setting(config, now, 0.1, 0.1) == Setting(2_000_000, 1.0)
     assert next_setting(config, now, 0.01, 0.1) == Setting(10_000_000, pytest.approx(2.0))
     assert next_setting(config, now, 0.0, 0.1) == Setting(10_000_000, pytest.approx(10.0))
     assert next_setting(config, now, 1.0, 0.1) == Setting(200_000, 1.0)
-    assert next_setting(config, Setting(200_000, 1.0), 1.0, 0.1) == Setting(100_000, 1.0)
+    assert next_setting(config, Setting(50_000, 1.0), 1.0, 0.1) == Setting(20_000, 1.0)
     assert decibels(factor(13.7)) == pytest.approx(13.7) and factor(20.0) == pytest.approx(10.0)
 
 

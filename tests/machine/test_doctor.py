@@ -8,10 +8,10 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from blinkgl import cli
-from blinkgl.errors import GLError
 from blinkgl.gl import context as context_module
 from blinkgl.machine import extras
 from blinkgl.show import doctor as doctor
@@ -31,14 +31,12 @@ def test_this_machine_passes_every_required_check(report):
     checks = by_name(report)
     for name in (
         "OpenGL/context",
-        "OpenGL/version",
         "OpenGL/32F depth, reversed-Z",
         "OpenGL/R32F target",
         "OpenGL/RG32F target",
         "OpenGL/RGBA32F target",
         "Kernels/numba",
-        "Kernels/threads",
-        "Kernels/SIMD",
+        "Kernels/kernels",
         "Codecs/HDF5 blosc-zstd",
         "Codecs/libx264 video",
         "Codecs/16-bit RGB PNG",
@@ -88,30 +86,11 @@ def test_clip_space_that_is_not_zero_to_one_is_found(gl):
         clip_control(0x8CA1, 0x935F)
 
 
-@pytest.mark.parametrize(
-    ("answer", "status", "value", "remedy"),
-    [
-        (("interop", ""), "ok", "they stay on the card: CUDA reads what OpenGL draws", ""),
-        (("pinned", "no cuda-bindings"), "absent", "over the bus: no cuda-bindings", "cuda-bindings"),
-        (("pinned", "cuInit: error 999"), "absent", "over the bus: cuInit: error 999", ""),
-        (GLError("tensors need torch"), "absent", "tensors need torch", "torch"),
-        (OSError("libcudart"), "absent", "OSError: libcudart", ""),
-    ],
-)
-def test_how_frames_go_to_torch(gl, monkeypatch, answer, status, value, remedy):
-    """Of a card's context; there is none here."""
-
-    def reader(*_):
-        if isinstance(answer, Exception):
-            raise answer
-        return SimpleNamespace(way=answer[0], why=answer[1], read=lambda: None, release=lambda: None)
-
-    monkeypatch.setattr("blinkgl.render.tensors.TextureReader", reader)
-    card = SimpleNamespace(is_software=False, ctx=gl.ctx, function=gl.function, idle=gl.idle)
-    check = doctor._to_torch(card, "OpenGL")
-    assert (check.status, check.value) == (status, value)
-    assert remedy in check.remedy and bool(check.remedy) == bool(remedy)
-    assert doctor._to_torch(SimpleNamespace(is_software=True), "OpenGL").status == "info"
+def test_an_extra_names_what_lacks_and_installs_it(monkeypatch):
+    monkeypatch.setattr(doctor, "EXTRAS", {"one": (("numpy", "no-such-thing"), "tests")})
+    (check,) = doctor._extras()
+    assert check.status == "absent" and check.value.startswith(f"numpy {np.__version__}, no no-such-thing (tests)")
+    assert check.remedy.endswith("-m pip install no-such-thing")
 
 
 def test_libraries_that_are_newer_than_tested_are_named(monkeypatch):

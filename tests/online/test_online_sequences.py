@@ -144,7 +144,7 @@ def test_batches_are_the_same_however_many_loader_processes(recipe):
         ({"window_ms": (1, 2, 3)}, "window_ms: not lengths of windows"),
         ({"window_ms": float("nan")}, "window_ms: not a finite number"),
         ({"steps": 0, "kind": "streams"}, "steps: not a whole number in range"),
-        ({"split": "val"}, "split: unknown split (got 'val'); expected train, test"),
+        ({"split": "val"}, "split: unknown choice (got 'val'); expected 'train' or 'test'"),
         ({"split": "test"}, "the recipe has no sequences of split 'test'"),
         ({"workers": -1}, "workers: not a whole number in range"),
         ({"rank": 2, "world": 2}, "rank: not a whole number in range"),

@@ -300,12 +300,12 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     from blinkgl.config.sensor import load_sensor
     from blinkgl.show.simulate import emulator_options
 
-    options = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
-    assert options["emulator"] == load_sensor("davis346").emulator("v2e", contrast_threshold=0.3)
-    assert options["readout"] == load_sensor("davis346").readout
+    emulator, camera = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
+    assert emulator == load_sensor("davis346").emulator("v2e", contrast_threshold=0.3)
+    assert camera == load_sensor("davis346")
     strobe = [np.full((120, 160), 0.1 if k % 2 else 1.0, np.float32) for k in range(20)]
     report = SimulationReport()
-    kept = all_of(strobe, fps=2000, emulator=EsimConfig(), readout=options["readout"], report=report)
+    kept = all_of(strobe, fps=2000, emulator=EsimConfig(), readout=camera.readout, report=report)
     free = all_of(strobe, fps=2000, emulator=EsimConfig())
     assert report.lost > 0 < report.late and len(kept) + report.lost + report.late == len(free)
     assert len(kept) <= 12e6 * 19 / 2000 + 1 and kept.t[-1] <= report.last_ns // 1000
@@ -372,9 +372,8 @@ def test_a_sensors_size_is_taken_and_said(tmp_path, capsys):
 )
 @pytest.mark.parametrize("sensor", [None, "davis346"])
 def test_emulator_parameters_that_cannot_be_used(tmp_path, text, overrides, message, sensor):
-    from blinkgl.recordings.simulation import emulator_config
     from blinkgl.show.simulate import emulator_options
 
     (tmp_path / "e.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        emulator_config(emulator_options("esim", str(tmp_path / "e.yaml"), overrides, sensor)["emulator"])
+        emulator_options("esim", str(tmp_path / "e.yaml"), overrides, sensor)

@@ -102,11 +102,11 @@ def test_the_page_is_whole_and_shows_what_is_there(data, capsys):
     page = read(data / "report.html")
     text = " ".join(page.text)
     assert "url(" not in text and "@import" not in text and "<script" not in (data / "report.html").read_text()
-    assert len(page.images) == 3 * (3 + 3), "frame, events, flow; and depth, ids and occlusion, which its labels are"
+    assert len(page.images) == 3 * 3, "depth, ids and occlusion; frame, events and flow are in the preview"
     pictures = [
         cv2.imdecode(np.frombuffer(base64.b64decode(i.split(",")[1]), np.uint8), cv2.IMREAD_COLOR) for i in page.images
     ]
-    assert {p.shape for p in pictures} == {(36, 48, 3)} and sum(p.std() > 3 for p in pictures) >= 15, (
+    assert {p.shape for p in pictures} == {(36, 48, 3)} and sum(p.std() > 3 for p in pictures) >= 6, (
         "masks may be black"
     )
     for words in (

@@ -198,7 +198,7 @@ def test_what_is_refused(tree, expected):
 def test_random_lights():
     """As many as asked for, in their ranges, of a stream of their own."""
     config = RandomLightsConfig(count=[2, 5], kinds=["sun", "point", "spot"], height=[2, 3])
-    drawn = [random_lamps(config, generator(7, k, Role.LIGHT), 10.0, 1.0) for k in range(40)]
+    drawn = [random_lamps(config, generator(7, k, Role.LIGHT), 10.0) for k in range(40)]
     assert {len(lamps) for lamps in drawn} == {2, 3, 4, 5}
     assert {lamp.kind for lamps in drawn for lamp in lamps} == {"sun", "point", "spot"}
     for lamp in (lamp for lamps in drawn for lamp in lamps):
@@ -206,10 +206,10 @@ def test_random_lights():
         assert low * 0.999 <= max(lamp.strength) <= high * 1.001 and min(lamp.strength) >= 0.49 * max(lamp.strength)
         pose = lamp.path.pose(0)
         if lamp.kind != "sun":
-            assert 3.0 <= pose[2, 3] <= 4.0 and np.abs(pose[:2, 3]).max() <= 10.0
+            assert 2.0 <= pose[2, 3] <= 3.0 and np.abs(pose[:2, 3]).max() <= 10.0
         if lamp.kind != "point":
             assert pose[2, 2] > 0, "it shines downwards"
-    again = random_lamps(config, generator(7, 3, Role.LIGHT), 10.0, 1.0)
+    again = random_lamps(config, generator(7, 3, Role.LIGHT), 10.0)
     assert [a.strength for a in again] == [b.strength for b in drawn[3]]
 
 

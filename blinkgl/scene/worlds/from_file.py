@@ -48,9 +48,8 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
     own = config.lights == "file"
     with reading("scene", str(path)):
         limits = {"max_faces": config.max_faces, "max_texture": config.max_texture_size}
-        limits["border"] = border_of(path, base)
         scene = from_document(
-            gltf.read(path, **limits, lights=own),
+            gltf.read(path, **limits, border=border_of(path, base), lights=own),
             camera,
             t0_ns,
             t1_ns,

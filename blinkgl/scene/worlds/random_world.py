@@ -1,7 +1,7 @@
 """Random worlds: a textured sky box, ground, and objects from a pool, resting or flying, mostly in view.
 
 After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; waypoints in free space
-joined by splines; objects that collide stop. The world is z up, in metres, ground at ``ground.height``.
+joined by splines; objects that collide stop. The world is z up, in metres, ground at z = 0.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.camera import camera_radius
+from blinkgl.config.base import placed
+from blinkgl.config.camera import room_for
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import RandomSceneConfig, SkyConfig
@@ -68,20 +69,20 @@ def random_world(
     objects, textures = pools(config, base)
     log = [*objects.notes, *textures.notes]
     omissions: dict[str, None] = {}
-    floor = config.ground.height if config.ground else 0.0
 
-    T_cam, target = _viewpoint(config, rng, floor)
-    clearance = _clearance(config, camera)
-    backdrop, panorama = _backdrop(config, textures, rng, rng_texture, split, floor, base, log)
+    T_cam, target = _viewpoint(config, rng)
+    with placed(str):
+        clearance = room_for(camera, config.camera_clearance, config.region.height)
+    backdrop, panorama = _backdrop(config, textures, rng, rng_texture, split, base, log)
     items: list[_Item] = [(name, category, parts, StaticPath(T, t0_ns, t1_ns)) for name, category, parts, T in backdrop]
 
     dice = rng, rng_texture, rng_shape
-    placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
+    placements = _place(config, camera, objects, textures, dice, split, T_cam, clearance, log, omissions)
     # Objects with their own motion are not thrown.
-    lifeless = [one.name for one in placed if gait(one.parts)[0] == "free"]
+    lifeless = [one.name for one in placements if gait(one.parts)[0] == "free"]
     bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
-    room = _Room(config, floor, placed, T_cam, clearance)
-    for k, one in enumerate(placed):
+    room = _Room(config, placements, T_cam, clearance)
+    for k, one in enumerate(placements):
         path = (
             StaticPath(one.pose, t0_ns, t1_ns)
             if one.name in bodies
@@ -98,34 +99,18 @@ def random_world(
     )
     # Bodies of the engine are left to it: their collisions are its own.
     kept, camera_path = _resolved(scene_objects, set(bodies), camera_paths, clearance, t0_ns, t1_ns, log)
-    kept, dynamics = _fallen(config, kept, bodies, (camera_path, clearance), floor, t0_ns, t1_ns, log)
+    kept, dynamics = _fallen(config, kept, bodies, (camera_path, clearance), t0_ns, t1_ns, log)
     return Scene(
         objects=kept,
         rig=Rig.alone(camera, camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
-        light=_light(
-            config, panorama, lamp_paths(t0_ns, t1_ns, base), rng, generator(seed, sequence, Role.LIGHT), floor
-        ),
+        light=_light(config, panorama, lamp_paths(t0_ns, t1_ns, base), rng, generator(seed, sequence, Role.LIGHT)),
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),
         dynamics=dynamics,
     )
-
-
-def _clearance(config: RandomSceneConfig, camera: CameraModel) -> float:
-    """Return the distance that everything keeps from the camera. Raises ConfigError: the region is too small for it."""
-    clearance = camera_radius(camera, config.camera_clearance)
-    if clearance > config.region.height:
-        raise ConfigError(
-            "the region is too low for the camera's clearance",
-            where="scene.region.height",
-            value=config.region.height,
-            accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
-            "distance of the near plane's corners: camera.near and camera.fov)",
-        )
-    return clearance
 
 
 class _Placed(NamedTuple):
@@ -141,12 +126,10 @@ class _Placed(NamedTuple):
 class _Room:
     """Free space of a random world: the region without the others' bounding spheres at t0."""
 
-    def __init__(
-        self, config: RandomSceneConfig, floor: float, placed: list[_Placed], T_cam: np.ndarray, clearance: float
-    ):
+    def __init__(self, config: RandomSceneConfig, placed: list[_Placed], T_cam: np.ndarray, clearance: float):
         half = config.region.width / 2
-        self.low, self.high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
-        self.ground_z = floor if config.ground else None
+        self.low, self.high = np.array([-half, -half, 0.0]), np.array([half, half, config.region.height])
+        self.ground_z = 0.0 if config.ground else None
         self.centres = np.array([one.pose[:3, 3] for one in placed]).reshape(-1, 3)
         self.radii = np.array([one.radius for one in placed])
         self.camera, self.clearance = T_cam[:3, 3], clearance
@@ -162,19 +145,19 @@ class _Room:
         return FreeSpace(low, self.high, self.ground_z, self.centres, self.radii + _STAND_OFF)
 
 
-def _backdrop(config, textures, rng, rng_texture, split, floor, base, log):
+def _backdrop(config, textures, rng, rng_texture, split, base, log):
     """Return ([(name, category, parts, pose)] of sky and ground, the panorama on the sky or None)."""
     backdrop, panorama = [], None
     if config.sky:
         parts, panorama = _sky(config.sky, textures, rng_texture, split, base, log)
-        backdrop.append(("sky", "sky", parts, pose_of((0, 0, floor))))
+        backdrop.append(("sky", "sky", parts, np.eye(4)))
     if config.ground:
-        size = config.ground.size or (config.sky.size if config.sky else 4 * config.region.width)
+        size = config.sky.size if config.sky else 4 * config.region.width
         mesh = grid(width=size, depth=size, subdivisions=config.ground.subdivisions)
         repeats = size / _log_uniform(rng_texture, config.ground.tile)
         texture = textures.draw(rng_texture, split, log)
         material = Material(texture, uv_scale=(repeats, repeats), unlit=config.light.unlit)
-        backdrop.append(("ground", "ground", (Part(mesh, material),), pose_of((0, 0, floor))))
+        backdrop.append(("ground", "ground", (Part(mesh, material),), np.eye(4)))
     rng.permutation(4)  # was used by removed walls; kept so that later draws stay the same
     return backdrop, panorama
 
@@ -210,12 +193,12 @@ def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clea
     return tuple(resolved.get(o.name, o) for o in objects if o.name not in bad), result.camera_path
 
 
-def _fallen(config, objects, bodies, eye, floor, t0_ns, t1_ns, log):
+def _fallen(config, objects, bodies, eye, t0_ns, t1_ns, log):
     """Return (the objects without those that diverge, Dynamics or None). eye : the camera's path and clearance."""
     if config.physics is None:
         return objects, None
     while any(o.name in bodies for o in objects):
-        sides = _sides(config, floor)
+        sides = _sides(config)
         try:
             return simulate(objects, bodies, config.physics, t0_ns, t1_ns, camera=eye, sides=sides)
         except Exploded as error:  # squeezed between two that cannot be stopped
@@ -224,12 +207,10 @@ def _fallen(config, objects, bodies, eye, floor, t0_ns, t1_ns, log):
     return objects, None
 
 
-def _light(
-    config: RandomSceneConfig, panorama: Panorama | None, path_of: LampPath, rng, rng_lamps, floor: float
-) -> Light:
+def _light(config: RandomSceneConfig, panorama: Panorama | None, path_of: LampPath, rng, rng_lamps) -> Light:
     lamps: tuple[Lamp, ...] = ()
     if config.lights is not None:
-        lamps = random_lamps(config.lights, rng_lamps, config.region.width / 2, floor)
+        lamps = random_lamps(config.lights, rng_lamps, config.region.width / 2)
         if len(lamps) + len(config.light.lights) + 1 > MAX_LAMPS:
             raise ConfigError(
                 "too many lights",
@@ -261,21 +242,23 @@ _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(confi
 _texture_pool = lru_cache(maxsize=4)(texture_pool)
 
 
-def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:
+def _viewpoint(config: RandomSceneConfig, rng) -> tuple[np.ndarray, np.ndarray]:
     """Return (T_world_cam at t0, target point): near the edge of the region, looking across its middle."""
     half = config.region.width / 2
     around = rng.uniform(0, 2 * math.pi)
     low, high = config.region.camera_height
-    position = np.array([0, 0, floor]) + [
-        *(rng.uniform(0.4, 0.85) * half * np.array([math.cos(around), math.sin(around)])),
-        rng.uniform(low, min(high, config.region.height)),
-    ]
-    target = np.array([*rng.uniform(-0.2, 0.2, 2) * half, floor + rng.uniform(0.05, 0.3) * config.region.height])
+    position = np.array(
+        [
+            *(rng.uniform(0.4, 0.85) * half * np.array([math.cos(around), math.sin(around)])),
+            rng.uniform(low, min(high, config.region.height)),
+        ]
+    )
+    target = np.array([*rng.uniform(-0.2, 0.2, 2) * half, rng.uniform(0.05, 0.3) * config.region.height])
     return pose_of(position, look_rotation(target - position)), target
 
 
 def _place(
-    config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, floor, log, omissions
+    config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, log, omissions
 ) -> list[_Placed]:
     """Return the objects that found a place: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
@@ -302,10 +285,10 @@ def _place(
         lowest = min(_lowest(p.mesh, rotation[2]) for p in parts)
         in_view, taken = rng.random() < settings.in_view, len(placed) + 1
         for _ in range(_PLACEMENTS):
-            position = _candidate(config, camera, rng, T_cam, floor, in_view, resting)
+            position = _candidate(config, camera, rng, T_cam, in_view, resting)
             if resting:
-                position[2] = floor - lowest
-            elif not floor + (radius if config.ground else 0) + _GAP <= position[2] <= floor + region.height:
+                position[2] = 0.0 - lowest  # never -0
+            elif not (radius if config.ground else 0) + _GAP <= position[2] <= region.height:
                 continue
             if max(abs(position[0]), abs(position[1])) > region.width / 2:
                 continue
@@ -362,12 +345,12 @@ def _lowest(mesh: Mesh, up: np.ndarray) -> float:
     return float((points @ up).min()) - (0.0 if mesh.deformer.locomotion == "upright" else margin)
 
 
-def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:
+def _candidate(config, camera, rng, T_cam, in_view, resting) -> np.ndarray:
     """Return a candidate position: along a pixel's ray at a log-uniform distance, or anywhere in the region."""
     region = config.region
     if not in_view:
         half = region.width / 2
-        return rng.uniform([-half, -half, floor], [half, half, floor + region.height])
+        return rng.uniform([-half, -half, 0.0], [half, half, region.height])
     # The image begins half a pixel before the first pixel's centre.
     pixel = rng.random(2) * (camera.width, camera.height) - 0.5
     ray = T_cam[:3, :3] @ camera.rays(pixel)
@@ -424,7 +407,6 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
         falling[name] = BodyConfig(
             density=density,
             friction=friction,
-            rolling=config.rolling,
             restitution=restitution,
             velocity=(flat * math.cos(around), flat * math.sin(around), speed * math.sin(elevation)),
             spin=tuple(spin * axis / np.linalg.norm(axis)),
@@ -432,15 +414,15 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
     return falling
 
 
-def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
+def _sides(config: RandomSceneConfig) -> list[Barrier]:
     """Return the sides of the region, far enough out that no object intersects one; its floor where there is no
     ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
     sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
-    sides.append(Barrier((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
+    sides.append(Barrier((0.0, 0.0, -1.0), -(config.region.height + reach)))
     if config.ground is None:
-        sides.append(Barrier((0.0, 0.0, 1.0), floor - reach))
+        sides.append(Barrier((0.0, 0.0, 1.0), -reach))
     return sides
 
 

@@ -149,9 +149,9 @@ def test_options():
     unlit = build(config(light=LightConfig(unlit=True)))
     assert all(p.material.unlit for o in unlit.objects for p in o.parts)
     assert len(things(build(config(objects=ObjectsConfig(count=0))))) == 0
-    raised = build(config(ground={"height": 5.0}))
-    assert min(world_vertices(o)[:, 2].min() for o in things(raised)) == pytest.approx(5, abs=1e-9)
-    assert raised.camera_path.pose(0)[2, 3] > 5.9
+    standing = build(config())
+    assert min(world_vertices(o)[:, 2].min() for o in things(standing)) == pytest.approx(0, abs=1e-9)
+    assert 1 <= standing.camera_path.pose(0)[2, 3] <= 3.5
 
 
 def test_crowded_worlds_leave_objects_out_and_say_so():

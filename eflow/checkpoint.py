@@ -88,10 +88,10 @@ def metadata_of(model: FlowModel) -> dict[str, str]:
     return {"format": FORMAT, "model": model.config.model_dump_json()}
 
 
-def find_weights(path: str | os.PathLike, *, averaged: bool = True) -> Path:
-    """Return the file of weights of the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder, a
-    run folder (its newest checkpoint), or a network that comes with the package (:mod:`eflow.shipped`). A file or
-    folder of that name has priority over the package's network. Raises AssetError."""
+def find_weights(path: str | os.PathLike) -> Path:
+    """Return the file of weights of the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder (the
+    averaged weights, if there are any), a run folder (its newest checkpoint), or a network that comes with the package
+    (:mod:`eflow.shipped`). A file or folder of that name has priority over the package's network. Raises AssetError."""
     path = Path(path)
     if path.is_file():
         return path
@@ -111,7 +111,7 @@ def find_weights(path: str | os.PathLike, *, averaged: bool = True) -> Path:
             "no checkpoint in this folder", where=str(path), accepted="weights.safetensors, or checkpoints/<step>"
         )
     ema = folder / "ema.safetensors"
-    return ema if averaged and ema.is_file() else folder / "weights.safetensors"
+    return ema if ema.is_file() else folder / "weights.safetensors"
 
 
 def newest(run: Path) -> Path | None:
@@ -129,12 +129,11 @@ def config_of(path: str | os.PathLike) -> dict[str, Any]:
     return json.loads(load_model(path).config.model_dump_json())
 
 
-def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any = None) -> FlowModel:
+def load_model(path: str | os.PathLike) -> FlowModel:
     """Return the model of a checkpoint, in evaluation mode on the CPU.
 
-    averaged : use the averaged weights if there are any. expected : configuration that the checkpoint must have.
-    Raises AssetError: no checkpoint, a damaged one, a pickle, or another model or configuration."""
-    file = find_weights(path, averaged=averaged)
+    Raises AssetError: no checkpoint, a damaged one, or a pickle."""
+    file = find_weights(path)
     tensors, metadata = read_tensors(file)
     try:
         if metadata["format"] != FORMAT:
@@ -145,26 +144,11 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
             "safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train"
         ) from None
     config = model_config(tree)
-    if expected is not None:
-        require_same(config, expected, str(file))
     with torch.device("meta"):  # shapes without memory: a small file may ask for a network of any size
         _require_fit(build_model(config).state_dict(), tensors, str(file))
     model = build_model(config)
     load_weights(model, tensors, str(file))
     return model.eval()
-
-
-def require_same(found: Any, expected: Any, where: str) -> None:
-    """Raise an AssetError that names the first key in which two model configurations differ."""
-    a, b = found.model_dump(), expected.model_dump()
-    for key in ["name", *sorted(set(a) | set(b))]:
-        if a.get(key) != b.get(key):
-            raise AssetError(
-                f"checkpoint of another model: model.{key} differs",
-                where=where,
-                value=a.get(key),
-                accepted=repr(b.get(key)),
-            )
 
 
 def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> None:
@@ -372,7 +356,7 @@ def _leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
 def weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
     """Return the weights that ``init_from`` names, and that name. Raises AssetError: they are of another model."""
     assert config.init_from is not None
-    model = load_model(config.init_from, expected=None)
+    model = load_model(config.init_from)
     if model.config.name != config.model.name:
         raise AssetError(
             "checkpoint of another model",

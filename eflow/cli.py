@@ -16,25 +16,20 @@ from eflow.cli_arguments import (
     Answer,
     Dataset,
     Dense,
-    Device,
     Focal,
     Frames,
-    GroundTruth,
     Iterations,
     Network,
     Overrides,
-    Precision,
     Protocol,
     Quiet,
-    Raw,
     Sharpen,
     Sharpened,
     Span,
-    Truth,
     WarmStart,
     Whole,
     WindowMs,
-    method_named,
+    answerer,
     network_of,
     one_of,
     ranges_of,
@@ -150,33 +145,23 @@ def evaluate(
     dataset: Dataset,
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     window_ms: WindowMs = None,
-    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     protocol: Protocol = "all",
-    ground_truth: GroundTruth = None,
     frames: Frames = None,
     dense: Dense = False,
-    pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
     iterations: Iterations = None,
-    empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     sharpen: Sharpened = False,
     warm_start: WarmStart = False,
-    raw: Raw = False,
     focal: Focal = None,
-    precision: Precision = "fp32",
-    device: Device = "auto",
 ) -> None:
     """Score a network or a method on a data set. Beside it stand baselines: zero flow, and global motions fitted to the
-    truth."""
+    truth. Samples with an empty window are left out and counted."""
     from blinkgl.machine.terminal import plain_console
-    from eflow.data.sources import FORMATS, open_source
+    from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
-    one_of("--empty", empty, ("error", "skip"))
-    model = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
-    if model is None:
-        model, precision = network_of(checkpoint, device, raw, precision, iterations, warm_start)
+    model = answerer(checkpoint, focal, iterations=iterations, warm_start=warm_start)
     console = plain_console(stderr=True)
     if dataset.endswith((".yaml", ".yml")):
         with console.status("rendering"):
@@ -184,17 +169,12 @@ def evaluate(
     elif window_ms is not None:
         raise ConfigError("needs a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        mvsec = {"protocol": protocol, "truth": ground_truth, "frames": ranges_of(frames), "dense": dense}
-        one_of("--format", format, ("auto", *FORMATS))
-        source = open_source(dataset, format, dt=dt, **mvsec)
+        source = open_source(dataset, dt=dt, protocol=protocol, frames=ranges_of(frames), dense=dense)
     with console.status("evaluating") as status:
         result = score(
             model,
             source,
             out,
-            pictures=pictures,
-            empty=empty,
-            precision=precision,
             limit=limit,
             sharpen=sharpen,
             warm_start=warm_start,
@@ -223,7 +203,6 @@ def predict(
     ] = None,
     end_ms: Annotated[float | None, typer.Option("--end-ms", help="Stop at this time after the first event.")] = None,
     whole: Whole = False,
-    truth: Truth = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None,
     time_unit: of_events.TimeUnit = None,
     origin: of_events.Origin = None,
@@ -239,12 +218,8 @@ def predict(
     video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None,
     warm_start: WarmStart = False,
     sharpen: Sharpen = True,
-    empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
-    raw: Raw = False,
     iterations: Iterations = None,
     focal: Focal = None,
-    precision: Precision = "fp32",
-    device: Device = "auto",
 ) -> None:
     """Compute the flow of any event file. Networks do it, and methods that need no training.
 
@@ -253,36 +228,26 @@ def predict(
     from blinkgl.io.reading import EventReading
     from blinkgl.types.events import Events
     from eflow import infer
-    from eflow.choice import AUTO, chosen
+    from eflow.choice import AUTO, BODIES, chosen
     from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
     from eflow.infer import doubts
 
-    one_of("--empty", empty, ("error", "zero"))
     asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
     if len(names) > 2:
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
-    checkpoint, events = [AUTO, *names][-2:]
-    method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
-    reading = EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort)
-    file = infer.open_sized(events, reading)
+    name, events = [AUTO, *names][-2:]
+    chooses = name == AUTO and not Path(AUTO).exists()
+    model = answerer(BODIES if chooses else name, focal, iterations=iterations, warm_start=warm_start and not chooses)
+    file = infer.open_sized(events, EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort))
     height, width = infer.sensor_of(file)
     for line in doubts(next(iter(file.chunks()), Events.empty()), height, width):
         typer.echo(f"{events}: {line}", err=True)
-    outputs = Outputs(out, video, npy, infer.read_truth(truth, height, width) if truth else None, at_events)
-
-    def predictor_of(name: str, **options) -> infer.Predictor:
-        model, own = network_of(name, device, raw, precision, iterations, options.get("warm_start", False))
-        return infer.Predictor(model, height, width, precision=own, empty=empty, **options)
-
-    if checkpoint == AUTO and not Path(AUTO).exists():
-        checkpoint, why = chosen(file, asked, predictor_of)
+    if chooses:
+        name, why = chosen(file, asked, infer.Predictor(model, height, width))
         typer.echo(f"network: {why}")
-    if method is not None:
-        predictor, reads = infer.MethodPredictor(method, height, width, empty=empty), ("old", "new")
-    else:
-        predictor = predictor_of(checkpoint, warm_start=warm_start, sharpen=sharpen)
-        reads = predictor.model.reads
-    show_flows(file, predictor, reads, asked, outputs, typer.echo)
+        model = answerer(name, focal, iterations=iterations, warm_start=warm_start)
+    predictor = infer.Predictor(model, height, width, warm_start=warm_start, sharpen=sharpen)
+    show_flows(file, predictor, asked, Outputs(out, video, npy, at_events), typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)
 
@@ -290,28 +255,18 @@ def predict(
 @app.command()
 def submit(
     checkpoint: Network,
-    dataset: Annotated[str, typer.Argument(help="The benchmark's test set.")],
-    benchmark: Annotated[str, typer.Option(help="dsec or blinkflow.")],
+    dataset: Annotated[str, typer.Argument(help="The test set of DSEC or BlinkFlow; its layout says which.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New zip file.")],
-    full: Annotated[bool, typer.Option("--full", help="BlinkFlow: all pixels instead of one per 4x4 cell.")] = False,
     warm_start: WarmStart = False,
-    precision: Precision = "fp32",
-    device: Device = "auto",
 ) -> None:
     """Write the submission file of a benchmark and check it."""
     from blinkgl.machine.terminal import plain_console
-    from eflow.submit import submit_blinkflow, submit_dsec
+    from eflow.submit import submit as write_submission
 
-    one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
-    model, precision = network_of(checkpoint, device, False, precision, warm_start=warm_start)
+    model = network_of(checkpoint, warm_start=warm_start)
     with plain_console(stderr=True).status("predicting") as status:
         progress = lambda i, n: status.update(f"{i}/{n} flows")
-        options = {"precision": precision, "warm_start": warm_start, "progress": progress}
-        count = (
-            submit_dsec(model, dataset, out, **options)
-            if benchmark == "dsec"
-            else submit_blinkflow(model, dataset, out, full=full, **options)
-        )
+        count = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
     typer.echo(f"written and checked: {out}, {count} files")
 
 
@@ -332,17 +287,11 @@ def import_(
 @app.command()
 def models(
     name: Annotated[str | None, typer.Argument(help="Show only this network, with its whole card.")] = None,
-    json_out: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """List the trained networks that come with the package. Their names can be used in place of a checkpoint."""
-    import json
-
     from eflow import shipped
 
     cards = [shipped.card_of(n) for n in ([name] if name is not None else shipped.names())]
-    if json_out:
-        typer.echo(json.dumps([card.model_dump(mode="json") for card in cards], indent=1))
-        return
     for card in cards:
         for line in shipped.lines(card, whole=name is not None):
             typer.echo(line)
@@ -361,7 +310,6 @@ def pack(
         str,
         typer.Option("--out", "-o", help="Parent of the new folder; networks in eflow/weights ship with the package."),
     ],
-    raw: Raw = False,
 ) -> None:
     """Pack a checkpoint as a network that can come with the package. It has weights (5 MB at most, above it in half
     precision) and a card.
@@ -370,21 +318,42 @@ def pack(
     from eflow import shipped
     from eflow.packing import pack as write_pack
 
-    folder, full = write_pack(checkpoint, name, card, out, averaged=not raw)
+    folder, full = write_pack(checkpoint, name, card, out)
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)
 
 
+_LAST_WEIGHTS = "the file weights.safetensors of a checkpoint in place of its folder"
+_DEVICE = "nothing: a GPU is used if there is one; CUDA_VISIBLE_DEVICES= hides it"
+_PRECISION = "nothing: flow is computed in single precision"
 GONE = {
     "export": "torch.onnx.export of eflow.load_model(NAME)'s network: ONNX files are no longer written here",
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
     "evaluate --confidence": "nothing: no network here estimates its confidence",
+    "evaluate --device": _DEVICE,
+    "evaluate --empty": "nothing: samples with an empty window are left out and counted",
+    "evaluate --format": "nothing: the layout is recognised by its files",
+    "evaluate --ground-truth": "--protocol, which says it",
+    "evaluate --pictures": "nothing: --out writes twelve",
+    "evaluate --precision": _PRECISION,
+    "evaluate --raw": _LAST_WEIGHTS,
     "predict --confidence": "nothing: no network here estimates its confidence",
+    "predict --device": _DEVICE,
+    "predict --empty": "nothing: windows without events have zero flow and are counted",
     "predict --flo": "--npy",
     "predict --h5": "--npy",
+    "predict --precision": _PRECISION,
+    "predict --raw": _LAST_WEIGHTS,
+    "predict --truth": "eflow evaluate, or --npy and your own comparison",
+    "submit --benchmark": "nothing: the layout of the test set says it",
+    "submit --device": _DEVICE,
+    "submit --full": "nothing: one pixel per 4x4 cell is written, the benchmark's smaller form",
+    "submit --precision": _PRECISION,
     "import --bins": "E-RAFT's published weights: RAFT's own are no longer read",
+    "models --json": "the card of each network, eflow/weights/NAME/card.yaml",
+    "pack --raw": _LAST_WEIGHTS,
     "pack --store": "nothing: weights are stored in single precision",
 }
 """Commands and options of earlier versions, and what to use instead."""

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from blinkgl.errors import ConfigError
-from eflow.methods.table import METHODS, make_method
+from eflow.methods.table import METHODS, Method, make_method
 
 if TYPE_CHECKING:
     from eflow.config import SourceConfig
+    from eflow.data.online import Held
+    from eflow.models import FlowModel
 
-Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Answer = Annotated[
     str,
     typer.Argument(
@@ -41,7 +41,6 @@ WindowMs = Annotated[
     typer.Option(metavar="LOW-HIGH", help="Lengths of windows, of a recipe only. Default: its label interval."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
-Raw = Annotated[bool, typer.Option("--raw", help="Use the last weights instead of the averaged ones.")]
 Iterations = Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")]
 
 Dataset = Annotated[
@@ -52,13 +51,6 @@ Dataset = Annotated[
     ),
 ]
 Protocol = Annotated[str, typer.Option(help="MVSEC: frames and rows to score: all, ste-flownet or e-raft (20 Hz).")]
-GroundTruth = Annotated[
-    str | None,
-    typer.Option(
-        "--ground-truth",
-        help="MVSEC: propagated (through the 20 Hz flow) or scaled (one field). Default: the protocol's.",
-    ),
-]
 Frames = Annotated[
     list[str] | None,
     typer.Option("--frames", metavar="FIRST-LAST", help="MVSEC: images (or 20 Hz fields) to score; may be repeated."),
@@ -74,7 +66,6 @@ Span = Annotated[
 Whole = Annotated[
     bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
 ]
-Truth = Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo); prints AEE and cosine.")]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
@@ -84,53 +75,49 @@ Sharpen = Annotated[
 ]
 
 
-def method_named(name: str, focal: float | None, **network: object):
-    """Return the method of that name; None if it is a network's name or a file.
+def answerer(
+    name: str, focal: float | None, *, iterations: int | None = None, warm_start: bool = False
+) -> FlowModel | Method:
+    """Return the method of that name, or the trained network, on a GPU if there is one.
 
-    network : options that only networks have. Raises ConfigError: one of them is set, but the name is a method's."""
+    Raises ConfigError: it lacks one of the options. AssetError: no such network."""
     if name not in METHODS or Path(name).exists():
         if focal is not None:
             raise ConfigError("only a method uses it", where="--focal", value=focal, accepted=", ".join(METHODS))
-        return None
-    for option, value in network.items():
+        return network_of(name, iterations=iterations, warm_start=warm_start)
+    for option, value in (("--iterations", iterations), ("--warm-start", warm_start)):
         if value:
-            raise ConfigError(f"{name} is not a network", where="--" + option.replace("_", "-"), value=value)
+            raise ConfigError(f"{name} is not a network", where=option, value=value)
     return make_method(name, focal)
 
 
 def ranges_of(frames: list[str] | None) -> tuple[tuple[int, int], ...]:
     """Return the ranges [first, end) of ``--frames``. Raises ConfigError."""
-    found = [re.fullmatch(r"(\d{1,9})-(\d{1,9})", text) for text in frames or ()]
-    for text, one in zip(frames or (), found):
-        if one is None or int(one[1]) > int(one[2]):
+    ranges = []
+    for text in frames or ():
+        ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", text)
+        if ends is None or int(ends[1]) > int(ends[2]):
             raise ConfigError("not a range of frames", where="--frames", value=text, accepted="FIRST-LAST: 200-800")
-    return tuple((int(one[1]), int(one[2]) + 1) for one in found if one)
+        ranges.append((int(ends[1]), int(ends[2]) + 1))
+    return tuple(ranges)
 
 
-def network_of(
-    checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None, warm_start: bool = False
-):
-    """Return (the trained network on its device, the precision to use there: fp32 if it does not support bf16). Raises
-    ConfigError: this network or machine lacks an option."""
+def network_of(checkpoint: str, *, iterations: int | None = None, warm_start: bool = False) -> FlowModel:
+    """Return the trained network, on a GPU if there is one. Raises ConfigError: it lacks an option. AssetError: no such
+    network."""
     import torch
 
     from eflow.allocator import keep_memory
     from eflow.checkpoint import load_model
-    from eflow.precision import precision_on
 
-    one_of("--precision", precision, ("fp32", "bf16"))
-    one_of("--device", device, ("auto", "cpu", "cuda"))
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
     keep_memory()
-    model = load_model(checkpoint, averaged=not raw)
-    for option, given in (("--iterations", iterations is not None), ("--warm-start", warm_start)):
-        if given and not hasattr(model.config, "iterations"):
+    model = load_model(checkpoint)
+    for option, wanted in (("--iterations", iterations is not None), ("--warm-start", warm_start)):
+        if wanted and not hasattr(model.config, "iterations"):
             raise ConfigError("this network has no iterations", where=option, value=model.config.name)
     if iterations is not None:
         model.config = model.config.model_copy(update={"iterations": iterations})
-    place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-    return model.to(place), precision_on(place, precision)
+    return model.to("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
@@ -139,7 +126,7 @@ def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
         raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
 
 
-def rendered(recipe: str, window_ms: str | None, limit: int | None):
+def rendered(recipe: str, window_ms: str | None, limit: int | None) -> Held:
     """Return samples of a recipe, rendered and kept in memory."""
     from eflow.data.online import held
 

@@ -97,7 +97,7 @@ def trained_so_far(run: Path, log: Path) -> Row:
 def scores(weights: str, sources: dict[str, Any], options: Namespace) -> dict[str, dict[str, Any]]:
     """Return the metrics of a network and of the baselines, by set."""
     model = load_model(weights).to(options.device)
-    return {name: evaluate(model, source, empty="skip", limit=MOST)["methods"] for name, source in sources.items()}
+    return {name: evaluate(model, source, limit=MOST)["methods"] for name, source in sources.items()}
 
 
 # --- a training while its data are rendered ---------------------------------------------------------------------------

@@ -42,15 +42,16 @@ import numpy as np
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import read_any_image
+from blinkgl.io.images import read_npy
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.simulation import emulator_config, frames_to_events
 from blinkgl.scene.surfaces.images import photographs
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
-from eflow.data.window import hit_pixels
+from eflow.data.window import RawSample, StreamWindow, hit_pixels
 from eflow.evaluate import best_motions
-from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
+from eflow.infer import LIKELY_PX, Predictor
 from eflow.methods.iwe import flow_warp_loss
 from eflow.methods.table import METHODS, make_method
 
@@ -64,7 +65,7 @@ LONGEST_MS = 120.0
 MIDDLE = (260, 346)
 """Height and width, px, that are looked at of a large sensor."""
 PANNED = "pans across photographs"
-Answer = Callable[[StreamWindow], np.ndarray]
+Answer = Callable[[StreamWindow | RawSample], np.ndarray]
 
 
 def read(path: Path) -> tuple[Events, int, int]:
@@ -110,10 +111,8 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
     if name == "zero":
         return lambda window: np.zeros((height, width, 2), np.float32)
     plain = name.removesuffix(SHARPENED)
-    if name in METHODS:
-        predictor = MethodPredictor(make_method(name, focal), height, width, empty="zero")
-    else:
-        predictor = Predictor(load_model(plain), height, width, empty="zero", sharpen=plain != name)
+    model = make_method(name, focal) if name in METHODS else load_model(plain)
+    predictor = Predictor(model, height, width, sharpen=plain != name)
     return lambda window: predictor(window)[0]
 
 
@@ -190,7 +189,7 @@ class Burst(NamedTuple):
         """Return the burst of a folder. Raises BlinkGLError."""
         events, height, width = read(folder / "events.txt")
         focal = float((folder / "calib.txt").read_text().split()[0])
-        return cls(events, read_truth(folder / "flow.npy", height, width).astype(np.float64), focal)
+        return cls(events, np.moveaxis(read_npy(folder / "flow.npy").reshape(2, height, width), 0, -1), focal)
 
     @property
     def times(self) -> tuple[int, int, int]:
@@ -294,7 +293,7 @@ def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float
     source = open_source(path)
     samples = (source[int(i)] for i in np.unique(np.linspace(0, len(source) - 1, most).round().astype(int)))
     pairs = (
-        (StreamWindow(s.new.t0, s.old, s.new), np.where(s.valid[..., None], s.flow, np.nan))
+        (s, np.where(s.valid[..., None], s.flow, np.nan))
         for s in samples
         if s.flow is not None and s.valid is not None and s.valid.any()
     )
@@ -302,7 +301,7 @@ def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float
 
 
 def of_pairs(
-    pairs: Iterable[tuple[StreamWindow, np.ndarray]], names: list[str], where: str
+    pairs: Iterable[tuple[StreamWindow | RawSample, np.ndarray]], names: list[str], where: str
 ) -> dict[str, dict[str, float]]:
     """The same of pairs of windows with their true flow, (H, W, 2) px, NaN where there is none."""
     answers: dict[str, Answer] = {}

@@ -13,8 +13,9 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -29,6 +30,16 @@ from eflow.config import TrainConfig
 from eflow.models import FlowModel, build_model, model_config
 
 FORMAT = "eflow-1"
+
+
+class State(TypedDict):
+    """``state.json``. seconds : of the whole training.   config : of the training.   content : digests of its data."""
+
+    format: str
+    step: int
+    seconds: float
+    config: NotRequired[dict[str, object]]
+    content: NotRequired[dict[str, str]]
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -60,7 +71,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         ) from error
 
 
-def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> None:
     """Write named tensors as a safetensors file. Raises OutputError."""
     with output_errors(path):
         try:
@@ -124,7 +135,7 @@ def _steps(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("*") if re.fullmatch("[0-9]{1,18}", p.name) and p.is_dir())
 
 
-def config_of(path: str | os.PathLike) -> dict[str, Any]:
+def config_of(path: str | os.PathLike) -> dict[str, object]:
     """Return the configuration of a checkpoint's network as plain data. Raises AssetError: as :func:`load_model`."""
     return json.loads(load_model(path).config.model_dump_json())
 
@@ -196,7 +207,7 @@ def save_checkpoint(
     model: FlowModel,
     ema: dict[str, Tensor] | None,
     optimizer: torch.optim.Optimizer,
-    state: dict[str, Any],
+    state: Mapping[str, object],
     keep: int,
 ) -> Path:
     """Write ``run/checkpoints/<step>`` completely or not at all, then delete all but the newest ``keep``
@@ -247,12 +258,12 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
     """Restore what :func:`optimizer_tensors` returned. Raises AssetError."""
     tensors, _ = read_tensors(path)
     for name, p in model.named_parameters():
-        found = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
-        if any(v.shape not in ((), p.shape) for v in found.values()):
+        moments = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
+        if any(v.shape not in ((), p.shape) for v in moments.values()):
             raise AssetError(f"optimiser state of '{name}' has another shape", where=str(path))
-        if found:  # AdamW keeps its step counter on the CPU, unless it is fused
+        if moments:  # AdamW keeps its step counter on the CPU, unless it is fused
             here = p.device if optimizer.defaults.get("fused") else torch.device("cpu")
-            optimizer.state[p] = {k: v.to(here if k == "step" else p.device, copy=True) for k, v in found.items()}
+            optimizer.state[p] = {k: v.to(here if k == "step" else p.device, copy=True) for k, v in moments.items()}
     if "/rng/cpu" not in tensors:
         raise AssetError("no generator state", where=str(path))
     torch.set_rng_state(tensors["/rng/cpu"])
@@ -260,7 +271,7 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
         torch.cuda.set_rng_state(tensors["/rng/cuda"])
 
 
-def read_state(folder: Path) -> dict[str, Any]:
+def read_state(folder: Path) -> State:
     """Return the content of ``state.json``. Raises AssetError."""
     path = folder / "state.json"
     try:
@@ -297,20 +308,25 @@ _PLACES = re.compile(r"data\.(train|validate_on)\.\d+\.(path|recipe)|init_from")
 """Keys that say where something is on this machine; :func:`same_content` compares what is there."""
 
 
-def resume_run(folder: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> dict[str, Any]:
+def resume_run(
+    folder: Path,
+    config: TrainConfig,
+    model: FlowModel,
+    optimizer: torch.optim.Optimizer,
+    ema: dict[str, Tensor] | None,
+) -> State:
     """Restore a run from its newest checkpoint ``folder``; return its state. A finished training may get more steps or
     minutes."""
     state = read_state(folder)
     saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
     saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
-    done: dict[str, Any] = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
+    done = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
     for path in sorted({*saved, *now}):
-        before: Any = saved.get(path)
-        wanted: Any = now.get(path)
+        before, wanted = saved.get(path), now.get(path)
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
         if before is not None and wanted is not None:
             free = free or ("content" in state and _PLACES.fullmatch(path))
-            free = free or (path in done and done[path] >= before and wanted > before)
+            free = free or (path in done and _extends(wanted, before, done[path]))
         if not free and before != wanted:
             raise ConfigError(
                 "differs from the run that is resumed",
@@ -322,11 +338,17 @@ def resume_run(folder: Path, config: TrainConfig, model: FlowModel, optimizer, e
     averaged = read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}
     load_weights(model, weights, str(folder / "weights.safetensors"))
     load_optimizer(folder / "optimizer.safetensors", model, optimizer)
-    for k in ema or ():
-        if k not in averaged or averaged[k].shape != ema[k].shape:
+    for k, average in (ema or {}).items():
+        if k not in averaged or averaged[k].shape != average.shape:
             raise AssetError(f"lacks the tensor '{k}' of this model", where=str(folder / "ema.safetensors"))
-        ema[k].copy_(averaged[k])
+        average.copy_(averaged[k])
     return state
+
+
+def _extends(wanted: object, before: object, done: float) -> bool:
+    """Whether a finished training gets a longer one: all steps or minutes of ``before`` are done."""
+    number = (int, float)
+    return isinstance(before, number) and isinstance(wanted, number) and done >= before and wanted > before
 
 
 def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig) -> None:
@@ -343,7 +365,7 @@ def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig
             )
 
 
-def _leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
+def _leaves(tree: object, prefix: str = "") -> dict[str, object]:
     if isinstance(tree, dict) and tree:
         return {
             k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()

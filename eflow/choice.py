@@ -8,8 +8,8 @@ import numpy as np
 
 from blinkgl.io.formats import EventFile
 from eflow import infer
+from eflow.cli_arguments import WindowsAsked
 from eflow.data.window import StreamWindow, hit_pixels
-from eflow.flow_of_file import WindowsAsked
 from eflow.types import Flow, Mask
 
 AUTO = "auto"
@@ -44,7 +44,7 @@ def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> 
     first, last = ends
     start, end = asked.limits(first)
     first, last = max(first, start or first), min(last, end or last)
-    span = infer.likely_span(file, predictor)[0] if asked.milliseconds is None else round(asked.milliseconds * 1000)
+    span = asked.span_us or infer.likely_span(file, predictor)[0]
     yield from infer.at_places(file, span, first, last)
 
 

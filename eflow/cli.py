@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from blinkgl.errors import ConfigError
-from blinkgl.machine import event_options as of_events
 from blinkgl.machine.command_line import new_app, run_app, safe_main
 from blinkgl.machine.interrupts import STOPS, interruptible
 from eflow.cli_arguments import (
     Answer,
+    Answering,
     Dataset,
+    Declared,
     Dense,
-    Focal,
     Frames,
-    Iterations,
     Network,
+    Outputs,
     Overrides,
     Protocol,
     Quiet,
+    Sampling,
     Sharpen,
     Sharpened,
-    Span,
     WarmStart,
-    Whole,
     WindowMs,
+    WindowsAsked,
     answerer,
+    grouped,
     network_of,
     one_of,
     ranges_of,
@@ -73,13 +75,13 @@ def train(
     from eflow.models import preset
     from eflow.train import as_yaml, train as run_training
 
-    said = overrides or []
-    if config is None and not (model or any(o.startswith("model") for o in said)):
+    changes = overrides or []
+    if config is None and not (model or any(o.startswith("model") for o in changes)):
         raise ConfigError("no network to train", accepted="a YAML file, or --model, e.g. ev_flownet-tiny, and --data")
-    if config is None and not (data or any(o.startswith("data.train") for o in said)):
+    if config is None and not (data or any(o.startswith("data.train") for o in changes)):
         raise ConfigError("nothing to train on", accepted="a YAML file, or --data, a folder or a recipe")
     tree = None if model is None else preset(model)
-    whole = load_train_config(config, said, model=tree, data=data or (), minutes=minutes)
+    whole = load_train_config(config, changes, model=tree, data=data or (), minutes=minutes)
     if print_config:
         typer.echo(as_yaml(whole), nl=False)
         return
@@ -93,19 +95,12 @@ def train(
 
 
 @app.command()
+@grouped
 def render(
     recipe: Annotated[str, typer.Argument(help="YAML file of `blinkgl generate`.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New folder of windows, to train on or to evaluate with.")],
+    sampling: Sampling,
     samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="Number of windows.")] = 1000,
-    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows from each sequence.")] = 8,
-    window_ms: WindowMs = None,
-    min_events: Annotated[
-        int, typer.Option(min=1, help="Minimum number of events in each of a sample's two windows.")
-    ] = 40,
-    max_flow: Annotated[float, typer.Option(help="Maximum median flow of a sample, px.")] = 40.0,
-    min_density: Annotated[
-        float, typer.Option(help="Minimum number of events per pixel and per px of mean flow.")
-    ] = 0.0,
     split: Annotated[str, typer.Option(help="Which groups to render: train or test.")] = "train",
     seed: Annotated[int, typer.Option(min=0, help="Each seed gives other windows.")] = 0,
     overrides: Overrides = None,
@@ -120,18 +115,9 @@ def render(
     from eflow.progress import Counting
 
     one_of("--split", split, ("train", "test"))
-    source = windows_of(
-        recipe,
-        window_ms,
-        samples=per_sequence,
-        min_events=min_events,
-        max_flow=max_flow,
-        min_density=min_density,
-        set=tuple(overrides or ()),
-        workers=workers,
-    )
-    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
-    about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
+    source = windows_of(recipe, sampling, set=tuple(overrides or ()), workers=workers)
+    about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": sampling.per_sequence}
+    about |= {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     refuse_existing(Path(out))  # before any worker starts
     with interruptible(*STOPS), open_online(source, seed, split=split) as stream:
         done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
@@ -140,20 +126,19 @@ def render(
 
 
 @app.command()
+@grouped
 def evaluate(
     checkpoint: Answer,
     dataset: Dataset,
+    options: Answering,
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     window_ms: WindowMs = None,
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     protocol: Protocol = "all",
     frames: Frames = None,
     dense: Dense = False,
-    iterations: Iterations = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     sharpen: Sharpened = False,
-    warm_start: WarmStart = False,
-    focal: Focal = None,
 ) -> None:
     """Score a network or a method on a data set. Beside it stand baselines: zero flow, and global motions fitted to the
     truth. Samples with an empty window are left out and counted."""
@@ -161,7 +146,7 @@ def evaluate(
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
-    model = answerer(checkpoint, focal, iterations=iterations, warm_start=warm_start)
+    model = answerer(checkpoint, options)
     console = plain_console(stderr=True)
     if dataset.endswith((".yaml", ".yml")):
         with console.status("rendering"):
@@ -177,7 +162,7 @@ def evaluate(
             out,
             limit=limit,
             sharpen=sharpen,
-            warm_start=warm_start,
+            warm_start=options.warm_start,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
     show(result)
@@ -186,6 +171,7 @@ def evaluate(
 
 
 @app.command()
+@grouped
 def predict(
     names: Annotated[
         list[str],
@@ -196,58 +182,36 @@ def predict(
             "real_bodies where bodies move their own ways.",
         ),
     ],
-    out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
-    window_ms: Span = "100",
-    start_ms: Annotated[
-        float | None, typer.Option("--start-ms", help="Start at this time after the first event.")
-    ] = None,
-    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Stop at this time after the first event.")] = None,
-    whole: Whole = False,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None,
-    time_unit: of_events.TimeUnit = None,
-    origin: of_events.Origin = None,
-    columns: of_events.Columns = None,
-    polarity: of_events.Polarity = None,
-    stream: of_events.Stream = None,
-    damaged: of_events.Damaged = "refuse",
-    sort: of_events.Sort = False,
-    npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False,
-    at_events: Annotated[
-        bool, typer.Option("--at-events", help="Flow of pixels without events nearby is written as not valid.")
-    ] = False,
-    video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None,
-    warm_start: WarmStart = False,
+    outputs: Outputs,
+    asked: WindowsAsked,
+    declared: Declared,
+    options: Answering,
     sharpen: Sharpen = True,
-    iterations: Iterations = None,
-    focal: Focal = None,
 ) -> None:
     """Compute the flow of any event file. Networks do it, and methods that need no training.
 
     FWL (flow warp loss) says how much sharper the events of the new window become when the flow moves them back to its
     start; above 1 the flow helps."""
-    from blinkgl.io.reading import EventReading
     from blinkgl.types.events import Events
     from eflow import infer
     from eflow.choice import AUTO, BODIES, chosen
-    from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
-    from eflow.infer import doubts
+    from eflow.flow_of_file import show_flows
 
-    asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
     if len(names) > 2:
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
     name, events = [AUTO, *names][-2:]
     chooses = name == AUTO and not Path(AUTO).exists()
-    model = answerer(BODIES if chooses else name, focal, iterations=iterations, warm_start=warm_start and not chooses)
-    file = infer.open_sized(events, EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort))
+    model = answerer(BODIES if chooses else name, replace(options, warm_start=options.warm_start and not chooses))
+    file = infer.open_sized(events, declared.reading())
     height, width = infer.sensor_of(file)
-    for line in doubts(next(iter(file.chunks()), Events.empty()), height, width):
+    for line in infer.doubts(next(iter(file.chunks()), Events.empty()), height, width):
         typer.echo(f"{events}: {line}", err=True)
     if chooses:
         name, why = chosen(file, asked, infer.Predictor(model, height, width))
         typer.echo(f"network: {why}")
-        model = answerer(name, focal, iterations=iterations, warm_start=warm_start)
-    predictor = infer.Predictor(model, height, width, warm_start=warm_start, sharpen=sharpen)
-    show_flows(file, predictor, asked, Outputs(out, video, npy, at_events), typer.echo)
+        model = answerer(name, options)
+    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, sharpen=sharpen)
+    show_flows(file, predictor, asked, outputs, typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import re
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_type_hints
 
 import typer
 
 from blinkgl.errors import ConfigError
+from blinkgl.machine import event_options as of_events
 from eflow.methods.table import METHODS, Method, make_method
 
 if TYPE_CHECKING:
+    from blinkgl.io.reading import EventReading
     from eflow.config import SourceConfig
     from eflow.data.online import Held
     from eflow.models import FlowModel
@@ -30,9 +36,6 @@ Network = Annotated[
         "models)."
     ),
 ]
-Focal = Annotated[
-    float | None, typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False)
-]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
@@ -41,7 +44,6 @@ WindowMs = Annotated[
     typer.Option(metavar="LOW-HIGH", help="Lengths of windows, of a recipe only. Default: its label interval."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
-Iterations = Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")]
 
 Dataset = Annotated[
     str,
@@ -59,13 +61,6 @@ Dense = Annotated[bool, typer.Option("--dense", help="MVSEC: score pixels withou
 Sharpened = Annotated[
     bool, typer.Option("--sharpen", help="Scale the flow of a network to the length that makes the events sharpest.")
 ]
-Span = Annotated[
-    str,
-    typer.Option("--window-ms", help="Length Δ of each of the two windows; auto: motion of about 5 px in a window."),
-]
-Whole = Annotated[
-    bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
-]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
@@ -75,20 +70,145 @@ Sharpen = Annotated[
 ]
 
 
-def answerer(
-    name: str, focal: float | None, *, iterations: int | None = None, warm_start: bool = False
-) -> FlowModel | Method:
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return the command with the fields of each parameter that is a dataclass as options of its own."""
+    hints = get_type_hints(command, include_extras=True)
+    groups = {name: kind for name, kind in hints.items() if is_dataclass(kind) and isinstance(kind, type)}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        of = inspect.signature(groups[name]).parameters.values() if name in groups else [parameter]
+        known = get_type_hints(groups[name], include_extras=True) if name in groups else hints
+        parameters += [option.replace(annotation=known[option.name]) for option in of]
+
+    @functools.wraps(command)
+    def run(**values: object) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        command(**values)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+@dataclass(frozen=True)
+class Answering:
+    """Options of a network or of a method. iterations, warm_start : of networks.   focal : px, of a method."""
+
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")] = None
+    warm_start: WarmStart = False
+    focal: Annotated[
+        float | None,
+        typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False),
+    ] = None
+
+
+@dataclass(frozen=True)
+class WindowsAsked:
+    """The windows of an event file to process.
+
+    window_ms : length of each.   start_ms, end_ms : limits, as times after the first event; None: no limit.
+    whole : the whole file is one window, or its halves are a pair."""
+
+    window_ms: Annotated[
+        str,
+        typer.Option(
+            "--window-ms", help="Length Δ of each of the two windows; auto: motion of about 5 px in a window."
+        ),
+    ] = "100"
+    start_ms: Annotated[float | None, typer.Option("--start-ms", help="Start at this time after the first event.")] = (
+        None
+    )
+    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Stop at this time after the first event.")] = None
+    whole: Annotated[
+        bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
+    ] = False
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError unless the length is one."""
+        if self.window_ms != "auto" and not self.span_us:
+            raise ConfigError(
+                "not a window length", where="--window-ms", value=self.window_ms, accepted="milliseconds, or auto"
+            )
+
+    @property
+    def span_us(self) -> int | None:
+        """Return the length of a window, µs; None: motion of about 5 px in a window."""
+        try:
+            milliseconds = float(self.window_ms)
+        except ValueError:
+            return None
+        return round(milliseconds * 1000) if 0.001 <= milliseconds < 1e9 else None
+
+    def limits(self, first: int) -> tuple[int | None, int | None]:
+        """Return the limits, µs, of a file whose first event is at ``first`` µs."""
+        start, end = (None if ms is None else first + round(ms * 1000) for ms in (self.start_ms, self.end_ms))
+        return start, end
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What an event file does not say."""
+
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None
+    time_unit: of_events.TimeUnit = None
+    origin: of_events.Origin = None
+    columns: of_events.Columns = None
+    polarity: of_events.Polarity = None
+    stream: of_events.Stream = None
+    damaged: of_events.Damaged = "refuse"
+    sort: of_events.Sort = False
+
+    def reading(self) -> EventReading:
+        """Return it as readers take it. Raises ConfigError."""
+        from blinkgl.io.reading import EventReading
+
+        return EventReading.of(**vars(self))
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What is written: a new folder of flow and pictures, a video; None: not written.
+
+    npy : also write float32 arrays to the folder.   at_events : flow of pixels without events nearby is not valid."""
+
+    out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None
+    npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False
+    at_events: Annotated[
+        bool, typer.Option("--at-events", help="Flow of pixels without events nearby is written as not valid.")
+    ] = False
+    video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How windows are taken from rendered sequences; keys of :class:`eflow.config.SourceConfig`."""
+
+    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows from each sequence.")] = 8
+    window_ms: WindowMs = None
+    min_events: Annotated[
+        int, typer.Option(min=1, help="Minimum number of events in each of a sample's two windows.")
+    ] = 40
+    max_flow: Annotated[float, typer.Option(help="Maximum median flow of a sample, px.")] = 40.0
+    min_density: Annotated[float, typer.Option(help="Minimum number of events per pixel and per px of mean flow.")] = (
+        0.0
+    )
+
+
+def answerer(name: str, options: Answering) -> FlowModel | Method:
     """Return the method of that name, or the trained network, on a GPU if there is one.
 
     Raises ConfigError: it lacks one of the options. AssetError: no such network."""
     if name not in METHODS or Path(name).exists():
-        if focal is not None:
-            raise ConfigError("only a method uses it", where="--focal", value=focal, accepted=", ".join(METHODS))
-        return network_of(name, iterations=iterations, warm_start=warm_start)
-    for option, value in (("--iterations", iterations), ("--warm-start", warm_start)):
+        if options.focal is not None:
+            raise ConfigError(
+                "only a method uses it", where="--focal", value=options.focal, accepted=", ".join(METHODS)
+            )
+        return network_of(name, iterations=options.iterations, warm_start=options.warm_start)
+    for option, value in (("--iterations", options.iterations), ("--warm-start", options.warm_start)):
         if value:
             raise ConfigError(f"{name} is not a network", where=option, value=value)
-    return make_method(name, focal)
+    return make_method(name, options.focal)
 
 
 def ranges_of(frames: list[str] | None) -> tuple[tuple[int, int], ...]:
@@ -130,17 +250,18 @@ def rendered(recipe: str, window_ms: str | None, limit: int | None) -> Held:
     """Return samples of a recipe, rendered and kept in memory."""
     from eflow.data.online import held
 
-    return held(windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
+    return held(windows_of(recipe, Sampling(4, window_ms)), limit or 128)
 
 
-def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
-    """Return the online source of a recipe for the options of a command line."""
+def windows_of(recipe: str, sampling: Sampling, **how: object) -> SourceConfig:
+    """Return the online source of a recipe. how : further keys of it. Raises ConfigError."""
     from blinkgl.config.problems import validate
     from eflow.config import SourceConfig
 
-    tree: dict = {"recipe": recipe, "online": True, **how}
-    if window_ms is not None:
-        ends = window_ms.split("-")
+    kept = {name: getattr(sampling, name) for name in ("min_events", "max_flow", "min_density")}
+    tree = {"recipe": recipe, "online": True, "samples": sampling.per_sequence, **kept, **how}
+    if sampling.window_ms is not None:
+        ends = sampling.window_ms.split("-")
         try:
             tree["window_ms"] = tuple(float(end) for end in (ends if len(ends) > 1 else 2 * ends))
             validate(SourceConfig, tree)
@@ -148,7 +269,7 @@ def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
             raise ConfigError(
                 "not a range of window lengths",
                 where="--window-ms",
-                value=window_ms,
+                value=sampling.window_ms,
                 accepted="LOW-HIGH in ms, such as 5-100",
             ) from None
     return validate(SourceConfig, tree)

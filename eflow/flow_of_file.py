@@ -4,62 +4,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.errors import BlinkGLError
 from blinkgl.io.formats import EventFile
 from eflow import infer
+from eflow.cli_arguments import Outputs, WindowsAsked
 from eflow.data.window import StreamWindow
 from eflow.infer import Predictor
 from eflow.methods.contrast import LEAST_EVENTS, ContrastMaximisation
 from eflow.methods.iwe import flow_warp_loss
 from eflow.writers import Answer, Writer, flow_folder, flow_video
-
-
-@dataclass(frozen=True)
-class WindowsAsked:
-    """The windows of a file to process.
-
-    milliseconds : length of each; None: motion of about 5 px in a window.
-    start_ms, end_ms : limits, as times after the first event; None: no limit.
-    whole : the whole file is one window, or its halves are a pair."""
-
-    milliseconds: float | None = 100.0
-    start_ms: float | None = None
-    end_ms: float | None = None
-    whole: bool = False
-
-    def limits(self, first: int) -> tuple[int | None, int | None]:
-        """Return the limits, µs, of a file whose first event is at ``first`` µs."""
-        start, end = (None if ms is None else first + round(ms * 1000) for ms in (self.start_ms, self.end_ms))
-        return start, end
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """What to write: a new folder of flow and pictures, a video; None: not written.
-
-    npy : also write float32 arrays to the folder.   at_events : flow of pixels without events nearby is not valid."""
-
-    folder: str | None = None
-    video: str | None = None
-    npy: bool = False
-    at_events: bool = False
-
-
-def milliseconds(text: str) -> float | None:
-    """Return the value of --window-ms; None for "auto". Raises ConfigError."""
-    if text == "auto":
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.001 <= value < 1e9:
-        raise ConfigError("not a window length", where="--window-ms", value=text, accepted="milliseconds, or auto")
-    return value
 
 
 def show_flows(
@@ -73,8 +30,8 @@ def show_flows(
     count = still = 0
     with contextlib.ExitStack() as opened:
         writers: list[Writer] = []
-        if outputs.folder:
-            folder = flow_folder(outputs.folder, npy=outputs.npy, at_events=outputs.at_events)
+        if outputs.out:
+            folder = flow_folder(outputs.out, npy=outputs.npy, at_events=outputs.at_events)
             writers.append(opened.enter_context(folder))
         if outputs.video:
             fps = min(20.0, 1e6 / span)  # windows per second of video: real time, but at most 20
@@ -101,7 +58,7 @@ def show_flows(
         say(f"  {still} of {count} flows are zero: too few events, or nothing moves")
     for why, windows in predictor.unsharpened.items():
         say(f"  {windows} of {count} flows have the network's own length: {why} (--no-sharpen for all)")
-    for path in filter(None, (outputs.folder, outputs.video)):
+    for path in filter(None, (outputs.out, outputs.video)):
         say(f"written: {path}")
 
 
@@ -116,14 +73,12 @@ def _windows(
     first = next((int(c.t[0]) for c in file.chunks()), None)
     if first is None:
         raise BlinkGLError("holds no events", where=str(file.path))
-    if asked.milliseconds is None:
+    if (span := asked.span_us) is None:
         span, longest = infer.likely_span(file, predictor, reads)
         say(f"windows of {span / 1000:g} ms")
         if span == longest:
             say(f"  the longest window of this recording: motion in it is below {infer.LIKELY_PX:g} px")
         _second_opinion(file, predictor, span, first + (longest - span) * len(reads) // 2, say)
-    else:
-        span = round(asked.milliseconds * 1000)
     start, end = asked.limits(first)
     return infer.windows(file, span, start_us=start, end_us=end, reads=reads), span, 1.0
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+from torch import Tensor
 
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import read_table, to_yaml
@@ -65,7 +68,9 @@ def pack(
     return final, full
 
 
-def _stored(tensors: dict[str, Any], checkpoint: str | os.PathLike) -> tuple[dict[str, Any], Literal["fp32", "fp16"]]:
+def _stored(
+    tensors: Mapping[str, Tensor], checkpoint: str | os.PathLike
+) -> tuple[Mapping[str, Tensor], Literal["fp32", "fp16"]]:
     """Return the tensors to store, and their precision: as they are, or in half precision where that is too large.
 
     Raises AssetError: above 5 MB in half precision, too."""

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from blinkgl.io.atomic import write_whole
 from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.images import encode_image
+from eflow.types import Flow, Grid, Mask, Numbers, Picture
 
 _GAP, BAR = 4, 18
 """Gap between panels and height of the bar of captions above them, px."""
@@ -19,7 +20,7 @@ NEAR_PX = 3
 _HEAT = np.array([[0, 0, 0], [70, 0, 90], [190, 40, 60], [250, 150, 30], [255, 250, 190]], np.float32)
 
 
-def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.ndarray:
+def error_colour(error: Numbers, largest: float, valid: Mask) -> Picture:
     """Return a picture (H, W, 3) uint8 of an error (H, W) px: black for 0, then red, pale yellow from ``largest`` on,
     grey where invalid."""
     at = np.clip(np.nan_to_num(error, nan=largest) / max(largest, 1e-9), 0, 1) * (len(_HEAT) - 1)
@@ -28,7 +29,7 @@ def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.nda
     return np.where(valid[..., None], rgb.astype(np.uint8), INVALID)
 
 
-def events_of(tensor: np.ndarray) -> np.ndarray:
+def events_of(tensor: Grid) -> Picture:
     """Return a picture (H, W, 3) uint8 of an event tensor (C, H, W): positive values blue, negative red."""
     strength = np.abs(tensor)
     top = np.percentile(strength[strength > 0], 95) if (strength > 0).any() else 1.0
@@ -36,22 +37,22 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
     return event_colour(np.stack([level(-tensor), level(tensor)]))
 
 
-def near_events(tensor: np.ndarray) -> np.ndarray:
+def near_events(tensor: Grid) -> Mask:
     """Return the pixels of an event tensor (C, H, W) with an event within ``NEAR_PX``, (H, W) bool."""
     hit = (tensor != 0).any(axis=0).astype(np.uint8)
     return cv2.dilate(hit, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
 
 
 def comparison(
-    events: np.ndarray,
-    predicted: np.ndarray,
-    truth: np.ndarray | None = None,
-    valid: np.ndarray | None = None,
+    events: Picture,
+    predicted: Flow,
+    truth: Flow | None = None,
+    valid: Mask | None = None,
     *,
     largest: float | None = None,
     caption: str = "events",
-    near: np.ndarray | None = None,
-) -> np.ndarray:
+    near: Mask | None = None,
+) -> Picture:
     """Return one RGB strip: events | ground truth | prediction | error; without truth events | prediction.
 
     A bar of :data:`BAR` px above names each panel and the length of flow at full colour. Flow panels share one scale:
@@ -82,19 +83,19 @@ def comparison(
     return strip
 
 
-def _paled(picture: np.ndarray, near: np.ndarray | None) -> np.ndarray:
+def _paled(picture: Picture, near: Mask | None) -> Picture:
     if near is None:
         return picture
     return np.where(near[..., None], picture, (0.25 * picture + 0.75 * 255).astype(np.uint8))
 
 
-def full_colour(flow: np.ndarray) -> float:
+def full_colour(flow: Flow) -> float:
     """Return the length of flow (..., 2) at full colour, px: its 99th percentile."""
     speed = np.hypot(flow[..., 0], flow[..., 1])
     speed = speed[np.isfinite(speed)]
     return (float(np.percentile(speed, 99)) if speed.size else 0.0) or 1.0
 
 
-def write_picture(path: str | os.PathLike, image: np.ndarray) -> None:
+def write_picture(path: str | os.PathLike, image: Picture) -> None:
     """Write a PNG, completely or not at all."""
     write_whole(path, encode_image(image))

@@ -161,7 +161,7 @@ class Counting:
         )
 
 
-def told(rendering: dict[str, float], waited: float) -> str:
+def cost_of(rendering: dict[str, float], waited: float) -> str:
     """Return a line about the cost of online rendering."""
     line = (
         f"{rendering['rendered']} samples rendered, {rendering['render_ms']:.1f} processor ms each; training waited "

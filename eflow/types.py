@@ -19,6 +19,8 @@ Grid: TypeAlias = npt.NDArray[np.float32]
 """(C, H, W) float32, the events of a window as channels."""
 Picture: TypeAlias = npt.NDArray[np.uint8]
 """(H, W, 3) uint8, RGB."""
+Times: TypeAlias = npt.NDArray[np.int64]
+"""(N,) int64 µs."""
 Numbers: TypeAlias = npt.NDArray[np.floating]
 """Any shape, a floating dtype; words say which."""
 Batch: TypeAlias = "Mapping[str, Tensor]"

@@ -22,7 +22,7 @@ from blinkgl.io.sizes import check_claim
 from blinkgl.types.recent import Recent
 from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
-from eflow.types import Flow
+from eflow.types import Flow, Mask, Numbers, Times
 
 HEIGHT, WIDTH = 260, 346
 CROP = 256
@@ -84,8 +84,8 @@ class NpzRows:
     def shape(self, name: str) -> tuple[int, ...]:
         return self._layout[name][0]
 
-    def read(self, name: str, row: int | None = None) -> np.ndarray:
-        """Return one row, or the whole array."""
+    def read(self, name: str, row: int | None = None) -> Numbers:
+        """Return one row, or the whole array, of the dtype in the file."""
         shape, dtype, start = self._layout[name]
         shape = shape if row is None else shape[1:]
         count = math.prod(shape)
@@ -147,7 +147,7 @@ class MvsecSource:
                 )
             self._index += [(s, i) for i in scored]
 
-    def _stamps(self, s: _MvsecSequence) -> np.ndarray:
+    def _stamps(self, s: _MvsecSequence) -> Times:
         return s.image_us if self.protocol.at == "images" else s.flow_us
 
     def __len__(self) -> int:
@@ -225,7 +225,7 @@ class _MvsecSequence:
         check_events(events, str(self.path), i, height=HEIGHT, width=WIDTH)
         return Window.of(events, t0, t1)
 
-    def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[np.ndarray, np.ndarray]:
+    def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[Flow, Mask]:
         """Return flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`. truth : of
         :data:`TRUTHS`."""
         k = int(np.clip(np.searchsorted(self.flow_us, t0, side="right") - 1, 0, len(self.flow_us) - 2))
@@ -246,7 +246,7 @@ class _MvsecSequence:
         )
 
 
-def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
+def _stamps(seconds: Numbers, where: str) -> Times:
     """Return times as int64 µs. Raises AssetError: not a list of increasing times."""
     if seconds.ndim != 1 or len(seconds) < 2:
         raise AssetError("not a list of times", where=where, value=seconds.shape, accepted="(N,) with N >= 2")
@@ -260,7 +260,7 @@ def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
     return t
 
 
-def propagate(pieces: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
+def propagate(pieces: list[tuple[Flow, float]]) -> tuple[Flow, Mask]:
     """Return the displacement of every pixel through successive flow fields, each over a fraction of its interval.
 
     pieces : (flow (H, W, 2) px over the whole interval of the field, fraction in (0, 1]); (0, 0) is invalid. A field is

@@ -21,7 +21,7 @@ class Representation(Protocol):
     @property
     def channels(self) -> int: ...
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         """Return (channels, height, width) float32. Raises EventDataError: events outside the window or the sensor."""
         ...
 
@@ -53,7 +53,7 @@ class VoxelGrid:
     def channels(self) -> int:
         return self.bins
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         t0, t1 = window.t0, window.t1
         if self.bounds == "events" and len(window):
             t0, t1 = int(window.t[0]), int(window.t[-1])
@@ -71,7 +71,7 @@ class CountSlices:
     def channels(self) -> int:
         return 2 * self.slices
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         w = _on_pixels(window, height, width)
         counts = voxel.count_slices(w.x, w.y, w.t, w.p, w.t0, w.t1, self.slices, height, width)
         return counts.reshape(-1, height, width)
@@ -83,7 +83,7 @@ class CountsAndTimes:
 
     channels: int = 4
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         w = _on_pixels(window, height, width)
         return voxel.counts_and_times(w.x, w.y, w.t, w.p, w.t0, w.t1, height, width)
 

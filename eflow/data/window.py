@@ -13,6 +13,7 @@ import numpy as np
 
 from blinkgl.online.samples import WindowSample
 from blinkgl.types.events import Events
+from eflow.types import Flow, Mask
 
 SIDES = ("old", "new")
 """The windows of a pair: the events before the reference time, and those after it."""
@@ -95,7 +96,7 @@ class StreamWindow:
         return cls(t_us, Window.of(events, start, t_us), Window.of(events, t_us, end))
 
 
-def hit_pixels(windows: Iterable[Window], height: int, width: int) -> np.ndarray:
+def hit_pixels(windows: Iterable[Window], height: int, width: int) -> Mask:
     """Return the pixels with an event in one of the windows, (H, W) bool; events outside are left out."""
     hit = np.zeros((height, width), bool)
     for w in windows:
@@ -122,11 +123,11 @@ class RawSample:
     width: int
     name: str
     scene: str
-    flow: np.ndarray | None = None
-    valid: np.ndarray | None = None
-    backward: np.ndarray | None = None
-    backward_valid: np.ndarray | None = None
-    mask: np.ndarray | None = None
+    flow: Flow | None = None
+    valid: Mask | None = None
+    backward: Flow | None = None
+    backward_valid: Mask | None = None
+    mask: Mask | None = None
 
     @property
     def has_events(self) -> bool:

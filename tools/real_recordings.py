@@ -34,7 +34,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -136,7 +136,7 @@ def likely_span(events: Events, height: int, width: int) -> int:
     return span
 
 
-def judged(path: Path, names: list[str], most: int) -> dict[str, Any]:
+def judged(path: Path, names: list[str], most: int) -> dict[str, object]:
     """What a recording says of each: {"span_ms", "windows", "moves", "rows": {name: {...}}}."""
     events, height, width = looked_at(path)
     span = likely_span(events, height, width)
@@ -312,8 +312,8 @@ def of_pairs(
         for name in names:
             answers.setdefault(name, answer_of(name, *size))
         hit, truth = hit_pixels((pair.old, pair.new), *size), np.where(valid[..., None], flow, 0.0).astype(np.float64)
-        for name, said in (best_of(truth, valid) | {name: answer(pair) for name, answer in answers.items()}).items():
-            judged.setdefault(name, []).append((np.asarray(said, np.float64), truth, valid, hit))
+        for name, flow_of in (best_of(truth, valid) | {name: answer(pair) for name, answer in answers.items()}).items():
+            judged.setdefault(name, []).append((np.asarray(flow_of, np.float64), truth, valid, hit))
     if not judged:
         raise BlinkGLError("no labelled sample", where=where)
     return {name: row_of(rows) for name, rows in judged.items()}
@@ -353,7 +353,7 @@ def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
             yield cut(events, int(events.t[-1]) - 1000 - span, span), flow
 
 
-def table(title: str, heads: list[str], rows: list[list[Any]]) -> str:
+def table(title: str, heads: list[str], rows: list[list[object]]) -> str:
     """Markdown."""
     cell = lambda v: f"{v:.3g}" if isinstance(v, float) and np.isfinite(v) else "–" if isinstance(v, float) else str(v)
     lines = ["| " + " | ".join([title, *heads]) + " |", "|" + "---|" * (len(heads) + 1)]
@@ -373,7 +373,7 @@ def main() -> None:
     a = parser.parse_args()
     if a.sets and not a.bursts:
         parser.error("--sets: needs --bursts")
-    console, found = plain_console(), {}
+    console, results = plain_console(), {}
     if a.bursts:
         known = {folder.name: burst(folder, a.answers) for folder in sorted((a.recordings / TEST).iterdir())}
         try:
@@ -382,12 +382,12 @@ def main() -> None:
         except BlinkGLError as error:
             parser.error(str(error))
         for title, rows in known.items():
-            found[title] = rows
+            results[title] = rows
             keys = [f"{what}_{where}" for where in ("events", "all") for what in ("aee", "of_zero", "cosine", "length")]
             heads = [key.replace("_", " ") for key in keys]
             say(console, table(title, heads, [[n, *(row[k] for k in keys)] for n, row in rows.items()]) + "\n")
         for folder in sorted((a.recordings / TEST).iterdir()) if a.changed else ():
-            rows = found[f"{folder.name}, changed"] = changed(folder, a.answers)
+            rows = results[f"{folder.name}, changed"] = changed(folder, a.answers)
             title = f"{folder.name}: AEE of zero flow's"
             say(console, table(title, list(rows[a.answers[0]]), [[n, *row.values()] for n, row in rows.items()]) + "\n")
     else:
@@ -396,22 +396,22 @@ def main() -> None:
             if name.startswith(TEST):
                 continue
             try:
-                found[name] = judged(path, a.answers, a.windows)
+                results[name] = judged(path, a.answers, a.windows)
             except BlinkGLError as error:
                 say(console, f"left out: {error}")
                 continue
-            it = found[name]
+            it = results[name]
             title = f"{name}, {it['size']}, {it['windows']} of {it['span_ms']:.1f} ms, affine {it['moves']:.2f}"
             keys = ["fwl", "cosine", "length", "x", "ms"]
             say(console, table(title, keys, [[n, *(row[k] for k in keys)] for n, row in it["rows"].items()]) + "\n")
-        moving = [it for it in found.values() if it["moves"] > MOVES]
+        moving = [it for it in results.values() if it["moves"] > MOVES]
         if not moving:
             raise SystemExit(f"nothing moves below {a.recordings}")
         over = lambda name, key: float(np.nanmedian([it["rows"][name][key] for it in moving]))
         rows = [[n, *(over(n, k) for k in ("fwl", "cosine", "length"))] for n in a.answers]
         say(console, table(f"all that move ({len(moving)})", ["fwl", "cosine", "length"], rows))
     if a.json:
-        a.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        a.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -36,14 +36,6 @@ ground truth; and the affine field nearest to it. All but zero flow are computed
 best that any global motion can reach."""
 
 
-class _Model(TypedDict):
-    """A model as plain data. parameters : their number."""
-
-    model: dict[str, object]
-    parameters: int
-    device: str
-
-
 class Scores(TypedDict):
     """Metrics of :mod:`eflow.metrics`, in total and by scene."""
 
@@ -51,13 +43,17 @@ class Scores(TypedDict):
     scenes: dict[str, dict[str, float]]
 
 
-class Result(_Model):
+class Result(TypedDict):
     """The content of ``results.json``.
 
+    model : its configuration, by key, or the name of a method.   parameters : their number.
     skipped, left_out : samples without a valid pixel, with an empty window.   still : samples with zero flow, of a
     method that has too few events.   warm : samples that were started from the flow before, with ``warm_start``.
     ms : mean time of a sample."""
 
+    model: dict[str, object]
+    parameters: int
+    device: str
     samples: int
     skipped: int
     left_out: int
@@ -150,8 +146,12 @@ class _Scores:
 
     def result(self, predictor: Predictor, samples: int) -> Result:
         """Return everything about ``samples`` samples, for tables and files."""
+        model = predictor.model
+        network = isinstance(model, FlowModel)
         result: Result = {
-            **_of_the_model(predictor.model),
+            "model": json.loads(model.config.model_dump_json()) if network else {"name": model.name},
+            "parameters": parameters_of(model) if network else 0,
+            "device": _device_of(model),
             "samples": samples,
             "skipped": self.tallies["network"].skipped,
             "left_out": self.left_out,
@@ -164,15 +164,12 @@ class _Scores:
         return result
 
 
-def _of_the_model(model: FlowModel | Method) -> _Model:
-    """Return configuration, number of parameters and device of a model, as plain data."""
+def _device_of(model: FlowModel | Method) -> str:
+    """Return the name of the card on which a model computes, or "cpu" and the threads of a network there."""
     if not isinstance(model, FlowModel):
-        return {"model": {"name": model.name}, "parameters": 0, "device": "cpu"}
+        return "cpu"
     device = next(model.parameters()).device
-    cpu = f"cpu, {torch.get_num_threads()} threads"
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu
-    config = json.loads(model.config.model_dump_json())
-    return {"model": config, "parameters": parameters_of(model), "device": name}
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
 
 
 def best_motions(truth: Numbers, valid: Mask) -> tuple[Numbers, Numbers]:

@@ -104,7 +104,9 @@ class FolderSource:
         if entry.backward is not None:
             backward, backward_valid = read_flow(entry.backward)
         reader = self._reader(sequence.events)
-        rectify = None if (path := sequence.rectify_map) is None else self._maps.of(path, lambda: _rectify_map(path))
+        rectify = (
+            None if (path := sequence.rectify_map) is None else self._maps.of(path, lambda: read_rectify_map(path))
+        )
         height, width = self._size(sequence, reader, flow, rectify)
         span = entry.to_us - entry.from_us
         return RawSample(
@@ -169,7 +171,7 @@ class FolderSource:
         return sizes.pop() if sizes else (480, 640)  # the sensor of DSEC and BlinkFlow, whose files do not store it
 
 
-def _rectify_map(path: Path) -> Numbers:
+def read_rectify_map(path: Path) -> Numbers:
     """Return the rectified (x, y) of each pixel, (H, W, 2) float32 px. Raises AssetError."""
     with open_hdf5(path) as file:
         table = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(np.float32)

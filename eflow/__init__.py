@@ -8,7 +8,7 @@ Start: train.py; evaluate.py, infer.py, cli.py.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from eflow.checkpoint import load_model
@@ -18,7 +18,7 @@ __all__ = ["Predictor", "load_model", "open_sized", "windows"]
 _FROM = {"load_model": "checkpoint", "Predictor": "infer", "open_sized": "infer", "windows": "infer"}
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import the names above when they are first used, so that ``import eflow`` does not import torch."""
     if name not in _FROM:
         raise AttributeError(f"module 'eflow' has no attribute '{name}'")

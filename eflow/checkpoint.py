@@ -13,8 +13,9 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -29,6 +30,16 @@ from eflow.config import TrainConfig
 from eflow.models import FlowModel, build_model, model_config
 
 FORMAT = "eflow-1"
+
+
+class State(TypedDict):
+    """``state.json``. seconds : of the whole training.   config : of the training.   content : digests of its data."""
+
+    format: str
+    step: int
+    seconds: float
+    config: NotRequired[dict[str, object]]
+    content: NotRequired[dict[str, str]]
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -60,7 +71,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         ) from error
 
 
-def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str]) -> None:
     """Write named tensors as a safetensors file. Raises OutputError."""
     with output_errors(path):
         try:
@@ -88,10 +99,10 @@ def metadata_of(model: FlowModel) -> dict[str, str]:
     return {"format": FORMAT, "model": model.config.model_dump_json()}
 
 
-def find_weights(path: str | os.PathLike, *, averaged: bool = True) -> Path:
-    """Return the file of weights of the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder, a
-    run folder (its newest checkpoint), or a network that comes with the package (:mod:`eflow.shipped`). A file or
-    folder of that name has priority over the package's network. Raises AssetError."""
+def find_weights(path: str | os.PathLike) -> Path:
+    """Return the file of weights of the checkpoint that ``path`` names: a .safetensors file, a checkpoint folder (the
+    averaged weights, if there are any), a run folder (its newest checkpoint), or a network that comes with the package
+    (:mod:`eflow.shipped`). A file or folder of that name has priority over the package's network. Raises AssetError."""
     path = Path(path)
     if path.is_file():
         return path
@@ -111,7 +122,7 @@ def find_weights(path: str | os.PathLike, *, averaged: bool = True) -> Path:
             "no checkpoint in this folder", where=str(path), accepted="weights.safetensors, or checkpoints/<step>"
         )
     ema = folder / "ema.safetensors"
-    return ema if averaged and ema.is_file() else folder / "weights.safetensors"
+    return ema if ema.is_file() else folder / "weights.safetensors"
 
 
 def newest(run: Path) -> Path | None:
@@ -124,17 +135,16 @@ def _steps(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("*") if re.fullmatch("[0-9]{1,18}", p.name) and p.is_dir())
 
 
-def config_of(path: str | os.PathLike) -> dict[str, Any]:
+def config_of(path: str | os.PathLike) -> dict[str, object]:
     """Return the configuration of a checkpoint's network as plain data. Raises AssetError: as :func:`load_model`."""
     return json.loads(load_model(path).config.model_dump_json())
 
 
-def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any = None) -> FlowModel:
+def load_model(path: str | os.PathLike) -> FlowModel:
     """Return the model of a checkpoint, in evaluation mode on the CPU.
 
-    averaged : use the averaged weights if there are any. expected : configuration that the checkpoint must have.
-    Raises AssetError: no checkpoint, a damaged one, a pickle, or another model or configuration."""
-    file = find_weights(path, averaged=averaged)
+    Raises AssetError: no checkpoint, a damaged one, or a pickle."""
+    file = find_weights(path)
     tensors, metadata = read_tensors(file)
     try:
         if metadata["format"] != FORMAT:
@@ -145,26 +155,11 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
             "safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train"
         ) from None
     config = model_config(tree)
-    if expected is not None:
-        require_same(config, expected, str(file))
     with torch.device("meta"):  # shapes without memory: a small file may ask for a network of any size
         _require_fit(build_model(config).state_dict(), tensors, str(file))
     model = build_model(config)
     load_weights(model, tensors, str(file))
     return model.eval()
-
-
-def require_same(found: Any, expected: Any, where: str) -> None:
-    """Raise an AssetError that names the first key in which two model configurations differ."""
-    a, b = found.model_dump(), expected.model_dump()
-    for key in ["name", *sorted(set(a) | set(b))]:
-        if a.get(key) != b.get(key):
-            raise AssetError(
-                f"checkpoint of another model: model.{key} differs",
-                where=where,
-                value=a.get(key),
-                accepted=repr(b.get(key)),
-            )
 
 
 def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> None:
@@ -212,7 +207,7 @@ def save_checkpoint(
     model: FlowModel,
     ema: dict[str, Tensor] | None,
     optimizer: torch.optim.Optimizer,
-    state: dict[str, Any],
+    state: Mapping[str, object],
     keep: int,
 ) -> Path:
     """Write ``run/checkpoints/<step>`` completely or not at all, then delete all but the newest ``keep``
@@ -263,12 +258,12 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
     """Restore what :func:`optimizer_tensors` returned. Raises AssetError."""
     tensors, _ = read_tensors(path)
     for name, p in model.named_parameters():
-        found = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
-        if any(v.shape not in ((), p.shape) for v in found.values()):
+        moments = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
+        if any(v.shape not in ((), p.shape) for v in moments.values()):
             raise AssetError(f"optimiser state of '{name}' has another shape", where=str(path))
-        if found:  # AdamW keeps its step counter on the CPU, unless it is fused
+        if moments:  # AdamW keeps its step counter on the CPU, unless it is fused
             here = p.device if optimizer.defaults.get("fused") else torch.device("cpu")
-            optimizer.state[p] = {k: v.to(here if k == "step" else p.device, copy=True) for k, v in found.items()}
+            optimizer.state[p] = {k: v.to(here if k == "step" else p.device, copy=True) for k, v in moments.items()}
     if "/rng/cpu" not in tensors:
         raise AssetError("no generator state", where=str(path))
     torch.set_rng_state(tensors["/rng/cpu"])
@@ -276,7 +271,7 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
         torch.cuda.set_rng_state(tensors["/rng/cuda"])
 
 
-def read_state(folder: Path) -> dict[str, Any]:
+def read_state(folder: Path) -> State:
     """Return the content of ``state.json``. Raises AssetError."""
     path = folder / "state.json"
     try:
@@ -313,20 +308,25 @@ _PLACES = re.compile(r"data\.(train|validate_on)\.\d+\.(path|recipe)|init_from")
 """Keys that say where something is on this machine; :func:`same_content` compares what is there."""
 
 
-def resume_run(folder: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> dict[str, Any]:
+def resume_run(
+    folder: Path,
+    config: TrainConfig,
+    model: FlowModel,
+    optimizer: torch.optim.Optimizer,
+    ema: dict[str, Tensor] | None,
+) -> State:
     """Restore a run from its newest checkpoint ``folder``; return its state. A finished training may get more steps or
     minutes."""
     state = read_state(folder)
     saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
     saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
-    done: dict[str, Any] = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
+    done = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
     for path in sorted({*saved, *now}):
-        before: Any = saved.get(path)
-        wanted: Any = now.get(path)
+        before, wanted = saved.get(path), now.get(path)
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
         if before is not None and wanted is not None:
             free = free or ("content" in state and _PLACES.fullmatch(path))
-            free = free or (path in done and done[path] >= before and wanted > before)
+            free = free or (path in done and _extends(wanted, before, done[path]))
         if not free and before != wanted:
             raise ConfigError(
                 "differs from the run that is resumed",
@@ -338,11 +338,17 @@ def resume_run(folder: Path, config: TrainConfig, model: FlowModel, optimizer, e
     averaged = read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}
     load_weights(model, weights, str(folder / "weights.safetensors"))
     load_optimizer(folder / "optimizer.safetensors", model, optimizer)
-    for k in ema or ():
-        if k not in averaged or averaged[k].shape != ema[k].shape:
+    for k, average in (ema or {}).items():
+        if k not in averaged or averaged[k].shape != average.shape:
             raise AssetError(f"lacks the tensor '{k}' of this model", where=str(folder / "ema.safetensors"))
-        ema[k].copy_(averaged[k])
+        average.copy_(averaged[k])
     return state
+
+
+def _extends(wanted: object, before: object, done: float) -> bool:
+    """Whether a finished training gets a longer one: all steps or minutes of ``before`` are done."""
+    number = (int, float)
+    return isinstance(before, number) and isinstance(wanted, number) and done >= before and wanted > before
 
 
 def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig) -> None:
@@ -359,7 +365,7 @@ def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig
             )
 
 
-def _leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
+def _leaves(tree: object, prefix: str = "") -> dict[str, object]:
     if isinstance(tree, dict) and tree:
         return {
             k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()
@@ -372,7 +378,7 @@ def _leaves(tree: Any, prefix: str = "") -> dict[str, Any]:
 def weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
     """Return the weights that ``init_from`` names, and that name. Raises AssetError: they are of another model."""
     assert config.init_from is not None
-    model = load_model(config.init_from, expected=None)
+    model = load_model(config.init_from)
     if model.config.name != config.model.name:
         raise AssetError(
             "checkpoint of another model",

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from blinkgl.io.formats import EventFile
 from eflow import infer
-from eflow.data.window import hit_pixels
-from eflow.flow_of_file import WindowsAsked
+from eflow.cli_arguments import WindowsAsked
+from eflow.data.window import StreamWindow, hit_pixels
+from eflow.types import Flow, Mask
 
 AUTO = "auto"
 CAMERA, BODIES = "real_small", "real_bodies"
@@ -19,11 +20,10 @@ moves. Medians of windows were .17 to .27 for seven recordings of moving cameras
 .88 for 24 simulated sequences of independent bodies (docs/results_eflow.md)."""
 
 
-def chosen(file: EventFile, asked: WindowsAsked, load: Callable[[str], infer.Predictor]) -> tuple[str, str]:
-    """Return (name of a network, the line that says why): by the flow of :data:`BODIES`, which reads two windows, at
-    three places of the recording. load : makes the predictor of a network."""
-    distances, height, width = [], int(file.height or 0), int(file.width or 0)
-    predictor = load(BODIES)
+def chosen(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> tuple[str, str]:
+    """Return (name of a network, the line that says why): by the flow of ``predictor``, which is :data:`BODIES` and
+    reads two windows, at three places of the recording."""
+    distances, (height, width) = [], infer.sensor_of(file)
     for pair in _pairs(file, asked, predictor):
         if len(pair.old) and len(pair.new):
             flow, _ = predictor(pair)
@@ -35,20 +35,20 @@ def chosen(file: EventFile, asked: WindowsAsked, load: Callable[[str], infer.Pre
     return name, f"{name}, since {moves}: the flow is {100 * distance:.0f} % of its length off an affine field"
 
 
-def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> Iterator[infer.StreamWindow]:
+def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> Iterator[StreamWindow]:
     if asked.whole:
         yield infer.whole_file(file)[0]
         return
     if (ends := infer.ends_of(file)) is None:
         return
     first, last = ends
-    start, end = (None if ms is None else first + round(ms * 1000) for ms in (asked.start_ms, asked.end_ms))
+    start, end = asked.limits(first)
     first, last = max(first, start or first), min(last, end or last)
-    span = infer.likely_span(file, predictor)[0] if asked.milliseconds is None else round(asked.milliseconds * 1000)
+    span = asked.span_us or infer.likely_span(file, predictor)[0]
     yield from infer.at_places(file, span, first, last)
 
 
-def from_affine(flow: np.ndarray, hit: np.ndarray) -> float:
+def from_affine(flow: Flow, hit: Mask) -> float:
     """Return the mean distance of the flow (H, W, 2) px from the affine field nearest to most of it, at the pixels
     ``hit`` (H, W), as a share of its mean length there."""
     y, x = np.nonzero(hit)

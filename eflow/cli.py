@@ -3,38 +3,35 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from blinkgl.errors import ConfigError
-from blinkgl.machine import event_options as of_events
 from blinkgl.machine.command_line import new_app, run_app, safe_main
 from blinkgl.machine.interrupts import STOPS, interruptible
 from eflow.cli_arguments import (
     Answer,
+    Answering,
     Dataset,
+    Declared,
     Dense,
-    Device,
-    Focal,
     Frames,
-    GroundTruth,
-    Iterations,
     Network,
+    Outputs,
     Overrides,
-    Precision,
     Protocol,
     Quiet,
-    Raw,
+    Sampling,
     Sharpen,
     Sharpened,
-    Span,
-    Truth,
     WarmStart,
-    Whole,
     WindowMs,
-    method_named,
+    WindowsAsked,
+    answerer,
+    grouped,
     network_of,
     one_of,
     ranges_of,
@@ -78,13 +75,13 @@ def train(
     from eflow.models import preset
     from eflow.train import as_yaml, train as run_training
 
-    said = overrides or []
-    if config is None and not (model or any(o.startswith("model") for o in said)):
+    changes = overrides or []
+    if config is None and not (model or any(o.startswith("model") for o in changes)):
         raise ConfigError("no network to train", accepted="a YAML file, or --model, e.g. ev_flownet-tiny, and --data")
-    if config is None and not (data or any(o.startswith("data.train") for o in said)):
+    if config is None and not (data or any(o.startswith("data.train") for o in changes)):
         raise ConfigError("nothing to train on", accepted="a YAML file, or --data, a folder or a recipe")
     tree = None if model is None else preset(model)
-    whole = load_train_config(config, said, model=tree, data=data or (), minutes=minutes)
+    whole = load_train_config(config, changes, model=tree, data=data or (), minutes=minutes)
     if print_config:
         typer.echo(as_yaml(whole), nl=False)
         return
@@ -98,19 +95,12 @@ def train(
 
 
 @app.command()
+@grouped
 def render(
     recipe: Annotated[str, typer.Argument(help="YAML file of `blinkgl generate`.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New folder of windows, to train on or to evaluate with.")],
+    sampling: Sampling,
     samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="Number of windows.")] = 1000,
-    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows from each sequence.")] = 8,
-    window_ms: WindowMs = None,
-    min_events: Annotated[
-        int, typer.Option(min=1, help="Minimum number of events in each of a sample's two windows.")
-    ] = 40,
-    max_flow: Annotated[float, typer.Option(help="Maximum median flow of a sample, px.")] = 40.0,
-    min_density: Annotated[
-        float, typer.Option(help="Minimum number of events per pixel and per px of mean flow.")
-    ] = 0.0,
     split: Annotated[str, typer.Option(help="Which groups to render: train or test.")] = "train",
     seed: Annotated[int, typer.Option(min=0, help="Each seed gives other windows.")] = 0,
     overrides: Overrides = None,
@@ -125,18 +115,9 @@ def render(
     from eflow.progress import Counting
 
     one_of("--split", split, ("train", "test"))
-    source = windows_of(
-        recipe,
-        window_ms,
-        samples=per_sequence,
-        min_events=min_events,
-        max_flow=max_flow,
-        min_density=min_density,
-        set=tuple(overrides or ()),
-        workers=workers,
-    )
-    kept = {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
-    about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": per_sequence, **kept}
+    source = windows_of(recipe, sampling, set=tuple(overrides or ()), workers=workers)
+    about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": sampling.per_sequence}
+    about |= {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     refuse_existing(Path(out))  # before any worker starts
     with interruptible(*STOPS), open_online(source, seed, split=split) as stream:
         done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
@@ -145,38 +126,27 @@ def render(
 
 
 @app.command()
+@grouped
 def evaluate(
     checkpoint: Answer,
     dataset: Dataset,
+    options: Answering,
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     window_ms: WindowMs = None,
-    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec, blinkflow or windows.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     protocol: Protocol = "all",
-    ground_truth: GroundTruth = None,
     frames: Frames = None,
     dense: Dense = False,
-    pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
-    iterations: Iterations = None,
-    empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     sharpen: Sharpened = False,
-    warm_start: WarmStart = False,
-    raw: Raw = False,
-    focal: Focal = None,
-    precision: Precision = "fp32",
-    device: Device = "auto",
 ) -> None:
     """Score a network or a method on a data set. Beside it stand baselines: zero flow, and global motions fitted to the
-    truth."""
+    truth. Samples with an empty window are left out and counted."""
     from blinkgl.machine.terminal import plain_console
-    from eflow.data.sources import FORMATS, open_source
+    from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
-    one_of("--empty", empty, ("error", "skip"))
-    model = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
-    if model is None:
-        model, precision = network_of(checkpoint, device, raw, precision, iterations, warm_start)
+    model = answerer(checkpoint, options)
     console = plain_console(stderr=True)
     if dataset.endswith((".yaml", ".yml")):
         with console.status("rendering"):
@@ -184,20 +154,15 @@ def evaluate(
     elif window_ms is not None:
         raise ConfigError("needs a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        mvsec = {"protocol": protocol, "truth": ground_truth, "frames": ranges_of(frames), "dense": dense}
-        one_of("--format", format, ("auto", *FORMATS))
-        source = open_source(dataset, format, dt=dt, **mvsec)
+        source = open_source(dataset, dt=dt, protocol=protocol, frames=ranges_of(frames), dense=dense)
     with console.status("evaluating") as status:
         result = score(
             model,
             source,
             out,
-            pictures=pictures,
-            empty=empty,
-            precision=precision,
             limit=limit,
             sharpen=sharpen,
-            warm_start=warm_start,
+            warm_start=options.warm_start,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
     show(result)
@@ -206,6 +171,7 @@ def evaluate(
 
 
 @app.command()
+@grouped
 def predict(
     names: Annotated[
         list[str],
@@ -216,73 +182,36 @@ def predict(
             "real_bodies where bodies move their own ways.",
         ),
     ],
-    out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
-    window_ms: Span = "100",
-    start_ms: Annotated[
-        float | None, typer.Option("--start-ms", help="Start at this time after the first event.")
-    ] = None,
-    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Stop at this time after the first event.")] = None,
-    whole: Whole = False,
-    truth: Truth = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None,
-    time_unit: of_events.TimeUnit = None,
-    origin: of_events.Origin = None,
-    columns: of_events.Columns = None,
-    polarity: of_events.Polarity = None,
-    stream: of_events.Stream = None,
-    damaged: of_events.Damaged = "refuse",
-    sort: of_events.Sort = False,
-    npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False,
-    at_events: Annotated[
-        bool, typer.Option("--at-events", help="Flow of pixels without events nearby is written as not valid.")
-    ] = False,
-    video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None,
-    warm_start: WarmStart = False,
+    outputs: Outputs,
+    asked: WindowsAsked,
+    declared: Declared,
+    options: Answering,
     sharpen: Sharpen = True,
-    empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
-    raw: Raw = False,
-    iterations: Iterations = None,
-    focal: Focal = None,
-    precision: Precision = "fp32",
-    device: Device = "auto",
 ) -> None:
     """Compute the flow of any event file. Networks do it, and methods that need no training.
 
     FWL (flow warp loss) says how much sharper the events of the new window become when the flow moves them back to its
     start; above 1 the flow helps."""
-    from blinkgl.io.reading import EventReading
     from blinkgl.types.events import Events
     from eflow import infer
-    from eflow.choice import AUTO, chosen
-    from eflow.flow_of_file import Outputs, WindowsAsked, milliseconds, show_flows
-    from eflow.infer import doubts
+    from eflow.choice import AUTO, BODIES, chosen
+    from eflow.flow_of_file import show_flows
 
-    one_of("--empty", empty, ("error", "zero"))
-    asked = WindowsAsked(milliseconds(window_ms), start_ms, end_ms, whole)
     if len(names) > 2:
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
-    checkpoint, events = [AUTO, *names][-2:]
-    method = method_named(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
-    reading = EventReading.of(time_unit, size, origin, columns, polarity, stream, damaged, sort)
-    file = infer.open_sized(events, reading)
+    name, events = [AUTO, *names][-2:]
+    chooses = name == AUTO and not Path(AUTO).exists()
+    model = answerer(BODIES if chooses else name, replace(options, warm_start=options.warm_start and not chooses))
+    file = infer.open_sized(events, declared.reading())
     height, width = infer.sensor_of(file)
-    for line in doubts(next(iter(file.chunks()), Events.empty()), height, width):
+    for line in infer.doubts(next(iter(file.chunks()), Events.empty()), height, width):
         typer.echo(f"{events}: {line}", err=True)
-    outputs = Outputs(out, video, npy, infer.read_truth(truth, height, width) if truth else None, at_events)
-
-    def predictor_of(name: str, **options) -> infer.Predictor:
-        model, own = network_of(name, device, raw, precision, iterations, options.get("warm_start", False))
-        return infer.Predictor(model, height, width, precision=own, empty=empty, **options)
-
-    if checkpoint == AUTO and not Path(AUTO).exists():
-        checkpoint, why = chosen(file, asked, predictor_of)
+    if chooses:
+        name, why = chosen(file, asked, infer.Predictor(model, height, width))
         typer.echo(f"network: {why}")
-    if method is not None:
-        predictor, reads = infer.MethodPredictor(method, height, width, empty=empty), ("old", "new")
-    else:
-        predictor = predictor_of(checkpoint, warm_start=warm_start, sharpen=sharpen)
-        reads = predictor.model.reads
-    show_flows(file, predictor, reads, asked, outputs, typer.echo)
+        model = answerer(name, options)
+    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, sharpen=sharpen)
+    show_flows(file, predictor, asked, outputs, typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)
 
@@ -290,28 +219,18 @@ def predict(
 @app.command()
 def submit(
     checkpoint: Network,
-    dataset: Annotated[str, typer.Argument(help="The benchmark's test set.")],
-    benchmark: Annotated[str, typer.Option(help="dsec or blinkflow.")],
+    dataset: Annotated[str, typer.Argument(help="The test set of DSEC or BlinkFlow; its layout says which.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New zip file.")],
-    full: Annotated[bool, typer.Option("--full", help="BlinkFlow: all pixels instead of one per 4x4 cell.")] = False,
     warm_start: WarmStart = False,
-    precision: Precision = "fp32",
-    device: Device = "auto",
 ) -> None:
     """Write the submission file of a benchmark and check it."""
     from blinkgl.machine.terminal import plain_console
-    from eflow.submit import submit_blinkflow, submit_dsec
+    from eflow.submit import submit as write_submission
 
-    one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
-    model, precision = network_of(checkpoint, device, False, precision, warm_start=warm_start)
+    model = network_of(checkpoint, warm_start=warm_start)
     with plain_console(stderr=True).status("predicting") as status:
         progress = lambda i, n: status.update(f"{i}/{n} flows")
-        options = {"precision": precision, "warm_start": warm_start, "progress": progress}
-        count = (
-            submit_dsec(model, dataset, out, **options)
-            if benchmark == "dsec"
-            else submit_blinkflow(model, dataset, out, full=full, **options)
-        )
+        count = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
     typer.echo(f"written and checked: {out}, {count} files")
 
 
@@ -332,17 +251,11 @@ def import_(
 @app.command()
 def models(
     name: Annotated[str | None, typer.Argument(help="Show only this network, with its whole card.")] = None,
-    json_out: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
 ) -> None:
     """List the trained networks that come with the package. Their names can be used in place of a checkpoint."""
-    import json
-
     from eflow import shipped
 
     cards = [shipped.card_of(n) for n in ([name] if name is not None else shipped.names())]
-    if json_out:
-        typer.echo(json.dumps([card.model_dump(mode="json") for card in cards], indent=1))
-        return
     for card in cards:
         for line in shipped.lines(card, whole=name is not None):
             typer.echo(line)
@@ -361,7 +274,6 @@ def pack(
         str,
         typer.Option("--out", "-o", help="Parent of the new folder; networks in eflow/weights ship with the package."),
     ],
-    raw: Raw = False,
 ) -> None:
     """Pack a checkpoint as a network that can come with the package. It has weights (5 MB at most, above it in half
     precision) and a card.
@@ -370,21 +282,42 @@ def pack(
     from eflow import shipped
     from eflow.packing import pack as write_pack
 
-    folder, full = write_pack(checkpoint, name, card, out, averaged=not raw)
+    folder, full = write_pack(checkpoint, name, card, out)
     typer.echo(f"written: {folder}")
     for line in shipped.lines(full):
         typer.echo(line)
 
 
+_LAST_WEIGHTS = "the file weights.safetensors of a checkpoint in place of its folder"
+_DEVICE = "nothing: a GPU is used if there is one; CUDA_VISIBLE_DEVICES= hides it"
+_PRECISION = "nothing: flow is computed in single precision"
 GONE = {
     "export": "torch.onnx.export of eflow.load_model(NAME)'s network: ONNX files are no longer written here",
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
     "evaluate --confidence": "nothing: no network here estimates its confidence",
+    "evaluate --device": _DEVICE,
+    "evaluate --empty": "nothing: samples with an empty window are left out and counted",
+    "evaluate --format": "nothing: the layout is recognised by its files",
+    "evaluate --ground-truth": "--protocol, which says it",
+    "evaluate --pictures": "nothing: --out writes twelve",
+    "evaluate --precision": _PRECISION,
+    "evaluate --raw": _LAST_WEIGHTS,
     "predict --confidence": "nothing: no network here estimates its confidence",
+    "predict --device": _DEVICE,
+    "predict --empty": "nothing: windows without events have zero flow and are counted",
     "predict --flo": "--npy",
     "predict --h5": "--npy",
+    "predict --precision": _PRECISION,
+    "predict --raw": _LAST_WEIGHTS,
+    "predict --truth": "eflow evaluate, or --npy and your own comparison",
+    "submit --benchmark": "nothing: the layout of the test set says it",
+    "submit --device": _DEVICE,
+    "submit --full": "nothing: one pixel per 4x4 cell is written, the benchmark's smaller form",
+    "submit --precision": _PRECISION,
     "import --bins": "E-RAFT's published weights: RAFT's own are no longer read",
+    "models --json": "the card of each network, eflow/weights/NAME/card.yaml",
+    "pack --raw": _LAST_WEIGHTS,
     "pack --store": "nothing: weights are stored in single precision",
 }
 """Commands and options of earlier versions, and what to use instead."""

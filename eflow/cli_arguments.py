@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import re
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_type_hints
 
 import typer
 
 from blinkgl.errors import ConfigError
-from eflow.methods.table import METHODS, make_method
+from blinkgl.machine import event_options as of_events
+from eflow.methods.table import METHODS, Method, make_method
 
 if TYPE_CHECKING:
+    from blinkgl.io.reading import EventReading
     from eflow.config import SourceConfig
+    from eflow.data.online import Held
+    from eflow.models import FlowModel
 
-Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Answer = Annotated[
     str,
     typer.Argument(
@@ -30,9 +36,6 @@ Network = Annotated[
         "models)."
     ),
 ]
-Focal = Annotated[
-    float | None, typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False)
-]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
@@ -41,8 +44,6 @@ WindowMs = Annotated[
     typer.Option(metavar="LOW-HIGH", help="Lengths of windows, of a recipe only. Default: its label interval."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
-Raw = Annotated[bool, typer.Option("--raw", help="Use the last weights instead of the averaged ones.")]
-Iterations = Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")]
 
 Dataset = Annotated[
     str,
@@ -52,13 +53,6 @@ Dataset = Annotated[
     ),
 ]
 Protocol = Annotated[str, typer.Option(help="MVSEC: frames and rows to score: all, ste-flownet or e-raft (20 Hz).")]
-GroundTruth = Annotated[
-    str | None,
-    typer.Option(
-        "--ground-truth",
-        help="MVSEC: propagated (through the 20 Hz flow) or scaled (one field). Default: the protocol's.",
-    ),
-]
 Frames = Annotated[
     list[str] | None,
     typer.Option("--frames", metavar="FIRST-LAST", help="MVSEC: images (or 20 Hz fields) to score; may be repeated."),
@@ -67,14 +61,6 @@ Dense = Annotated[bool, typer.Option("--dense", help="MVSEC: score pixels withou
 Sharpened = Annotated[
     bool, typer.Option("--sharpen", help="Scale the flow of a network to the length that makes the events sharpest.")
 ]
-Span = Annotated[
-    str,
-    typer.Option("--window-ms", help="Length Δ of each of the two windows; auto: motion of about 5 px in a window."),
-]
-Whole = Annotated[
-    bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
-]
-Truth = Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo); prints AEE and cosine.")]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
@@ -84,53 +70,174 @@ Sharpen = Annotated[
 ]
 
 
-def method_named(name: str, focal: float | None, **network: object):
-    """Return the method of that name; None if it is a network's name or a file.
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return the command with the fields of each parameter that is a dataclass as options of its own."""
+    hints = get_type_hints(command, include_extras=True)
+    groups = {name: kind for name, kind in hints.items() if is_dataclass(kind) and isinstance(kind, type)}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        of = inspect.signature(groups[name]).parameters.values() if name in groups else [parameter]
+        known = get_type_hints(groups[name], include_extras=True) if name in groups else hints
+        parameters += [option.replace(annotation=known[option.name]) for option in of]
 
-    network : options that only networks have. Raises ConfigError: one of them is set, but the name is a method's."""
+    @functools.wraps(command)
+    def run(**values: object) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        command(**values)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+@dataclass(frozen=True)
+class Answering:
+    """Options of a network or of a method. iterations, warm_start : of networks.   focal : px, of a method."""
+
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")] = None
+    warm_start: WarmStart = False
+    focal: Annotated[
+        float | None,
+        typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False),
+    ] = None
+
+
+@dataclass(frozen=True)
+class WindowsAsked:
+    """The windows of an event file to process.
+
+    window_ms : length of each.   start_ms, end_ms : limits, as times after the first event; None: no limit.
+    whole : the whole file is one window, or its halves are a pair."""
+
+    window_ms: Annotated[
+        str,
+        typer.Option(
+            "--window-ms", help="Length Δ of each of the two windows; auto: motion of about 5 px in a window."
+        ),
+    ] = "100"
+    start_ms: Annotated[float | None, typer.Option("--start-ms", help="Start at this time after the first event.")] = (
+        None
+    )
+    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Stop at this time after the first event.")] = None
+    whole: Annotated[
+        bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
+    ] = False
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError unless the length is one."""
+        if self.window_ms != "auto" and not self.span_us:
+            raise ConfigError(
+                "not a window length", where="--window-ms", value=self.window_ms, accepted="milliseconds, or auto"
+            )
+
+    @property
+    def span_us(self) -> int | None:
+        """Return the length of a window, µs; None: motion of about 5 px in a window."""
+        try:
+            milliseconds = float(self.window_ms)
+        except ValueError:
+            return None
+        return round(milliseconds * 1000) if 0.001 <= milliseconds < 1e9 else None
+
+    def limits(self, first: int) -> tuple[int | None, int | None]:
+        """Return the limits, µs, of a file whose first event is at ``first`` µs."""
+        start, end = (None if ms is None else first + round(ms * 1000) for ms in (self.start_ms, self.end_ms))
+        return start, end
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What an event file does not say."""
+
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, if the file does not store it.")] = None
+    time_unit: of_events.TimeUnit = None
+    origin: of_events.Origin = None
+    columns: of_events.Columns = None
+    polarity: of_events.Polarity = None
+    stream: of_events.Stream = None
+    damaged: of_events.Damaged = "refuse"
+    sort: of_events.Sort = False
+
+    def reading(self) -> EventReading:
+        """Return it as readers take it. Raises ConfigError."""
+        from blinkgl.io.reading import EventReading
+
+        return EventReading.of(**vars(self))
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What is written: a new folder of flow and pictures, a video; None: not written.
+
+    npy : also write float32 arrays to the folder.   at_events : flow of pixels without events nearby is not valid."""
+
+    out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None
+    npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False
+    at_events: Annotated[
+        bool, typer.Option("--at-events", help="Flow of pixels without events nearby is written as not valid.")
+    ] = False
+    video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How windows are taken from rendered sequences; keys of :class:`eflow.config.SourceConfig`."""
+
+    per_sequence: Annotated[int, typer.Option(min=1, max=1000, help="Windows from each sequence.")] = 8
+    window_ms: WindowMs = None
+    min_events: Annotated[
+        int, typer.Option(min=1, help="Minimum number of events in each of a sample's two windows.")
+    ] = 40
+    max_flow: Annotated[float, typer.Option(help="Maximum median flow of a sample, px.")] = 40.0
+    min_density: Annotated[float, typer.Option(help="Minimum number of events per pixel and per px of mean flow.")] = (
+        0.0
+    )
+
+
+def answerer(name: str, options: Answering) -> FlowModel | Method:
+    """Return the method of that name, or the trained network, on a GPU if there is one.
+
+    Raises ConfigError: it lacks one of the options. AssetError: no such network."""
     if name not in METHODS or Path(name).exists():
-        if focal is not None:
-            raise ConfigError("only a method uses it", where="--focal", value=focal, accepted=", ".join(METHODS))
-        return None
-    for option, value in network.items():
+        if options.focal is not None:
+            raise ConfigError(
+                "only a method uses it", where="--focal", value=options.focal, accepted=", ".join(METHODS)
+            )
+        return network_of(name, iterations=options.iterations, warm_start=options.warm_start)
+    for option, value in (("--iterations", options.iterations), ("--warm-start", options.warm_start)):
         if value:
-            raise ConfigError(f"{name} is not a network", where="--" + option.replace("_", "-"), value=value)
-    return make_method(name, focal)
+            raise ConfigError(f"{name} is not a network", where=option, value=value)
+    return make_method(name, options.focal)
 
 
 def ranges_of(frames: list[str] | None) -> tuple[tuple[int, int], ...]:
     """Return the ranges [first, end) of ``--frames``. Raises ConfigError."""
-    found = [re.fullmatch(r"(\d{1,9})-(\d{1,9})", text) for text in frames or ()]
-    for text, one in zip(frames or (), found):
-        if one is None or int(one[1]) > int(one[2]):
+    ranges = []
+    for text in frames or ():
+        ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", text)
+        if ends is None or int(ends[1]) > int(ends[2]):
             raise ConfigError("not a range of frames", where="--frames", value=text, accepted="FIRST-LAST: 200-800")
-    return tuple((int(one[1]), int(one[2]) + 1) for one in found if one)
+        ranges.append((int(ends[1]), int(ends[2]) + 1))
+    return tuple(ranges)
 
 
-def network_of(
-    checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None, warm_start: bool = False
-):
-    """Return (the trained network on its device, the precision to use there: fp32 if it does not support bf16). Raises
-    ConfigError: this network or machine lacks an option."""
+def network_of(checkpoint: str, *, iterations: int | None = None, warm_start: bool = False) -> FlowModel:
+    """Return the trained network, on a GPU if there is one. Raises ConfigError: it lacks an option. AssetError: no such
+    network."""
     import torch
 
     from eflow.allocator import keep_memory
     from eflow.checkpoint import load_model
-    from eflow.precision import precision_on
 
-    one_of("--precision", precision, ("fp32", "bf16"))
-    one_of("--device", device, ("auto", "cpu", "cuda"))
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
     keep_memory()
-    model = load_model(checkpoint, averaged=not raw)
-    for option, given in (("--iterations", iterations is not None), ("--warm-start", warm_start)):
-        if given and not hasattr(model.config, "iterations"):
+    model = load_model(checkpoint)
+    for option, wanted in (("--iterations", iterations is not None), ("--warm-start", warm_start)):
+        if wanted and not hasattr(model.config, "iterations"):
             raise ConfigError("this network has no iterations", where=option, value=model.config.name)
     if iterations is not None:
         model.config = model.config.model_copy(update={"iterations": iterations})
-    place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-    return model.to(place), precision_on(place, precision)
+    return model.to("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
@@ -139,21 +246,22 @@ def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
         raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
 
 
-def rendered(recipe: str, window_ms: str | None, limit: int | None):
+def rendered(recipe: str, window_ms: str | None, limit: int | None) -> Held:
     """Return samples of a recipe, rendered and kept in memory."""
     from eflow.data.online import held
 
-    return held(windows_of(recipe, window_ms, samples=4, min_events=40, max_flow=40.0), limit or 128)
+    return held(windows_of(recipe, Sampling(4, window_ms)), limit or 128)
 
 
-def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
-    """Return the online source of a recipe for the options of a command line."""
+def windows_of(recipe: str, sampling: Sampling, **how: object) -> SourceConfig:
+    """Return the online source of a recipe. how : further keys of it. Raises ConfigError."""
     from blinkgl.config.problems import validate
     from eflow.config import SourceConfig
 
-    tree: dict = {"recipe": recipe, "online": True, **how}
-    if window_ms is not None:
-        ends = window_ms.split("-")
+    kept = {name: getattr(sampling, name) for name in ("min_events", "max_flow", "min_density")}
+    tree = {"recipe": recipe, "online": True, "samples": sampling.per_sequence, **kept, **how}
+    if sampling.window_ms is not None:
+        ends = sampling.window_ms.split("-")
         try:
             tree["window_ms"] = tuple(float(end) for end in (ends if len(ends) > 1 else 2 * ends))
             validate(SourceConfig, tree)
@@ -161,7 +269,7 @@ def windows_of(recipe: str, window_ms: str | None, **how) -> SourceConfig:
             raise ConfigError(
                 "not a range of window lengths",
                 where="--window-ms",
-                value=window_ms,
+                value=sampling.window_ms,
                 accepted="LOW-HIGH in ms, such as 5-100",
             ) from None
     return validate(SourceConfig, tree)

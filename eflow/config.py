@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
@@ -171,6 +171,8 @@ class SteFlowNetConfig(Config):
 
 
 ModelConfig = one_of("name", EraftConfig, EFlowFormerConfig, EvFlowNetConfig, SpikeFlowNetConfig, SteFlowNetConfig)
+NetworkConfig: TypeAlias = EraftConfig | EFlowFormerConfig | EvFlowNetConfig | SpikeFlowNetConfig | SteFlowNetConfig
+"""The configuration of a network, one of those that a field of ``ModelConfig`` takes."""
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterator
 
 import torch
 import torch.distributed as dist
@@ -54,7 +55,7 @@ def agree(reason: str | None, device: torch.device) -> str | None:
 
 
 @contextlib.contextmanager
-def compile_errors(enabled: bool):
+def compile_errors(enabled: bool) -> Iterator[None]:
     """Raise a ConfigError if torch.compile lacks something on this machine (a C++ compiler, Triton)."""
     try:
         yield

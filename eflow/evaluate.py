@@ -1,17 +1,16 @@
-"""Evaluation of a network or a method on a data set, beside baselines; tables, JSON and pictures."""
+"""Evaluation of a network or a method on a data set: its answers beside baselines; tables, JSON and pictures."""
 
 from __future__ import annotations
 
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import numpy as np
 import torch
-from rich.console import Console
 from rich.table import Table
 
 from blinkgl.errors import AssetError
@@ -19,20 +18,61 @@ from blinkgl.io.atomic import write_whole
 from blinkgl.io.records import inside
 from blinkgl.machine.terminal import plain_console
 from blinkgl.sequence_files.sequence_dir import refuse_existing
-from eflow.data.dataset import FlowDataset, collate, evenly
+from eflow.data.dataset import evenly, truth_of
 from eflow.data.sources import Source
-from eflow.infer import PICTURED, WarmStart
+from eflow.data.window import RawSample
+from eflow.infer import Predictor
 from eflow.methods import Method
-from eflow.methods.contrast import sharpest_length
 from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
 from eflow.pictures import comparison, events_of, write_picture
+from eflow.types import Flow, Mask, Numbers
+from eflow.writers import Answer
 
-MEDIAN_FRAMES = 64
+MEDIAN_FRAMES, PICTURES = 64, 12
 BASELINES = ("zero flow", "median of the set", "median of the frame", "affine of the frame")
 """Answers to compare with: zero flow; the component-wise median of the set's ground truth; the median of each frame's
 ground truth; and the affine field nearest to it. All but zero flow are computed from the truth: the last two are the
 best that any global motion can reach."""
+
+
+class Scores(TypedDict):
+    """Metrics of :mod:`eflow.metrics`, in total and by scene."""
+
+    total: dict[str, float]
+    scenes: dict[str, dict[str, float]]
+
+
+class Result(TypedDict):
+    """The content of ``results.json``.
+
+    model : its configuration, by key, or the name of a method.   parameters : their number.
+    skipped, left_out : samples without a valid pixel, with an empty window.   still : samples with zero flow, of a
+    method that has too few events.   warm : samples that were started from the flow before, with ``warm_start``.
+    ms : mean time of a sample."""
+
+    model: dict[str, object]
+    parameters: int
+    device: str
+    samples: int
+    skipped: int
+    left_out: int
+    still: int
+    warm: NotRequired[int]
+    ms: float
+    methods: dict[str, Scores]
+
+
+def answers(predictor: Predictor, source: Source, indices: Iterable[int]) -> Iterator[tuple[int, RawSample, Answer]]:
+    """Yield (number, sample, answer) of the samples of a set, in order: the only walk over one.
+
+    Raises AssetError: unreadable files. EventDataError: events outside the sensor."""
+    for i in indices:
+        sample = source[i]
+        predictor.height, predictor.width = sample.height, sample.width  # sequences may differ
+        began = time.perf_counter()
+        flow, events = predictor(sample)
+        yield i, sample, Answer(sample, flow, events, time.perf_counter() - began)
 
 
 def evaluate(
@@ -40,111 +80,99 @@ def evaluate(
     source: Source,
     out: str | os.PathLike | None = None,
     *,
-    pictures: int = 12,
-    empty: str = "error",
-    precision: str = "fp32",
     limit: int | None = None,
     sharpen: bool = False,
     warm_start: bool = False,
     progress: Callable[[int, int, float], None] | None = None,
-) -> dict[str, Any]:
-    """Score ``model``, or a method that needs no training, on every labelled sample of ``source``.
+) -> Result:
+    """Score ``model``, or a method that needs no training, on every labelled sample of ``source``. Samples with an
+    empty window are left out, for every network the same ones.
 
-    out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
-    map); None: write nothing.
-    limit : score only this many samples, evenly spaced.
-    sharpen : scale the flow of a network to the length that makes the events of its windows sharpest, as `eflow
-    predict` does.
-    warm_start : start the refinement of a sample whose new window follows the previous sample's from its flow.
+    out : new folder for ``results.json`` and ``pictures/`` (at most 12 evenly spaced samples: events, truth,
+    prediction, error map); None: write nothing.
+    limit : score only this many samples, evenly spaced.   sharpen, warm_start : as of :class:`~eflow.infer.Predictor`.
     progress : called with (samples done, samples in all, AEE so far).
-    empty : samples with an empty window: "error", or "skip" leaves them out, for every network the same ones.
-    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped" (no valid pixel), "left_out"
-    (empty windows), "model", "parameters"}; metrics as in :mod:`eflow.metrics`.
 
-    Raises AssetError: no ground truth, unreadable files. EventDataError: a window has no events (unless
-    ``empty="skip"``)."""
+    Raises AssetError: no ground truth, unreadable files. EventDataError: events outside the sensor."""
     if out is not None:
         refuse_existing(out)
-    out = Path(out) if out is not None else None
-    representation = model.representation if isinstance(model, FlowModel) else PICTURED
-    reads = model.reads if isinstance(model, FlowModel) and not sharpen else ("old", "new")
-    dataset = FlowDataset([source], representation, empty=empty, raw=True, reads=reads, option="--empty skip")
-    indices = evenly(len(dataset), limit or len(dataset))
-    shown = {indices[k] for k in evenly(len(indices), pictures)}
-    scores = _Scores(_set_median(dataset, indices))
-    spent, left_out, warm = 0.0, 0, WarmStart(warm_start)
-    for done, i in enumerate(indices, 1):
-        if (sample := dataset[i]) is None:
-            left_out += 1
+    indices = evenly(len(source), limit or len(source))
+    shown = {indices[k] for k in evenly(len(indices), PICTURES)}
+    scores = _Scores(_set_median(source, indices))
+    predictor = Predictor(model, 0, 0, warm_start=warm_start, sharpen=sharpen)
+    for done, (i, sample, answer) in enumerate(answers(predictor, source, indices), 1):
+        if not sample.has_events:
+            scores.left_out += 1
             continue
-        batch = collate([sample])
-        raw, scene = batch["raw"][0], batch["scene"][0]
-        began = time.perf_counter()
-        if isinstance(model, FlowModel):
-            flow = warm.predict(model, batch, (scene, raw.new.t0), (scene, raw.new.t1), precision)
-            if sharpen:
-                flow = flow * np.float32(sharpest_length([raw.old, raw.new], flow)[0])
-        else:
-            flow = model(raw.old, raw.new, raw.height, raw.width)
-        spent += time.perf_counter() - began
-        truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
-        scores.add(scene, flow, truth, valid)
+        truth, valid = _labelled(sample)
+        scores.add(answer, truth, valid)
         if progress is not None:
             progress(done, len(indices), scores.aee)
         if out is not None and i in shown:
-            name = batch["name"][0].replace("/", "_")
-            picture = comparison(events_of(batch["new"][0].numpy()), flow, truth, valid)
-            write_picture(inside(out / "pictures", f"{name}.png"), picture)
+            picture = comparison(events_of(answer.events), answer.flow, truth, valid)
+            write_picture(inside(Path(out) / "pictures", f"{sample.name.replace('/', '_')}.png"), picture)
     if not scores.count:
         raise AssetError("no sample has events and a valid ground-truth pixel", accepted="a labelled data set")
-    result = {
-        **_of_the_model(model),
-        "samples": len(indices) - left_out,
-        "skipped": scores.tallies["network"].skipped,
-        "left_out": left_out,
-        **({"warm": warm.count} if warm_start else {}),
-        "ms": 1000 * spent / (len(indices) - left_out),
-        "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in scores.tallies.items()},
-    }
+    result = scores.result(predictor, len(indices) - scores.left_out)
     if out is not None:
-        write_whole(out / "results.json", json.dumps(result, indent=1) + "\n")
+        write_whole(Path(out) / "results.json", json.dumps(result, indent=1) + "\n")
     return result
 
 
 class _Scores:
     """Metrics of the network and of the baselines, by scene. median : (2,) of the set's ground truth, px."""
 
-    def __init__(self, median: np.ndarray):
+    def __init__(self, median: Numbers):
         self.median = median
         self.tallies = {name: Tally() for name in ("network", *BASELINES)}
-        self.count, self._sum = 0, 0.0
+        self.count, self.left_out, self.still, self._sum, self._seconds = 0, 0, 0, 0.0, 0.0
 
     @property
     def aee(self) -> float:
         """Return the network's mean AEE so far, px."""
         return self._sum / max(self.count, 1)
 
-    def add(self, scene: str, flow: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> None:
-        metrics = frame_metrics(flow, truth, valid)
+    def add(self, answer: Answer, truth: Flow, valid: Mask) -> None:
+        """Score one answer beside the baselines."""
+        assert isinstance(answer.pair, RawSample)
+        self._seconds += answer.seconds
+        self.still += not answer.flow.any()
+        scene, metrics = answer.pair.scene, frame_metrics(answer.flow, truth, valid)
         self.tallies["network"].add(scene, metrics)
         for name, constant in zip(BASELINES, (np.zeros(2), self.median, *best_motions(truth, valid)), strict=True):
             self.tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
         if metrics:
             self._sum, self.count = self._sum + metrics["AEE"], self.count + 1
 
+    def result(self, predictor: Predictor, samples: int) -> Result:
+        """Return everything about ``samples`` samples, for tables and files."""
+        model = predictor.model
+        network = isinstance(model, FlowModel)
+        result: Result = {
+            "model": json.loads(model.config.model_dump_json()) if network else {"name": model.name},
+            "parameters": parameters_of(model) if network else 0,
+            "device": _device_of(model),
+            "samples": samples,
+            "skipped": self.tallies["network"].skipped,
+            "left_out": self.left_out,
+            "still": self.still,
+            "ms": 1000 * self._seconds / samples,
+            "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in self.tallies.items()},
+        }
+        if predictor.warm_start:
+            result["warm"] = predictor.warm
+        return result
 
-def _of_the_model(model: FlowModel | Method) -> dict[str, Any]:
-    """Return configuration, number of parameters and device of a model, as plain data."""
+
+def _device_of(model: FlowModel | Method) -> str:
+    """Return the name of the card on which a model computes, or "cpu" and the threads of a network there."""
     if not isinstance(model, FlowModel):
-        return {"model": {"name": model.name}, "parameters": 0, "device": "cpu"}
+        return "cpu"
     device = next(model.parameters()).device
-    cpu = f"cpu, {torch.get_num_threads()} threads"
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu
-    config = json.loads(model.config.model_dump_json())
-    return {"model": config, "parameters": parameters_of(model), "device": name}
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
 
 
-def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def best_motions(truth: Numbers, valid: Mask) -> tuple[Numbers, Numbers]:
     """Return the median (2,) and the least-squares affine field (H, W, 2) of the truth; zeros if nothing is valid."""
     if not valid.any():
         return np.zeros(2), np.zeros_like(truth)
@@ -155,24 +183,29 @@ def best_motions(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.n
     return np.median(truth[valid], axis=0), ground @ affine
 
 
-def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
+def _labelled(sample: RawSample) -> tuple[Flow, Mask]:
+    """Return the ground truth of a sample and the pixels to score. Raises AssetError: it has none."""
+    if (truth := truth_of(sample)) is None:
+        raise AssetError("no ground truth", where=sample.name, accepted="a labelled data set")
+    flow, valid, mask = truth
+    return flow, valid & mask
+
+
+def _set_median(source: Source, indices: list[int]) -> Numbers:
     """Return the component-wise median of the ground truth over at most 64 samples and every 8th pixel."""
-    rows = []
+    rows = [np.zeros((0, 2), np.float32)]
     # Rounded up, so that no more than MEDIAN_FRAMES are read.
-    for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]:
-        if (sample := dataset[i]) is None:
-            continue
-        if "flow" not in sample:
-            raise AssetError("no ground truth", where=sample["name"], accepted="a labelled data set")
-        keep = (sample["valid"] & sample["mask"])[::8, ::8]
-        rows.append(sample["flow"][:, ::8, ::8][:, keep].numpy())
-    values = np.concatenate(rows, axis=1) if rows else np.zeros((2, 0))
-    return np.median(values, axis=1) if values.size else np.zeros(2)
+    for sample in (source[i] for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]):
+        if sample.has_events:
+            flow, keep = (array[::8, ::8] for array in _labelled(sample))
+            rows.append(flow[keep])
+    values = np.concatenate(rows)
+    return np.median(values, axis=0) if values.size else np.zeros(2)
 
 
-def show(result: dict[str, Any], console: Console | None = None) -> None:
+def show(result: Result) -> None:
     """Print two tables: all metrics of the network and the baselines, and the network's metrics by scene."""
-    console = console or plain_console()
+    console = plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
     table = Table(
         title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on "
@@ -198,6 +231,10 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
         console.print(table)
     if "warm" in result:
         console.print(f"{result['warm']} samples follow the one before and were started from its flow")
-    for key, what in (("skipped", "without a valid pixel"), ("left_out", "with an empty window")):
-        if result[key]:
-            console.print(f"{result[key]} samples {what} are left out")
+    for count, what in (
+        (result["skipped"], "without a valid pixel are left out"),
+        (result["left_out"], "with an empty window are left out"),
+        (result["still"], "have zero flow: too few events, or nothing moves"),
+    ):
+        if count:
+            console.print(f"{count} samples {what}")

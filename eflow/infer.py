@@ -1,38 +1,32 @@
-"""Inference: padding, windows of a stream, warm start, ground truth and output files."""
+"""Inference: padding, windows of a stream, a network or a method that is called with them."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.atomic import atomic_folder, output_errors
-from blinkgl.io.flow import read_flo, read_flow_png, write_flow_png
+from blinkgl.errors import EventDataError
 from blinkgl.io.formats import EventFile, open_events
-from blinkgl.io.images import encode_npy, read_npy
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
-from eflow.data.representation import VoxelGrid
-from eflow.data.window import Window
+from eflow.data.representation import VoxelGrid, grids_of
+from eflow.data.window import SIDES, RawSample, StreamWindow, Window
 from eflow.methods import Method
 from eflow.methods.contrast import sharpest_length
 from eflow.models import FlowModel, FlowPrediction
 from eflow.ops.warp import forward_warp
-from eflow.pictures import comparison, events_of, near_events, write_picture
+from eflow.types import Batch, Flow, Grid
 
 PICTURED = VoxelGrid(bins=2, normalise="none")
 """Grid for the pictures of a method, which reads events and no grid."""
 
 
-def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
+def pad_batch(batch: Batch, model: FlowModel) -> tuple[Batch, int, int]:
     """Return the batch with old and new padded by zeros to a size that the network accepts, and the (left, top) of the
     original image in it.
 
@@ -45,11 +39,11 @@ def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
     right, down = -width % multiple, -height % multiple
     left, top = (right, down) if model.pad_start else (0, 0)
     pad = (left, right - left, top, down - top)
-    return {**batch, **{k: F.pad(batch[k], pad) for k in ("old", "new") if k in batch}}, left, top
+    return {**batch, **{k: F.pad(batch[k], pad) for k in SIDES if k in batch}}, left, top
 
 
 @torch.inference_mode()
-def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPrediction:
+def predict(model: FlowModel, batch: Batch, *, precision: str = "fp32") -> FlowPrediction:
     """Return the prediction of the model in evaluation mode, at the size of the batch.
 
     batch : old, new (N, C, H, W), optional flow_init. Raises EventDataError: smaller than ``model.least``."""
@@ -62,7 +56,7 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
             accepted=f"at least {model.least} px a side",
         )
     device = next(model.parameters()).device
-    batch = {k: v.to(device) if torch.is_tensor(v) else v for k, v in batch.items()}
+    batch = {k: v.to(device) for k, v in batch.items() if torch.is_tensor(v)}
     was_training = model.training
     model.eval()
     try:
@@ -94,27 +88,13 @@ def largest_change(model: FlowModel, other: FlowModel) -> float:
     return float((predict(model, batch).flow - predict(other, batch).flow).abs().max())
 
 
-@dataclass(frozen=True)
-class StreamWindow:
-    """A reference time, the window before it and the window after it."""
-
-    t_us: int
-    old: Window
-    new: Window
-
-    @classmethod
-    def of(cls, events: Events, start: int, t_us: int, end: int) -> StreamWindow:
-        """Return the windows [start, t_us) and [t_us, end) µs of a stream."""
-        return cls(t_us, Window.of(events, start, t_us), Window.of(events, t_us, end))
-
-
 def windows(
     file: EventFile,
     span_us: int,
     *,
     start_us: int | None = None,
     end_us: int | None = None,
-    reads: Sequence[str] = ("old", "new"),
+    reads: Sequence[str] = SIDES,
 ) -> Iterator[StreamWindow]:
     """Yield the successive windows of an event file, at reference times start + Δ, start + 2Δ, … while both windows are
     inside [start, end). If only the new window is read, the first reference time is start.
@@ -156,7 +136,7 @@ LIKELY_PX = 5.0
 def likely_span(
     file: EventFile,
     predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]],
-    reads: Sequence[str] = ("old", "new"),
+    reads: Sequence[str] = SIDES,
 ) -> tuple[int, int]:
     """Return (Δ, longest possible Δ) in µs, where Δ is the time in which motion is about :data:`LIKELY_PX`.
 
@@ -204,7 +184,7 @@ def ends_of(file: EventFile) -> tuple[int, int] | None:
 
 
 def at_places(
-    file: EventFile, span: int, first: int, last: int, reads: Sequence[str] = ("old", "new")
+    file: EventFile, span: int, first: int, last: int, reads: Sequence[str] = SIDES
 ) -> Iterator[StreamWindow]:
     """Yield a window, or pair, of ``span`` µs at a quarter, half and three quarters from ``first`` to ``last``; those
     without events are left out."""
@@ -216,7 +196,7 @@ def at_places(
             yield window
 
 
-def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tuple[StreamWindow, float]:
+def whole_file(file: EventFile, reads: tuple[str, ...] = SIDES) -> tuple[StreamWindow, float]:
     """Return the whole file as one pair, and the factor from the flow of its new window to that of the whole file at
     constant velocity.
 
@@ -230,108 +210,70 @@ def whole_file(file: EventFile, reads: tuple[str, ...] = ("old", "new")) -> tupl
     return StreamWindow.of(events, t0, t, t1), (t1 - t0) / (t1 - t)
 
 
-class MethodPredictor:
-    """A method without training, called like a :class:`Predictor`.
-
-    empty : "error", or "zero" flow for a pair of windows in which the method finds no motion."""
-
-    def __init__(self, method: Method, height: int, width: int, *, empty: str = "error"):
-        self.method, self.height, self.width, self.empty = method, height, width, empty
-
-    def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's events (2, H, W) for a picture."""
-        seen = PICTURED(window.new, self.height, self.width)
-        try:
-            return self.method(window.old, window.new, self.height, self.width), seen
-        except EventDataError as error:
-            if self.empty == "zero":
-                return np.zeros((self.height, self.width, 2), np.float32), seen
-            raise EventDataError(
-                error.problem,
-                where=error.where,
-                value=error.value,
-                accepted=f"{error.accepted}, or --empty zero to write zero flow there",
-            ) from None
-
-
-class WarmStart:
-    """Predicts flow window by window. If ``on``, the refinement of each window starts from the flow of the previous
-    one, moved along itself, where it follows it.
-
-    ``count`` : windows that did."""
-
-    def __init__(self, on: bool):
-        self.on, self.count = on, 0
-        self._end: Hashable = None
-        self._low: torch.Tensor | None = None
-
-    def predict(self, model: FlowModel, batch: dict, start: Hashable, end: Hashable, precision: str) -> np.ndarray:
-        """Return the flow (H, W, 2) px of a window, :func:`predict` of a batch of one.
-
-        start, end : of the window: a time, or a sequence and a time."""
-        if self._low is not None and start == self._end:
-            self.count += 1
-            batch = {**batch, "flow_init": forward_warp(self._low)}
-        prediction = predict(model, batch, precision=precision)
-        if self.on:
-            self._end, self._low = end, prediction.low
-        return prediction.flow[0].permute(1, 2, 0).cpu().numpy()
-
-    def forget(self) -> None:
-        """Start the next window from nothing: this one has no flow."""
-        self._low = None
-
-
 class Predictor:
-    """A model that is called with the windows of a stream, one after the other.
+    """A network, or a method that needs no training, that is called with the windows of a stream, one after the other.
 
-    warm_start : start from the previous flow, moved along itself (networks with an iterated low-resolution flow only).
-    empty : "error", or "zero" flow for a window without events.
-    sharpen : multiply each flow by the factor that makes the events of its windows sharpest
-    (:func:`eflow.methods.contrast.sharpest_length`).   unsharpened : windows whose flow kept its length, by reason."""
+    warm_start : the refinement of each window starts from the flow of the previous one, moved along itself, where it
+    follows it (networks with an iterated low-resolution flow only).   warm : number of windows that did.
+    sharpen : multiply each flow of a network by the factor that makes the events of its windows sharpest
+    (:func:`eflow.methods.contrast.sharpest_length`).   unsharpened : windows whose flow kept its length, by reason.
+    reads : the windows of a pair that are read. A window without events, or with too few for a method, has zero
+    flow."""
 
     def __init__(
         self,
-        model: FlowModel,
+        model: FlowModel | Method,
         height: int,
         width: int,
         *,
         warm_start: bool = False,
-        precision: str = "fp32",
-        empty: str = "error",
         sharpen: bool = False,
     ):
         self.model, self.height, self.width = model, height, width
-        self.precision, self.empty, self.sharpen = precision, empty, sharpen
-        self._warm = WarmStart(warm_start)
+        self.warm_start, self.sharpen = warm_start, sharpen
+        self.reads = model.reads if isinstance(model, FlowModel) else SIDES
         self.unsharpened: Counter[str] = Counter()
+        self.warm = 0
+        self._before: tuple[tuple[str, int], torch.Tensor] | None = None
+        """Scene and end of the previous window, and its low-resolution flow, if a window may start from it."""
 
-    def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's event tensor (C, H, W).
+    def __call__(self, window: StreamWindow | RawSample) -> tuple[Flow, Grid]:
+        """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's event tensor (C, H, W) float32.
 
-        Raises EventDataError: a window has no events (unless ``empty`` is "zero")."""
-        read = {name: getattr(window, name) for name in self.model.reads}
-        for name, w in read.items():
-            if not len(w) and self.empty == "error":
-                raise EventDataError(
-                    f"no events in the {name} window [{w.t0}, {w.t1}) µs",
-                    accepted="use --empty zero to write zero flow there",
-                )
-        grids = {name: self.model.representation(w, self.height, self.width) for name, w in read.items()}
-        new = grids["new"]
-        if not all(len(w) for w in read.values()):
-            self._warm.forget()
-            return np.zeros((self.height, self.width, 2), np.float32), new
-        batch = {name: torch.from_numpy(grid)[None] for name, grid in grids.items()}
-        flow = self._warm.predict(self.model, batch, window.new.t0, window.new.t1, self.precision)
-        if self.sharpen:
-            follows = len(window.old) and window.old.t1 == window.new.t0
-            seen = [window.old, window.new] if follows else [window.new]
-            factor, why = sharpest_length(seen, flow)
-            flow = flow * np.float32(factor)
-            if why:
-                self.unsharpened[why] += 1
-        return flow, new
+        Raises EventDataError: events outside the window or the sensor."""
+        if not isinstance(self.model, FlowModel):
+            seen = PICTURED(window.new, self.height, self.width)
+            try:
+                return self.model(window.old, window.new, self.height, self.width), seen
+            except EventDataError:  # too few events
+                return self._still(), seen
+        grids = grids_of(self.model.representation, window, self.reads, (self.height, self.width))
+        if not all(len(getattr(window, name)) for name in self.reads):
+            return self._still(), grids["new"]
+        flow = self._predicted(window, {name: torch.from_numpy(grid)[None] for name, grid in grids.items()})
+        return self._sharpened(window, flow) if self.sharpen else flow, grids["new"]
+
+    def _still(self) -> Flow:
+        """Return zero flow for a window that tells none; the next one does not start from it."""
+        self._before = None
+        return np.zeros((self.height, self.width, 2), np.float32)
+
+    def _predicted(self, window: StreamWindow | RawSample, batch: Batch) -> Flow:
+        assert isinstance(self.model, FlowModel)
+        if self._before is not None and self._before[0] == (window.scene, window.new.t0):
+            self.warm += 1
+            batch = {**batch, "flow_init": forward_warp(self._before[1])}
+        prediction = predict(self.model, batch)
+        if self.warm_start and prediction.low is not None:
+            self._before = (window.scene, window.new.t1), prediction.low
+        return prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+
+    def _sharpened(self, window: StreamWindow | RawSample, flow: Flow) -> Flow:
+        follows = len(window.old) and window.old.t1 == window.new.t0
+        factor, why = sharpest_length([window.old, window.new] if follows else [window.new], flow)
+        if why:
+            self.unsharpened[why] += 1
+        return flow * np.float32(factor)
 
 
 def open_sized(path: str | os.PathLike, reading: EventReading = AS_FILE) -> EventFile:
@@ -344,76 +286,6 @@ def sensor_of(file: EventFile) -> tuple[int, int]:
     """Return (height, width) px of a file that :func:`open_sized` opened."""
     assert file.height is not None and file.width is not None
     return file.height, file.width
-
-
-def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
-    """Return the ground truth of one window, (H, W, 2) px, NaN where there is none.
-
-    path : .npy of shape (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC) or .flo. Raises AssetError."""
-    path = Path(path)
-    if path.suffix == ".npy":
-        flow = read_npy(path)
-        flow = flow[0] if flow.ndim == 4 and flow.shape[0] == 1 else flow
-        flow = np.moveaxis(flow, 0, -1) if flow.ndim == 3 and flow.shape[0] == 2 else flow
-        flow = flow.astype(np.float32) if flow.ndim == 3 and flow.dtype.kind == "f" else flow
-    else:
-        flow, valid = (read_flo if path.suffix == ".flo" else read_flow_png)(path)
-        flow = np.where(valid[..., None], flow, np.nan)
-    if flow.shape != (height, width, 2):
-        raise AssetError(
-            "ground truth of another size", where=str(path), value=flow.shape, accepted=f"({height}, {width}, 2)"
-        )
-    return flow
-
-
-@contextlib.contextmanager
-def flow_folder(final: str | os.PathLike, *, npy: bool = False) -> Iterator[FlowWriter]:
-    """Open a new folder of flow, which appears completely or not at all: ``%06d.png`` (DSEC's 16 bits),
-    ``pictures/%06d.png`` and ``timestamps.txt`` (from_us, to_us).
-
-    npy : also write exact flow to ``npy/%06d.npy``, (H, W, 2) float32. Raises OutputError: the folder exists."""
-    with atomic_folder(final) as folder:
-        writer = FlowWriter(folder, Path(final), npy)
-        yield writer
-        with output_errors(final):
-            (folder / "timestamps.txt").write_text("\n".join(writer.lines) + "\n", encoding="utf-8")
-
-
-class FlowWriter:
-    """Writes windows into the folder of :func:`flow_folder`. lines : of its time stamps."""
-
-    def __init__(self, folder: Path, final: Path, npy: bool):
-        self._folder, self._final, self.npy, self.count = folder, final, npy, 0
-        self.lines = ["# from_timestamp_us, to_timestamp_us"]
-
-    def add(
-        self,
-        window: StreamWindow,
-        flow: np.ndarray,
-        tensor: np.ndarray,
-        truth: np.ndarray | None = None,
-        at_events: bool = False,
-    ) -> None:
-        """Write one window.   flow : (H, W, 2) px.   tensor : the new window's events, as a predictor returns them.
-        at_events : flow of pixels without events nearby is not valid, NaN in ``npy/``."""
-        name, valid, flow = f"{self.count:06d}", np.all(np.isfinite(flow), axis=-1), flow.astype(np.float32, copy=False)
-        near = near_events(tensor)
-        if at_events:
-            valid &= near
-        write_flow_png(self._folder / f"{name}.png", flow, valid)
-        with output_errors(self._final):
-            if self.npy:
-                values = np.where(valid[..., None], flow, np.float32(np.nan)) if at_events else flow
-                self._part("npy", f"{name}.npy").write_bytes(encode_npy(values))
-            where = None if truth is None else np.all(np.isfinite(truth), axis=-1)
-            strip = comparison(events_of(tensor), flow, truth, where, near=near)
-            write_picture(self._part("pictures", f"{name}.png"), strip)
-        self.lines.append(f"{window.new.t0}, {window.new.t1}")
-        self.count += 1
-
-    def _part(self, folder: str, name: str) -> Path:
-        (self._folder / folder).mkdir(exist_ok=True)
-        return self._folder / folder / name
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -432,12 +304,12 @@ def doubts(events: Events, height: int, width: int) -> list[str]:
     """Return warnings, one line each, about the first events of a recording of (height, width) px."""
     if len(events) < _ENOUGH:
         return []
-    found = []
+    lines = []
     seconds = max(int(events.t[-1]) - int(events.t[0]), 1) * 1e-6
     rate = len(events) / seconds / (height * width)
     if not SLOWEST <= rate <= FASTEST:
         other = "ns, or ticks of the camera's clock" if rate < SLOWEST else "ms, or ticks of a slower clock"
-        found.append(
+        lines.append(
             f"{rate:.2g} events per second and pixel; cameras give 0.05 to 1000. Are the times {other}, instead of µs?"
         )
     counts = np.bincount(events.pixel(width), minlength=height * width)
@@ -445,8 +317,8 @@ def doubts(events: Events, height: int, width: int) -> list[str]:
     # The largest counts, without sorting all.
     share = np.partition(counts, -few)[-few:].sum() / len(events)
     if share > FLOOD:
-        found.append(
+        lines.append(
             f"{few} pixels ({100 * FEW:g} %) have {100 * share:.0f} % of the events: hot pixels or a flickering light; "
             "flow there is not motion"
         )
-    return found
+    return lines

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from blinkgl.config.problems import validate
@@ -16,7 +16,7 @@ def load_train_config(
     path: str | Path | None,
     overrides: list[str] | tuple[str, ...] = (),
     *,
-    model: dict | None = None,
+    model: Mapping[str, object] | None = None,
     data: Sequence[str] = (),
     minutes: float | None = None,
 ) -> TrainConfig:

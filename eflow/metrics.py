@@ -14,6 +14,7 @@ from torch import Tensor
 
 from eflow.config import LossConfig
 from eflow.models.contract import FlowPrediction
+from eflow.types import Mask, Numbers
 
 NAMES = {
     "AEE": "end-point error, px",
@@ -28,7 +29,7 @@ NAMES = {
 MAX_FLOW = 400.0
 
 
-def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float] | None:
+def frame_metrics(predicted: Numbers, truth: Numbers, valid: Mask) -> dict[str, float] | None:
     """Return all metrics of :data:`NAMES` for one frame, or None if it has no valid pixel.
 
     predicted, truth : (H, W, 2) px. valid : (H, W) bool. Pixels with |gt| >= 400 are excluded, too; occluded pixels are
@@ -54,7 +55,7 @@ def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -
     }
 
 
-def angle_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_2d(a: Numbers, b: Numbers) -> Numbers:
     """Return the angle in radians between vectors (..., 2).
 
     It is atan2(|cross|, dot), which is accurate at 0 and 180 degrees where arccos is not. If one vector is zero the
@@ -65,7 +66,7 @@ def angle_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(zero_a & zero_b, 0.0, np.where(zero_a | zero_b, np.pi / 2, angle))
 
 
-def angle_3d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_3d(a: Numbers, b: Numbers) -> Numbers:
     """Return the angle in radians between (u, v, 1) and (u', v', 1)."""
     a3, b3 = (np.concatenate([f, np.ones_like(f[..., :1])], -1) for f in (a, b))
     return np.arctan2(np.linalg.norm(np.cross(a3, b3), axis=-1), (a3 * b3).sum(-1))

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+from torch import Tensor
 
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import read_table, to_yaml
@@ -25,14 +28,11 @@ def pack(
     name: str,
     card: str | os.PathLike,
     out: str | os.PathLike,
-    *,
-    averaged: bool = True,
 ) -> tuple[Path, Card]:
     """Write the new folder ``out/name`` with the weights of a checkpoint and a card (a YAML file of
     :class:`CardText`); return the folder and its card. It appears after its weights were read back, or not at all.
     Weights above 5 MB are rounded to float16; the card says what that changes.
 
-    averaged : use the averaged weights if there are any.
     Raises ConfigError: bad name or card. AssetError: bad checkpoint, or above 5 MB in float16, too. OutputError."""
     if not NAME.fullmatch(name) or name in METHODS or name in NETWORKS:
         raise ConfigError(
@@ -44,12 +44,12 @@ def pack(
     text = validate(CardText, read_table(os.fspath(card)), where=str(card))
     final = Path(out) / name
     refuse_existing(final)
-    model = load_model(checkpoint, averaged=averaged)
+    model = load_model(checkpoint)
     tensors, stored = _stored(model.state_dict(), checkpoint)
     with atomic_folder(final) as folder:
         write_tensors(folder / WEIGHTS, tensors, metadata_of(model))
         (folder / WEIGHTS).chmod(0o644)  # other users of an installation must be able to read it
-        packed = load_model(folder / WEIGHTS, expected=model.config)  # raises if it cannot be read
+        packed = load_model(folder / WEIGHTS)  # raises if it cannot be read
         read = (folder / WEIGHTS).read_bytes()
         full = Card(
             **text.model_dump(),
@@ -68,7 +68,9 @@ def pack(
     return final, full
 
 
-def _stored(tensors: dict[str, Any], checkpoint: str | os.PathLike) -> tuple[dict[str, Any], Literal["fp32", "fp16"]]:
+def _stored(
+    tensors: Mapping[str, Tensor], checkpoint: str | os.PathLike
+) -> tuple[Mapping[str, Tensor], Literal["fp32", "fp16"]]:
     """Return the tensors to store, and their precision: as they are, or in half precision where that is too large.
 
     Raises AssetError: above 5 MB in half precision, too."""

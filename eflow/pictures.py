@@ -1,29 +1,26 @@
-"""Pictures and videos of events, ground truth, prediction and error, side by side with captions."""
+"""Pictures of events, ground truth, prediction and error, side by side with captions."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from blinkgl.io.atomic import atomic_file, write_whole
+from blinkgl.io.atomic import write_whole
 from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.images import encode_image
-from blinkgl.io.video import VideoWriter
+from eflow.types import Flow, Grid, Mask, Numbers, Picture
 
 _GAP, BAR = 4, 18
 """Gap between panels and height of the bar of captions above them, px."""
-_STEADY = 0.95
 NEAR_PX = 3
 """Distance from a pixel within which its events tell its flow."""
 _HEAT = np.array([[0, 0, 0], [70, 0, 90], [190, 40, 60], [250, 150, 30], [255, 250, 190]], np.float32)
 
 
-def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.ndarray:
+def error_colour(error: Numbers, largest: float, valid: Mask) -> Picture:
     """Return a picture (H, W, 3) uint8 of an error (H, W) px: black for 0, then red, pale yellow from ``largest`` on,
     grey where invalid."""
     at = np.clip(np.nan_to_num(error, nan=largest) / max(largest, 1e-9), 0, 1) * (len(_HEAT) - 1)
@@ -32,7 +29,7 @@ def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.nda
     return np.where(valid[..., None], rgb.astype(np.uint8), INVALID)
 
 
-def events_of(tensor: np.ndarray) -> np.ndarray:
+def events_of(tensor: Grid) -> Picture:
     """Return a picture (H, W, 3) uint8 of an event tensor (C, H, W): positive values blue, negative red."""
     strength = np.abs(tensor)
     top = np.percentile(strength[strength > 0], 95) if (strength > 0).any() else 1.0
@@ -40,22 +37,22 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
     return event_colour(np.stack([level(-tensor), level(tensor)]))
 
 
-def near_events(tensor: np.ndarray) -> np.ndarray:
+def near_events(tensor: Grid) -> Mask:
     """Return the pixels of an event tensor (C, H, W) with an event within ``NEAR_PX``, (H, W) bool."""
     hit = (tensor != 0).any(axis=0).astype(np.uint8)
     return cv2.dilate(hit, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
 
 
 def comparison(
-    events: np.ndarray,
-    predicted: np.ndarray,
-    truth: np.ndarray | None = None,
-    valid: np.ndarray | None = None,
+    events: Picture,
+    predicted: Flow,
+    truth: Flow | None = None,
+    valid: Mask | None = None,
     *,
     largest: float | None = None,
     caption: str = "events",
-    near: np.ndarray | None = None,
-) -> np.ndarray:
+    near: Mask | None = None,
+) -> Picture:
     """Return one RGB strip: events | ground truth | prediction | error; without truth events | prediction.
 
     A bar of :data:`BAR` px above names each panel and the length of flow at full colour. Flow panels share one scale:
@@ -86,53 +83,19 @@ def comparison(
     return strip
 
 
-def _paled(picture: np.ndarray, near: np.ndarray | None) -> np.ndarray:
+def _paled(picture: Picture, near: Mask | None) -> Picture:
     if near is None:
         return picture
     return np.where(near[..., None], picture, (0.25 * picture + 0.75 * 255).astype(np.uint8))
 
 
-def full_colour(flow: np.ndarray) -> float:
+def full_colour(flow: Flow) -> float:
     """Return the length of flow (..., 2) at full colour, px: its 99th percentile."""
     speed = np.hypot(flow[..., 0], flow[..., 1])
     speed = speed[np.isfinite(speed)]
     return (float(np.percentile(speed, 99)) if speed.size else 0.0) or 1.0
 
 
-@contextmanager
-def flow_video(path: str | os.PathLike, height: int, width: int, fps: float) -> Iterator[FlowVideo]:
-    """Open a video that appears completely or not at all. Small sensors are enlarged twice.
-
-    fps : windows per second of video. Raises OutputError: the video cannot be written."""
-    factor, still = 2 if height < 200 else 1, np.zeros((height, width, 2), np.float32)
-    blank = _fitted(comparison(np.zeros((height, width, 3), np.uint8), still), factor)
-    with atomic_file(path, overwrite=False) as final, VideoWriter(final, blank.shape[0], blank.shape[1], fps) as video:
-        yield FlowVideo(video, factor)
-
-
-class FlowVideo:
-    """Draws the events and flow of successive windows into a video, enlarged by ``factor``.
-
-    The colour scale grows at once and falls slowly, so that colours do not flicker."""
-
-    def __init__(self, video: VideoWriter, factor: int):
-        self._video, self._factor, self._largest = video, factor, 0.0
-
-    def add(self, caption: str, events: np.ndarray, flow: np.ndarray, near: np.ndarray | None = None) -> None:
-        """Add one window.   caption : text above the events, e.g. their time.   events : (H, W, 3) uint8; flow (H, W,
-        2) px.   near : as of :func:`comparison`."""
-        told = flow if near is None or not near.any() else flow[near]
-        self._largest = max(_STEADY * self._largest, full_colour(told))
-        strip = comparison(events, flow, largest=self._largest, caption=caption, near=near)
-        self._video.write(_fitted(strip, self._factor))
-
-
-def _fitted(strip: np.ndarray, factor: int) -> np.ndarray:
-    """Return the strip enlarged and padded to an even height and width, which the codec needs."""
-    strip = strip.repeat(factor, 0).repeat(factor, 1)
-    return np.pad(strip, ((0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)), constant_values=255)
-
-
-def write_picture(path: str | os.PathLike, image: np.ndarray) -> None:
+def write_picture(path: str | os.PathLike, image: Picture) -> None:
     """Write a PNG, completely or not at all."""
     write_whole(path, encode_image(image))

@@ -9,7 +9,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -32,7 +32,7 @@ class TrainProgress:
     """Shows step, smoothed loss and EPE, samples/s and the time left until the last step or the time limit.
 
     The first line appears before the first step, the second after it.
-    where : device and precision, as text.   minutes : time limit, counted from ``began`` (s of ``clock``).
+    where : device and precision, as text.   minutes : time limit, counted from now on.
     rate : samples/s over the last steps."""
 
     def __init__(
@@ -43,23 +43,20 @@ class TrainProgress:
         enabled: bool,
         where: str = "",
         minutes: float | None = None,
-        began: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ):
-        self.steps, self.batch, self.enabled, self._clock = steps, batch, enabled, clock
+        self.steps, self.batch, self.enabled = steps, batch, enabled
         self.rate = 0.0
         self._loss: float | None = None
         self._epe: float | None = None
-        self._step, self._time, self._said = start, clock(), -float("inf")
-        began = self._time if began is None else began
-        self._deadline = None if minutes is None else began + 60 * minutes
+        self._step, self._time, self._printed = start, time.monotonic(), -float("inf")
+        self._deadline = None if minutes is None else self._time + 60 * minutes
         self._where = where
         self._console = plain_console(file=sys.stderr)
 
     def __enter__(self) -> TrainProgress:
         self._live = None
         if self.enabled:
-            limit = "" if self._deadline is None else f", {_hms(self._deadline - self._clock())} at most"
+            limit = "" if self._deadline is None else f", {_hms(self._deadline - time.monotonic())} at most"
             self._print(f"training: {self.steps - self._step} steps of {self.batch} samples on {self._where}{limit}")
         if self.enabled and self._console.is_terminal:
             self._live = Progress(
@@ -75,7 +72,7 @@ class TrainProgress:
     def update(self, step: int, values: Iterable[tuple[float, float]] = ()) -> None:
         """Show the state after ``step`` steps. values : (loss, end-point error) of the steps read since the last
         call."""
-        now = self._clock()
+        now = time.monotonic()
         speed = (step - self._step) * self.batch / max(now - self._time, 1e-9)
         self.rate = speed if self.rate == 0 else 0.9 * self.rate + 0.1 * speed
         for loss, epe in values:
@@ -87,8 +84,8 @@ class TrainProgress:
         text = f"loss {self._loss:.2f}  EPE {self._epe:.2f} px  {self.rate:.2f} samples/s  {self._left(now)}"
         if self._live is not None:
             self._live.update(self._task, completed=step, text=text)
-        elif now - self._said >= _QUIET_S or step == self.steps:
-            self._said = now
+        elif now - self._printed >= _QUIET_S or step == self.steps:
+            self._printed = now
             self._print(f"step {step}/{self.steps}  {text}")
 
     def _left(self, now: float) -> str:
@@ -110,7 +107,7 @@ class TrainProgress:
 
     def note(self, step: int, scores: dict[str, float]) -> None:
         """Print the scores of a validation."""
-        self._time = self._clock()  # validation does not count as training time
+        self._time = time.monotonic()  # validation does not count as training time
         self.say(f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items()))
 
     def __exit__(self, *_) -> None:
@@ -121,38 +118,38 @@ class TrainProgress:
 class Waiting(Generic[T]):
     """Iterates over items; ``share`` is the share of the wall time spent waiting for the next one."""
 
-    def __init__(self, items: Iterable[T], clock: Callable[[], float] = time.monotonic):
-        self._items, self._clock, self._waited, self._began = items, clock, 0.0, clock()
+    def __init__(self, items: Iterable[T]):
+        self._items, self._waited, self._began = items, 0.0, time.monotonic()
 
     def __iter__(self) -> Iterator[T]:
         items = iter(self._items)
         while True:
-            since = self._clock()
+            since = time.monotonic()
             try:
                 item = next(items)
             except StopIteration:
                 return
             finally:
-                self._waited += self._clock() - since
+                self._waited += time.monotonic() - since
             yield item
 
     @property
     def share(self) -> float:
-        return self._waited / max(self._clock() - self._began, 1e-9)
+        return self._waited / max(time.monotonic() - self._began, 1e-9)
 
 
 class Counting:
     """Prints a count and the time left: at the start, every ten seconds, and at the end."""
 
-    def __init__(self, total: int, what: str, enabled: bool, clock: Callable[[], float] = time.monotonic):
-        self.total, self.what, self.enabled, self._clock = total, what, enabled, clock
-        self._began, self._said = clock(), -float("inf")
+    def __init__(self, total: int, what: str, enabled: bool):
+        self.total, self.what, self.enabled = total, what, enabled
+        self._began, self._printed = time.monotonic(), -float("inf")
 
     def __call__(self, done: int) -> None:
-        now = self._clock()
-        if not self.enabled or (now - self._said < _QUIET_S and done < self.total):
+        now = time.monotonic()
+        if not self.enabled or (now - self._printed < _QUIET_S and done < self.total):
             return
-        self._said, spent = now, now - self._began
+        self._printed, spent = now, now - self._began
         left = spent * (self.total - done) / done
         print(  # noqa: T201
             f"{done}/{self.total} {self.what}  {done / max(spent, 1e-9):.1f}/s  {_hms(left)} left",
@@ -161,7 +158,7 @@ class Counting:
         )
 
 
-def told(rendering: dict[str, float], waited: float) -> str:
+def cost_of(rendering: dict[str, float], waited: float) -> str:
     """Return a line about the cost of online rendering."""
     line = (
         f"{rendering['rendered']} samples rendered, {rendering['render_ms']:.1f} processor ms each; training waited "

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
@@ -39,8 +40,8 @@ def import_published(path: str | os.PathLike, out: str | os.PathLike) -> FlowMod
     return model
 
 
-_SCALAR = np.float64(0).__reduce__()[0]
-_NUMBERS: list[Any] = [
+_SCALAR = cast(Callable, np.float64(0).__reduce__()[0])
+_NUMBERS: list[Callable | tuple[Callable, str]] = [
     np.dtype,
     *(type(np.dtype(code)) for code in "?bBhHiIlLqQefd"),
     *((_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
@@ -90,13 +91,13 @@ def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
     if not 2 <= channels <= 64:
         raise AssetError("tensor 'fnet.conv1.weight' has another shape", where=where, value=tuple(first.shape))
     events = {"bins": channels, "normalise": "nonzero", "bounds": "events"}
-    config: dict[str, Any] = {"name": "eraft", "input": events, "border": "zero", "padding": "start"}
+    config = {"name": "eraft", "input": events, "border": "zero", "padding": "start"}
     model = build_model(model_config(config))
     ours = model.state_dict()
-    found = {}
+    taken = {}
     for name, wanted in ours.items():
         if name.endswith("num_batches_tracked"):
-            found[name] = wanted
+            taken[name] = wanted
             continue
         sources = published_names(name)
         parts = [_tensor(tensors, source, where) for source in sources]
@@ -108,14 +109,14 @@ def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
                 value=(tuple(value.shape), str(value.dtype).removeprefix("torch.")),
                 accepted=f"{tuple(wanted.shape)}, floating point",
             )
-        found[name] = (_reordered(value) if name == "update.motion.corr1.weight" else value).float()
+        taken[name] = (_reordered(value) if name == "update.motion.corr1.weight" else value).float()
     used = {source for name in ours for source in published_names(name)}
     left = [k for k in sorted(set(tensors) - used) if not any(part in k for part in _IGNORED)]
     if left:
         raise AssetError(
             f"holds a tensor '{left[0]}' that E-RAFT does not have", where=where, accepted="E-RAFT's checkpoint"
         )
-    load_weights(model, found, where)
+    load_weights(model, taken, where)
     return model.eval()
 
 

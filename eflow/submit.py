@@ -6,7 +6,9 @@ import io
 import os
 import struct
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,10 +17,11 @@ from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file
 from blinkgl.io.flow import encode_flow_png
 from blinkgl.io.images import encode_png
-from eflow.data.dataset import FlowDataset, collate
-from eflow.data.sources import FolderSource, open_source
-from eflow.infer import WarmStart
+from eflow.data.sources import Entry, FolderSource, detect_format, open_source
+from eflow.evaluate import answers
+from eflow.infer import Predictor
 from eflow.models import FlowModel
+from eflow.types import Flow, Numbers
 
 DSEC_SEQUENCES = (
     "interlaken_00_b",
@@ -29,54 +32,85 @@ DSEC_SEQUENCES = (
     "zurich_city_14_c",
     "zurich_city_15_a",
 )
-FULL, SAMPLED = 2502001, 2502002
+SAMPLED = 2502002
 CELL = 4
-Progress = Callable[[int, int], None]
 
 
-def submit_dsec(
+@dataclass(frozen=True)
+class Benchmark:
+    """The files of a benchmark.
+
+    name : of the file of a label.   encode : flow and the name of its file -> its bytes.   check : raises OutputError
+    unless the bytes of a file hold flow of (height, width) px.   sequences : of the test set; empty: any."""
+
+    compression: int
+    name: Callable[[Entry], str]
+    encode: Callable[[Flow, str], bytes]
+    check: Callable[[bytes, str, tuple[int, int]], None]
+    sequences: tuple[str, ...] = ()
+
+
+def submit(
     model: FlowModel,
     root: str | os.PathLike,
     out: str | os.PathLike,
     *,
-    sequences: tuple[str, ...] = DSEC_SEQUENCES,
-    precision: str = "fp32",
     warm_start: bool = False,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> int:
-    """Write a zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's CSV; return the number
-    of files.
+    """Write the zip of the benchmark whose layout the test set at ``root`` has, a file ``<sequence>/<name>`` for every
+    label; return the number of files.
 
-    Raises AssetError: a test sequence is missing, or there are others. OutputError: the file exists, or its check
-    failed (then nothing is written)."""
-    source = open_source(root, "dsec")
+    Raises AssetError: no benchmark's layout, a test sequence is missing, or there are others. OutputError: the file
+    exists, or its check failed (then nothing is written)."""
+    if (layout := detect_format(Path(root))) not in BENCHMARKS:
+        raise AssetError("not a benchmark's test set", where=str(root), value=layout, accepted=", ".join(BENCHMARKS))
+    benchmark, source = BENCHMARKS[layout], open_source(root, layout)
     assert isinstance(source, FolderSource)
-    found = {s.name for s in source.sequences}
-    if found != set(sequences):
-        missing, foreign = sorted(set(sequences) - found), sorted(found - set(sequences))
-        raise AssetError(
-            "not the benchmark's test sequences",
-            where=str(root),
-            value=(f"missing {missing[0]}" if missing else f"foreign {foreign[0]}"),
-            accepted=f"exactly the {len(sequences)} test sequences",
-        )
-    wanted = {f"{source.entry(i)[0].name}/{source.entry(i)[1].index:06d}.png" for i in range(len(source))}
-    if len(wanted) != len(source):
+    _check_sequences(source, benchmark.sequences, str(root))
+    entries = [source.entry(i) for i in range(len(source))]
+    names = [f"{sequence.name}/{benchmark.name(entry)}" for sequence, entry in entries]
+    if len(set(names)) != len(names):
         raise AssetError("a file index is listed twice", where=str(root))
+    sizes: dict[str, tuple[int, int]] = {}
+    predictor = Predictor(model, 0, 0, warm_start=warm_start)
     with atomic_file(out, overwrite=False) as temporary:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            for i, flow in _flows(model, source, precision, warm_start, progress):
-                sequence, entry = source.entry(i)
-                _member(
-                    archive,
-                    f"{sequence.name}/{entry.index:06d}.png",
-                    _dsec_png(flow, f"{sequence.name}/{entry.index:06d}"),
-                )
-        check_dsec(temporary, wanted)
-    return len(wanted)
+        with zipfile.ZipFile(temporary, "w", benchmark.compression) as archive:
+            for i, sample, answer in answers(predictor, source, range(len(source))):
+                _member(archive, names[i], benchmark.encode(answer.flow, names[i]))
+                sizes[names[i]] = sample.height, sample.width
+                progress(i + 1, len(names))
+        check_archive(temporary, benchmark, sizes)
+    return len(names)
 
 
-def _dsec_png(flow: np.ndarray, name: str) -> bytes:
+def _check_sequences(source: FolderSource, sequences: tuple[str, ...], where: str) -> None:
+    there = {s.name for s in source.sequences}
+    if not sequences or there == set(sequences):
+        return
+    missing, foreign = sorted(set(sequences) - there), sorted(there - set(sequences))
+    raise AssetError(
+        "not the benchmark's test sequences",
+        where=where,
+        value=(f"missing {missing[0]}" if missing else f"foreign {foreign[0]}"),
+        accepted=f"exactly the {len(sequences)} test sequences",
+    )
+
+
+def check_archive(path: str | os.PathLike, benchmark: Benchmark, sizes: dict[str, tuple[int, int]]) -> None:
+    """Raise OutputError unless the zip has exactly the files of ``sizes``, each with flow of its (height, width)."""
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        if sorted(names) != sorted(sizes):
+            odd = sorted(set(names) ^ set(sizes)) or sorted(n for n in names if names.count(n) > 1)
+            raise OutputError(
+                "submission does not match the test set", where=str(path), value=odd[0], accepted=f"{len(sizes)} files"
+            )
+        for name in names:
+            benchmark.check(archive.read(name), f"{path}: {name}", sizes[name])
+
+
+def _dsec_png(flow: Flow, name: str) -> bytes:
     """Return a 16-bit PNG with the third channel 0, as the benchmark requires."""
     png, lost = encode_flow_png(flow, np.ones(flow.shape[:2], bool))
     if lost:
@@ -92,111 +126,41 @@ def _dsec_png(flow: np.ndarray, name: str) -> bytes:
     return encode_png(raw)
 
 
-def check_dsec(path: str | os.PathLike, wanted: set[str], shape: tuple[int, int] = (480, 640)) -> None:
-    """Raise OutputError unless the zip has exactly the files ``wanted``, each 16-bit RGB of ``shape`` with third
-    channel 0."""
-    with zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-        if sorted(names) != sorted(wanted):
-            odd = sorted(set(names) ^ set(wanted)) or sorted(n for n in names if names.count(n) > 1)
-            raise OutputError(
-                "submission does not match the CSV", where=str(path), value=odd[0], accepted=f"{len(wanted)} files"
-            )
-        for name in names:
-            image = cv2.imdecode(np.frombuffer(archive.read(name), np.uint8), cv2.IMREAD_UNCHANGED)
-            if image is None or image.dtype != np.uint16 or image.shape != (*shape, 3) or image[..., 0].any():
-                raise OutputError(
-                    "submission holds a wrong image",
-                    where=f"{path}: {name}",
-                    value=None if image is None else (str(image.dtype), image.shape),
-                    accepted=f"16-bit RGB {shape} with the third channel 0",
-                )
+def _check_png(data: bytes, where: str, size: tuple[int, int]) -> None:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint16 or image.shape != (*size, 3) or image[..., 0].any():
+        raise OutputError(
+            "submission holds a wrong image",
+            where=where,
+            value=None if image is None else (str(image.dtype), image.shape),
+            accepted=f"16-bit RGB {size} with the third channel 0",
+        )
 
 
-def submit_blinkflow(
-    model: FlowModel,
-    root: str | os.PathLike,
-    out: str | os.PathLike,
-    *,
-    full: bool = False,
-    precision: str = "fp32",
-    warm_start: bool = False,
-    progress: Progress | None = None,
-) -> int:
-    """Write a zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the format of the benchmark, with one pixel per 4x4 cell
-    unless ``full``; return the number of files. Raises as :func:`submit_dsec`."""
-    source = open_source(root, "blinkflow")
-    assert isinstance(source, FolderSource)
-    name = lambda i: (
-        f"{source.entry(i)[0].name}/{source.entry(i)[1].from_us // 1000:d}_{source.entry(i)[1].to_us // 1000:d}.flo"
-    )
-    wanted = {name(i) for i in range(len(source))}
-    sizes: dict[str, tuple[int, int]] = {}
-    with atomic_file(out, overwrite=False) as temporary:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for i, flow in _flows(model, source, precision, warm_start, progress):
-                if not np.isfinite(flow).all():
-                    raise OutputError("flow is not finite", where=name(i))
-                _member(archive, name(i), encode_full(flow) if full else encode_sampled(flow))
-                sizes[name(i)] = flow.shape[:2]
-        with zipfile.ZipFile(temporary) as archive:
-            if sorted(archive.namelist()) != sorted(wanted):
-                raise OutputError(
-                    "submission does not match the data set", where=str(out), accepted=f"{len(wanted)} files"
-                )
-            for member in wanted:
-                decoded = decode(archive.read(member))
-                expected = (*sizes[member], 2) if full else (cells(*sizes[member]), 2)
-                if decoded.shape != expected or not np.isfinite(decoded).all():
-                    raise OutputError(
-                        "submission holds a wrong file", where=member, value=decoded.shape, accepted=str(expected)
-                    )
-    return len(wanted)
-
-
-def cells(height: int, width: int) -> int:
-    """Return the number of 4x4 cells of an image."""
-    return -(-height // CELL) * -(-width // CELL)
-
-
-def encode_full(flow: np.ndarray) -> bytes:
-    """Return int32 tag 2502001, int32 width and height, then (H, W, 2) float32, little-endian."""
-    return struct.pack("<iii", FULL, flow.shape[1], flow.shape[0]) + np.ascontiguousarray(flow, "<f4").tobytes()
-
-
-def encode_sampled(flow: np.ndarray) -> bytes:
+def encode_sampled(flow: Flow, name: str) -> bytes:
     """Return int32 tag 2502002, int32 contains_vis = 0, int32 n, then n pairs (u, v) float32: the top-left pixel of
-    every 4x4 cell, row-major."""
+    every 4x4 cell, row-major. Raises OutputError: flow is not finite."""
+    if not np.isfinite(flow).all():
+        raise OutputError("flow is not finite", where=name)
     picked = np.ascontiguousarray(flow[::CELL, ::CELL], "<f4").reshape(-1, 2)
     return struct.pack("<iii", SAMPLED, 0, len(picked)) + picked.tobytes()
 
 
-def decode(data: bytes) -> np.ndarray:
-    """Return the flow of a file of either form, (H, W, 2) or (n, 2) float32. Raises AssetError."""
+def decode(data: bytes) -> Numbers:
+    """Return the flow of a file of :func:`encode_sampled`, (n, 2) float32 px. Raises AssetError."""
     try:
-        tag, a, b = struct.unpack_from("<iii", data)
-        shape = (b, a, 2) if tag == FULL else (b, 2)
-        if tag not in (FULL, SAMPLED):
+        tag, _, count = struct.unpack_from("<iii", data)
+        if tag != SAMPLED:
             raise ValueError
-        return np.frombuffer(data, "<f4", offset=12).reshape(shape)
+        return np.frombuffer(data, "<f4", offset=12).reshape(count, 2)
     except (struct.error, ValueError):
         raise AssetError("not a BlinkFlow submission file", value=data[:12]) from None
 
 
-def _flows(
-    model: FlowModel, source: FolderSource, precision: str, warm_start: bool, progress: Progress | None
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield (number, flow) of every sample; with ``warm_start`` those that follow the one before start from its
-    flow."""
-    dataset, warm = FlowDataset([source], model.representation, raw=True, reads=model.reads), WarmStart(warm_start)
-    for i in range(len(dataset)):
-        sample = dataset[i]
-        assert sample is not None  # empty windows are an error
-        batch = collate([sample])
-        raw = batch["raw"][0]
-        yield i, warm.predict(model, batch, (raw.scene, raw.new.t0), (raw.scene, raw.new.t1), precision)
-        if progress is not None:
-            progress(i + 1, len(dataset))
+def _check_sampled(data: bytes, where: str, size: tuple[int, int]) -> None:
+    flow, cells = decode(data), -(-size[0] // CELL) * -(-size[1] // CELL)
+    if flow.shape != (cells, 2) or not np.isfinite(flow).all():
+        raise OutputError("submission holds a wrong file", where=where, value=flow.shape, accepted=str((cells, 2)))
 
 
 def _member(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
@@ -205,3 +169,17 @@ def _member(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     info.compress_type = archive.compression
     with archive.open(info, "w") as file:
         file.write(io.BytesIO(data).getbuffer())
+
+
+BENCHMARKS = {
+    "dsec": Benchmark(
+        zipfile.ZIP_STORED, lambda entry: f"{entry.index:06d}.png", _dsec_png, _check_png, DSEC_SEQUENCES
+    ),
+    "blinkflow": Benchmark(
+        zipfile.ZIP_DEFLATED,
+        lambda entry: f"{entry.from_us // 1000:d}_{entry.to_us // 1000:d}.flo",
+        encode_sampled,
+        _check_sampled,
+    ),
+}
+"""The benchmarks by the layout of their test sets (:func:`eflow.data.sources.detect_format`)."""

@@ -27,7 +27,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -48,7 +47,7 @@ from eflow.metrics import sequence_loss
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
 from eflow.precision import precision_on
-from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, told
+from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, cost_of
 from eflow.schedule import Course, learning_rate
 from eflow.training_data import check_sizes, check_truth, training_sets, validate, validation_sets
 
@@ -133,7 +132,7 @@ class Training:
         self.path = out
         """The newest checkpoint, or the run folder on ranks that do not write."""
 
-    def _make_network(self) -> dict[str, Any]:
+    def _make_network(self) -> ckpt.State:
         """Make network, optimiser and averaged weights, new or from a checkpoint; return its state."""
         config = self.config
         torch.manual_seed(config.seed)
@@ -146,7 +145,7 @@ class Training:
         self.optimizer = _optimizer(self.model, config.optim, self.device)
         self.ema = {k: v.detach().clone() for k, v in self.model.state_dict().items()} if config.optim.ema else None
         if self.saved is None:
-            return {"step": 0, "seconds": 0.0}
+            return {"format": ckpt.FORMAT, "step": 0, "seconds": 0.0}
         return resume_run(self.saved, config, self.model, self.optimizer, self.ema)
 
     def _make_data(self, stack: contextlib.ExitStack) -> None:
@@ -231,7 +230,7 @@ class Training:
                 if self.lead:  # no step was left
                     self.path = ckpt.newest(self.out) or self._save()
             if self.lead and any(is_endless(s) for s in self.sources):
-                progress.say("online: " + told(_rendering(self.sources), waiting.share))
+                progress.say("online: " + cost_of(_rendering(self.sources), waiting.share))
         if self.world > 1:
             dist.barrier()
             dist.destroy_process_group()
@@ -344,7 +343,7 @@ def _optimizer(model: FlowModel, optim: OptimConfig, device: torch.device) -> to
     )
 
 
-def _forward(net, batch: dict, config: TrainConfig, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _forward(net: torch.nn.Module, batch: dict, config: TrainConfig, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the loss (its sum over valid pixels divided by ``count``), the sum of the end-point errors of the last
     field, px, and that field, all still on the device."""
     kind = batch["new"].device.type

@@ -34,9 +34,9 @@ def page() -> str:
     """The page as Markdown, of the commands that the package installs."""
     scripts = distribution("blinkgl").entry_points.select(group="console_scripts")
     roots = [(script.name, import_module(f"{script.name}.cli").app) for script in sorted(scripts)]
-    commands = [found for root, app in roots for found in _commands(root, typer.main.get_command(app))]
+    commands = [row for root, app in roots for row in _commands(root, typer.main.get_command(app))]
     rows = {name: _rows(name, command) for name, command in commands}
-    count = Counter(row for found in rows.values() for row in found)
+    count = Counter(row for options in rows.values() for row in options)
     shared = [row for row in count if count[row] >= SHARED_BY and row.startswith("|`-")]
     table = f"\n## Options of several commands\n\n{HEAD}{''.join(shared)}"
     return HEADER + table + "".join(_section(name, command, rows[name], shared) for name, command in commands)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import sys
 import types
 import typing
-from typing import Any
 
 import annotated_types
 from pydantic import BaseModel
@@ -151,7 +150,7 @@ def _about(info: FieldInfo) -> str:
     )
 
 
-def _models(annotation: Any) -> list[type[BaseModel]]:
+def _models(annotation: object) -> list[type[BaseModel]]:
     if is_model(annotation):
         return members(annotation)
     return [m for a in typing.get_args(annotation) for m in _models(a)]
@@ -169,7 +168,7 @@ def _type(info: FieldInfo) -> str:
     return " ".join(filter(None, (_name(info.annotation), limits))).replace("|", "\\|")
 
 
-def _name(annotation: Any) -> str:
+def _name(annotation: object) -> str:
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return _name(arguments[0])

@@ -12,7 +12,6 @@ which become a list, one entry each.
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import griffe
 
@@ -90,7 +89,7 @@ def _listed(lines: list[str]) -> list[str]:
 class Docstrings(griffe.Extension):
     """Translates every docstring once. A room shows its modules, not besides what it hands on of them."""
 
-    def on_module(self, *, mod: griffe.Module, **_: Any) -> None:
+    def on_module(self, *, mod: griffe.Module, **_: object) -> None:
         if mod.is_init_module and mod.parent is not None:
             mod.exports = None
             modules = {
@@ -98,11 +97,11 @@ class Docstrings(griffe.Extension):
             }
             mod.members = {name: member for name, member in mod.members.items() if name not in modules} | modules
 
-    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+    def on_object(self, *, obj: griffe.Object, **_: object) -> None:
         if obj.docstring is not None:
             obj.docstring.value = markdown(obj.docstring.value)
 
-    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+    def on_package(self, *, pkg: griffe.Module, **_: object) -> None:
         # The root of a package is no object of another one, so the hook above does not see it.
         if pkg.docstring is not None:
             pkg.docstring.value = markdown(pkg.docstring.value)

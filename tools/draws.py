@@ -15,14 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from blinkgl.config.camera import CameraConfig
-from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.primitives import kinds
 from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
@@ -44,7 +44,7 @@ TIMES_NS = np.array([0, 61_234_567, 200_000_000, 333_333_333, END_NS])
 CLOSE, CLOSE_PIXELS = 2e-6, 1e-3
 """Relative to the larger of 1e-3 and the number; of pictures in [0, 1], whose pixels are rounded, absolute."""
 
-WORLDS: dict[str, dict[str, Any]] = {
+WORLDS: dict[str, dict[str, object]] = {
     "default": {},
     "no sky": {"sky": None},
     "no ground, all flying": {"ground": None, "objects": {"count": 5, "flying": 1.0, "tint": 0.0}},
@@ -70,7 +70,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     },
     "unlit": {"light": {"unlit": True}, "object_motion": {"kind": "static"}, "camera_motion": {"rotation_rate": 0}},
 }
-EMULATORS: dict[str, Any] = {
+EMULATORS: dict[str, EmulatorConfig] = {
     "esim": EsimConfig(),
     "esim spread, jitter": EsimConfig(
         contrast_threshold=0.15,
@@ -90,7 +90,7 @@ EMULATORS: dict[str, Any] = {
 }
 
 
-def told(values: Any) -> list[float]:
+def numbers_of(values: object) -> list[float]:
     """Shape, mean, standard deviation and two projections of an array."""
     a = np.asarray(values, np.float64)
     if not a.size:
@@ -100,14 +100,14 @@ def told(values: Any) -> list[float]:
     return [*(float(n) for n in a.shape), *(float(f"{n:.8g}") for n in numbers)]
 
 
-def told_mesh(mesh) -> list[float]:
+def mesh_numbers(mesh) -> list[float]:
     return [
         float(mesh.closed),
-        *(n for part in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs) for n in told(part)),
+        *(n for part in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs) for n in numbers_of(part)),
     ]
 
 
-def told_events(events: Events) -> list[int]:
+def event_numbers(events: Events) -> list[int]:
     place = np.arange(len(events)) % 101
     return [
         len(events),
@@ -115,62 +115,64 @@ def told_events(events: Events) -> list[int]:
     ]
 
 
-def told_scene(scene: Scene) -> dict[str, Any]:
+def scene_numbers(scene: Scene) -> Mapping[str, object]:
     camera = scene.camera
-    said: dict[str, Any] = {
+    table: dict[str, object] = {
         "log": list(scene.log),
-        "light": told([*scene.light.sun_direction, scene.light.sun, scene.light.sky]),
+        "light": numbers_of([*scene.light.sun_direction, scene.light.sun, scene.light.sky]),
         "camera": [
             camera.fx,
             camera.fy,
             camera.cx,
             camera.cy,
-            *told(scene.camera_path.poses(TIMES_NS)),
-            *told(np.stack([scene.camera_path.derivative(int(t)) for t in TIMES_NS])),
+            *numbers_of(scene.camera_path.poses(TIMES_NS)),
+            *numbers_of(np.stack([scene.camera_path.derivative(int(t)) for t in TIMES_NS])),
         ],
     }
-    for thing in scene.objects:
-        said[f"{thing.instance_id} {thing.category} {thing.name}"] = [
-            *told(thing.path.poses(TIMES_NS)),
-            *told(np.stack([thing.path.derivative(int(t)) for t in TIMES_NS])),
+    for body in scene.objects:
+        table[f"{body.instance_id} {body.category} {body.name}"] = [
+            *numbers_of(body.path.poses(TIMES_NS)),
+            *numbers_of(np.stack([body.path.derivative(int(t)) for t in TIMES_NS])),
             *(
                 n
-                for part in thing.parts
+                for part in body.parts
                 for n in (
-                    *told_mesh(part.mesh),
+                    *mesh_numbers(part.mesh),
                     *part.material.base_color,
                     *part.material.uv_scale,
                     float(part.material.unlit),
                     float(not part.culled),
                 )
             ),
-            *(part.material.texture.name for part in thing.parts if part.material.texture),
+            *(part.material.texture.name for part in body.parts if part.material.texture),
         ]
-    return said
+    return table
 
 
-def textures() -> dict[str, Any]:
+def textures() -> Mapping[str, object]:
     return {
-        f"{kind} {index}": told(procedural_texture(kind, index, 48).image / 255)
+        f"{kind} {index}": numbers_of(procedural_texture(kind, index, 48).image / 255)
         for kind in TEXTURE_KINDS
         for index in range(6)
     }
 
 
-def coats() -> dict[str, Any]:
+def coats() -> Mapping[str, object]:
     """What people, flags and fish wear, averaged over patches of 32 px."""
     return {
-        f"{coat.__name__} {seed}": told(coat(seed).reshape(16, 32, 16, 32, 3).mean(axis=(1, 3)) / 255)
+        f"{coat.__name__} {seed}": numbers_of(coat(seed).reshape(16, 32, 16, 32, 3).mean(axis=(1, 3)) / 255)
         for coat in (clothes, bunting, scales)
         for seed in range(8)
     }
 
 
-def bodies() -> dict[str, Any]:
-    return {f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in kinds("pool") for index in range(3)}
+def bodies() -> Mapping[str, object]:
+    return {
+        f"{kind} {index}": mesh_numbers(random_primitive(kind, index)) for kind in kinds("pool") for index in range(3)
+    }
 
 
-def living() -> dict[str, Any]:
+def living() -> Mapping[str, object]:
     """People, flags and fish as they are bound, and where they are at other times."""
     keys = {
         "figure": [
@@ -182,17 +184,17 @@ def living() -> dict[str, Any]:
         "flag": [{}],
         "fish": [{}, {"deep": 0.7}],
     }
-    said = {}
+    table = {}
     for kind, several in keys.items():
         for number, these in enumerate(several):
             mesh = BUILDERS[kind](**these)
             assert mesh.deformer is not None
             at = np.stack([mesh.deformer.positions(mesh, int(t)) for t in TIMES_NS])
-            said[f"{kind} {number}"] = [*told_mesh(mesh), *told(at)]
-    return said
+            table[f"{kind} {number}"] = [*mesh_numbers(mesh), *numbers_of(at)]
+    return table
 
 
-def shapes() -> dict[str, Any]:
+def shapes() -> Mapping[str, object]:
     """Primitives of other parameters than the usual ones; meshes whose normals and texture
     coordinates are made here."""
     other = {
@@ -207,23 +209,23 @@ def shapes() -> dict[str, Any]:
         "pyramid": dict(sides=3, radius=0.8, height=1.7),
         "grid": dict(width=2.0, depth=3.0, subdivisions=3),
     }
-    said = {kind: told_mesh(BUILDERS[kind](**keys)) for kind, keys in other.items()}
+    table = {kind: mesh_numbers(BUILDERS[kind](**keys)) for kind, keys in other.items()}
     for kind in ("cuboid", "sphere", "prism", "torus"):
         mesh = BUILDERS[kind](**other[kind])
         for name, make in {"creased": make_mesh, "tiled": partial(make_mesh, uv_size=0.37)}.items():
-            said[f"{kind} {name}"] = told_mesh(make(mesh.vertices, mesh.faces))
-    return said
+            table[f"{kind} {name}"] = mesh_numbers(make(mesh.vertices, mesh.faces))
+    return table
 
 
-def worlds() -> dict[str, Any]:
+def worlds() -> Mapping[str, object]:
     camera = CameraConfig(width=96, height=72)
     return {
-        name: told_scene(build_scene(world(keys), camera, 0, END_NS, seed=3, sequence=k))
+        name: scene_numbers(build_scene(world(keys), camera, 0, END_NS, seed=3, sequence=k))
         for k, (name, keys) in enumerate(WORLDS.items())
     }
 
 
-def world(keys: dict[str, Any]) -> RandomSceneConfig:
+def world(keys: dict[str, object]) -> RandomSceneConfig:
     return validate(
         RandomSceneConfig,
         {
@@ -253,28 +255,28 @@ def clip(frames: int = 6, height: int = 37, width: int = 45) -> tuple[np.ndarray
     )
 
 
-def events() -> dict[str, Any]:
+def events() -> Mapping[str, object]:
     frames, times = clip()
-    said = {}
+    table = {}
     for name, config in EMULATORS.items():
         emulator = make_emulator(config, frames.shape[1], frames.shape[2], 9)
         chunks = [emulator.step(f, int(t)) for f, t in zip(frames, times)]
-        said[name] = told_events(Events.concatenate(chunks))
+        table[name] = event_numbers(Events.concatenate(chunks))
         bus = Readout(ReadoutConfig(events_per_second=100_000, queue_events=50, row_ns=300))
         sent = Events.concatenate([bus.step(chunk) for chunk in chunks])
-        said[f"{name} read out"] = [*told_events(sent), bus.dropped]
-    return said
+        table[f"{name} read out"] = [*event_numbers(sent), bus.dropped]
+    return table
 
 
 PARTS = (textures, coats, bodies, living, shapes, worlds, events)
 
 
-def drawn(parts=PARTS) -> dict[str, Any]:
+def drawn(parts=PARTS) -> Mapping[str, object]:
     """ "PART/NAME" -> what was drawn, as the golden file has it."""
     return {f"{part.__name__}/{name}": value for part in parts for name, value in part().items()}
 
 
-def differences(golden: Any, now: Any, where: str = "") -> list[str]:
+def differences(golden: object, now: object, where: str = "") -> list[str]:
     """Where two tables say different things, one line each."""
     if isinstance(golden, dict) and isinstance(now, dict):
         lines = (
@@ -295,7 +297,7 @@ def differences(golden: Any, now: Any, where: str = "") -> list[str]:
     return [] if same else [f"{where}: {golden!r} became {now!r}"]
 
 
-def written(table: dict[str, Any]) -> str:
+def written(table: Mapping[str, object]) -> str:
     """As JSON, one line for each thing drawn."""
     lines = (
         f"{json.dumps(key, ensure_ascii=False)}: {json.dumps(value, ensure_ascii=False)}"
@@ -304,7 +306,7 @@ def written(table: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def known() -> dict[str, Any]:
+def known() -> Mapping[str, object]:
     return json.loads(GOLDEN.read_text(encoding="utf-8"))
 
 

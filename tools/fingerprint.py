@@ -62,13 +62,13 @@ def platform_name() -> str:
 
 def sums(folder: Path) -> dict[str, str]:
     """Return a SHA-256 sum (its first 16 digits) for each folder below ``folder`` that directly holds data files."""
-    found: dict[str, Any] = {}
+    digests: dict[str, hashlib._Hash] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_file() and not NOT_DATA.search(name):
-            whole = found.setdefault(path.relative_to(folder).parent.as_posix(), hashlib.sha256())
+            whole = digests.setdefault(path.relative_to(folder).parent.as_posix(), hashlib.sha256())
             whole.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return {name: whole.hexdigest()[:16] for name, whole in found.items()}
+    return {name: whole.hexdigest()[:16] for name, whole in digests.items()}
 
 
 @functools.cache

@@ -25,8 +25,8 @@ from blinkgl.machine.terminal import plain_console, say
 from blinkgl.tools.real_recordings import PANS, of_pans, table
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
-from eflow.data.window import RawSample, hit_pixels
-from eflow.infer import Predictor, StreamWindow
+from eflow.data.window import RawSample, StreamWindow, hit_pixels
+from eflow.infer import Predictor
 from eflow.models import FlowModel
 
 BINS = (0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 24.0)
@@ -36,16 +36,13 @@ Judged = tuple[float, float, float, float, float]
 """True length; predicted over true length and error over true length, of the flow as it is and sharpened."""
 
 
-def of_pool(path: str) -> Iterator[tuple[StreamWindow, np.ndarray]]:
+def of_pool(path: str) -> Iterator[tuple[RawSample, np.ndarray]]:
     """Pairs of windows and their true flow, (H, W, 2) px, NaN where there is none."""
     source = open_source(path)
     for i in range(len(source)):
         sample = source[i]
         assert sample.flow is not None and sample.valid is not None
-        yield (
-            StreamWindow(sample.new.t0, sample.old, sample.new),
-            np.where(sample.valid[..., None], sample.flow, np.nan),
-        )
+        yield sample, np.where(sample.valid[..., None], sample.flow, np.nan)
 
 
 def enlarged(sample: RawSample, factor: int) -> RawSample:
@@ -105,13 +102,13 @@ def of_views(model: FlowModel, path: str, limit: int) -> list[list[list[object]]
 
 def _error(model: FlowModel, s: RawSample) -> tuple[float, float, float]:
     """Error of a sample, and zero flow's, px; events per pixel of the new window."""
-    predictor = Predictor(model, s.height, s.width, empty="zero")
+    predictor = Predictor(model, s.height, s.width)
     assert s.flow is not None and s.valid is not None
-    flow, true = predictor(StreamWindow(s.new.t0, s.old, s.new))[0][s.valid], s.flow[s.valid]
+    flow, true = predictor(s)[0][s.valid], s.flow[s.valid]
     return np.hypot(*(flow - true).T).mean(), np.hypot(*true.T).mean(), len(s.new) / (s.height * s.width)
 
 
-def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -> Iterator[Judged]:
+def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow | RawSample, np.ndarray]]) -> Iterator[Judged]:
     """Of every pair whose new window has events enough."""
     for pair, truth in pairs:
         height, width = truth.shape[:2]
@@ -123,7 +120,7 @@ def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow, np.ndarray]]) -
         if not size.any():  # nothing moves: no length to compare
             continue
         for sharpen in (False, True):
-            flow = Predictor(model, height, width, empty="zero", sharpen=sharpen)(pair)[0][hit]
+            flow = Predictor(model, height, width, sharpen=sharpen)(pair)[0][hit]
             row += [np.hypot(*flow.T).sum() / size.sum(), np.hypot(*(flow - true).T).sum() / size.sum()]
         share, error, sharp_share, sharp_error = map(float, row)
         yield float(np.median(size)), share, error, sharp_share, sharp_error

@@ -344,10 +344,10 @@ def number(rng: np.random.Generator, data: bytes) -> bytes:
 
 def word(rng: np.random.Generator, data: bytes) -> bytes:
     """A word or number of a text is lost, or becomes another."""
-    found = list(re.finditer(rb"[A-Za-z_]+|[-+]?\d[\d.eE+-]*|[:,{}\[\]]", data))
-    if not found:
+    words = list(re.finditer(rb"[A-Za-z_]+|[-+]?\d[\d.eE+-]*|[:,{}\[\]]", data))
+    if not words:
         return flip_bits(rng, data)
-    spot, other = (found[int(rng.integers(len(found)))] for _ in range(2))
+    spot, other = (words[int(rng.integers(len(words)))] for _ in range(2))
     new = other[0] if rng.random() < 0.3 else TOKENS[int(rng.integers(len(TOKENS)))]
     return data[: spot.start()] + new + data[spot.end() :]
 

@@ -18,6 +18,7 @@ import h5py
 import hdf5plugin  # noqa: F401 - the events' filter
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from blinkgl.config.base import is_model, members
@@ -33,7 +34,7 @@ from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest
 
-SMALL: dict[str, Any] = {
+SMALL: dict[str, object] = {
     "camera": {"width": 32, "height": 24},
     "time": {"duration": 0.1, "label_rate": 20},
     "timeline": {"kind": "uniform", "fps": 100},
@@ -76,7 +77,9 @@ _MOST: dict[str, float] = {
 Leaf = tuple[tuple[str, ...], dict[tuple[str, ...], str], FieldInfo]
 
 
-def leaves(model: Any, path: tuple[str, ...] = (), kinds: dict[tuple[str, ...], str] | None = None) -> list[Leaf]:
+def leaves(
+    model: type[BaseModel], path: tuple[str, ...] = (), kinds: dict[tuple[str, ...], str] | None = None
+) -> list[Leaf]:
     """Return the keys of a model that hold plain values: path, the kinds of the unions on the way, and the field."""
     rows: list[Leaf] = []
     for name, info in model.model_fields.items():
@@ -94,7 +97,7 @@ def leaves(model: Any, path: tuple[str, ...] = (), kinds: dict[tuple[str, ...], 
     return rows
 
 
-def value(rng: np.random.Generator, annotation: Any, bounds: list[Any]) -> Any:
+def value(rng: np.random.Generator, annotation: object, bounds: list[object]) -> object:
     """Return a value of a type: an end of its bounds, something between, or one of its choices."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
@@ -122,10 +125,11 @@ def value(rng: np.random.Generator, annotation: Any, bounds: list[Any]) -> Any:
     return int(number) if annotation is int else float(number)
 
 
-def drawn(seed: int, index: int) -> dict[str, Any]:
+def drawn(seed: int, index: int) -> dict[str, object]:
     """Return configuration ``index``: the small recipe with one to four keys of other values."""
     rng = np.random.default_rng([seed, zlib.crc32(b"configurations"), index])
-    tree, rows = copy.deepcopy(SMALL), leaves(SequenceConfig)
+    tree: dict[str, Any] = copy.deepcopy(SMALL)
+    rows = leaves(SequenceConfig)
     for _ in range(int(rng.integers(1, 5))):
         path, kinds, info = rows[int(rng.integers(len(rows)))]
         picked = value(rng, info.annotation, list(info.metadata))
@@ -133,7 +137,7 @@ def drawn(seed: int, index: int) -> dict[str, Any]:
         if most is not None and isinstance(picked, (int, float)) and picked > most:
             picked = type(picked)(most)
         for at, entry in [*kinds.items(), (path, picked)]:
-            table = tree
+            table: dict[str, Any] = tree
             for step in at[:-1]:
                 table = table.setdefault(step, {}) if isinstance(table.get(step, {}), dict) else {}
             if at[-1] in ("kind", "emulator") and table.get(at[-1]) not in (None, entry):

@@ -6,7 +6,7 @@ import gzip
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import av
 import cv2
@@ -52,7 +52,7 @@ def mat(path: Path, e: Events) -> None:
     savemat(path, {"events": {"x": e.x * 1.0, "y": e.y, "ts": e.t * 1.0, "p": e.p}}, do_compression=True)
 
 
-def h5(*packed: Any) -> Make:
+def h5(*packed: object) -> Make:
     """Columns of a stranger's HDF5, packed by filters."""
 
     def make(path: Path, e: Events) -> None:

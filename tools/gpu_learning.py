@@ -10,11 +10,10 @@ import subprocess
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,8 +21,8 @@ from blinkgl.errors import AssetError
 from blinkgl.tools import fingerprint as cases
 from blinkgl.tools.gpu_pieces import PACKED, WITHOUT_CODECS, Row, Rows, arrays_of, command, last_line, only, overrides
 from eflow.checkpoint import find_weights, load_model, read_tensors, write_tensors
-from eflow.data.sources import FolderSource, open_source
-from eflow.evaluate import evaluate
+from eflow.data.sources import FolderSource, Source, open_source
+from eflow.evaluate import Scores, evaluate
 from eflow.models import NETWORKS
 
 RECIPES = resources.files("blinkgl.configs") / "eflow"
@@ -70,7 +69,7 @@ def started(words: Sequence[str], log: Path) -> subprocess.Popen:
         )
 
 
-def training(options: Namespace, data: dict[str, Any], optim: dict[str, Any]) -> list[str]:
+def training(options: Namespace, data: Mapping[str, object], optim: Mapping[str, object]) -> list[str]:
     """Return overrides of ``eflow train`` for this machine: all that a training of minutes writes is its log and its
     newest weights."""
     never = 1_000_000
@@ -94,10 +93,10 @@ def trained_so_far(run: Path, log: Path) -> Row:
     return {name: last[name] for name in names if name in last}
 
 
-def scores(weights: str, sources: dict[str, Any], options: Namespace) -> dict[str, dict[str, Any]]:
+def scores(weights: str, sources: Mapping[str, Source], options: Namespace) -> dict[str, dict[str, Scores]]:
     """Return the metrics of a network and of the baselines, by set."""
     model = load_model(weights).to(options.device)
-    return {name: evaluate(model, source, empty="skip", limit=MOST)["methods"] for name, source in sources.items()}
+    return {name: evaluate(model, source, limit=MOST)["methods"] for name, source in sources.items()}
 
 
 # --- a training while its data are rendered ---------------------------------------------------------------------------
@@ -110,22 +109,22 @@ def online(options: Namespace) -> Rows:
     run, log, best = Path(options.scratch, "online"), Path(options.scratch, "online.log"), np.inf
 
     def judge(weights: str) -> Row:
-        found = scores(weights, sources, options)
+        judged = scores(weights, sources, options)
         share = lambda of: of["network"]["total"]["AEE"] / of["zero flow"]["total"]["AEE"]
-        return {f"{name}, of zero flow's error": share(of) for name, of in found.items()}
+        return {f"{name}, of zero flow's error": share(of) for name, of in judged.items()}
 
     def after(until: float, last: bool) -> Row:
         nonlocal best
         while process.poll() is None and (last or time.monotonic() < until):
             time.sleep(0.2)
-        told, (tensors, metadata) = trained_so_far(run, log), read_tensors(find_weights(run))
+        progress, (tensors, metadata) = trained_so_far(run, log), read_tensors(find_weights(run))
         halves = {key: value.half() if value.is_floating_point() else value for key, value in tensors.items()}
         write_tensors(newest := run / "half.safetensors", halves, metadata)
         row = judge(str(newest))
         if (mean := float(np.mean([*row.values()]))) < best:
             best = mean
             shutil.copy(newest, options.out / "online_half.safetensors")
-        return {**told, **row, "best": mean == best, "status": process.poll()}
+        return {**progress, **row, "best": mean == best, "status": process.poll()}
 
     yield "real_bodies, which ships", partial(judge, "real_bodies")
     began, minutes = time.monotonic(), 0.15 if options.small else max(options.seconds - BESIDE_S, 30.0) / 60
@@ -193,10 +192,11 @@ def _learnt(options: Namespace, name: str, minutes: float) -> Row:
     words = ["train", "--model", model, "--data", str(scratch / "pool"), "--out", str(run)]
     started([*words, *training(options, data, {"lr": 4e-4, "ema": 0.995, "minutes": minutes})], log).wait()
     row = {"minutes": minutes, **trained_so_far(run, log)}
-    whole: Any = open_source(str(scratch / "tests" / "test"))
+    whole = open_source(str(scratch / "tests" / "test"))
+    assert isinstance(whole, FolderSource)
     of = lambda start: FolderSource([s for s in whole.sequences if s.name.split("/")[-1].startswith(start)])
     for title, methods in scores(str(run), {title: of(start) for title, start in PARTS.items()}, options).items():
-        found, zero = methods["network"]["total"], methods["zero flow"]["total"]
-        told = {"AEE, px": found["AEE"], "outliers, %": found["outlier"], "AE, deg": found["AE2D"], "zero": zero["AEE"]}
-        row |= {f"{title}: {name}": value for name, value in told.items()}
+        own, zero = methods["network"]["total"], methods["zero flow"]["total"]
+        columns = {"AEE, px": own["AEE"], "outliers, %": own["outlier"], "AE, deg": own["AE2D"], "zero": zero["AEE"]}
+        row |= {f"{title}: {name}": value for name, value in columns.items()}
     return row

@@ -33,7 +33,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.render.tensors import TextureReader
 from blinkgl.show import doctor as machine
 from blinkgl.tools import fingerprint as cases
-from blinkgl.tools.bench import probe_scene
+from blinkgl.tools.bench_rows import probe_scene
 from blinkgl.tools.shader_debugger.commands import run_diff
 from blinkgl.tools.shader_debugger.session import moment, open_subject
 
@@ -118,8 +118,8 @@ def command(module: str, *words: str, cache: str | None = None) -> float:
 
 def last_line(text: str) -> str:
     """Return the last line that says something."""
-    said = [line for line in text.splitlines() if line.strip() and "this is a bug" not in line]
-    return said[-1] if said else "(silent)"
+    lines = [line for line in text.splitlines() if line.strip() and "this is a bug" not in line]
+    return lines[-1] if lines else "(silent)"
 
 
 def overrides(*pairs: str) -> list[str]:
@@ -149,13 +149,13 @@ def frames(options: Namespace) -> Rows:
 
 def _beside_reference(config: str, index: int = 0, changes: tuple[str, ...] = ()) -> Row:
     subject = open_subject(config, sequence=index, overrides=changes)
-    found, reports = run_diff(subject, moment(subject), None, [])
+    result, reports = run_diff(subject, moment(subject), None, [])
     over = [report.quantity.name for report in reports if not report.passed]
     share, worst = max(
         (report.value / report.tolerance, report.quantity.name) for report in reports if report.tolerance
     )
-    said = f"{worst} {share:.2g} of its tolerance"
-    return {"buffers": len(reports), "over": ", ".join(over) or "none", "worst": said, "passed": found["passed"]}
+    share_text = f"{worst} {share:.2g} of its tolerance"
+    return {"buffers": len(reports), "over": ", ".join(over) or "none", "worst": share_text, "passed": result["passed"]}
 
 
 def fingerprint(options: Namespace) -> Rows:
@@ -183,7 +183,7 @@ def _beside_packed(name: str, known: dict[str, np.ndarray]) -> Row:
 
 def arrays_of(name: str) -> dict[str, np.ndarray]:
     """Return the pictures and labels of a case of the fingerprint, and the number of events in each of its pixels."""
-    found = {}
+    arrays = {}
     with tempfile.TemporaryDirectory() as folder:
         cases.assets(Path(folder))
         out = cases.generated(name, Path(folder), WITHOUT_CODECS)
@@ -196,8 +196,8 @@ def arrays_of(name: str) -> dict[str, np.ndarray]:
                     events, sides = reader.slice(0, 2**40), (range(reader.height + 1), range(reader.width + 1))
                 array = np.histogram2d(events.y, events.x, sides)[0].astype(np.uint16)
             assert array is not None
-            found[f"{name}/{path.relative_to(out).as_posix()}"] = array
-    return found
+            arrays[f"{name}/{path.relative_to(out).as_posix()}"] = array
+    return arrays
 
 
 # --- events on tensors ------------------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def arrays_of(name: str) -> dict[str, np.ndarray]:
 def events(options: Namespace) -> Iterator[tuple[str, Callable[[], Row]]]:
     sizes, total = SIZES[:3] if options.small else SIZES, 0
 
-    def compare(config: Any, turn: int) -> Row:
+    def compare(config: EsimConfig | V2eConfig, turn: int) -> Row:
         nonlocal total
         kinds = (TensorEsim if isinstance(config, EsimConfig) else TensorV2e, emulator_of(config))
         before, changes = total, {"device": options.device, "seed": 2**64 - 2 + turn, "frames_seed": turn}
@@ -353,8 +353,8 @@ def sequences(options: Namespace) -> Rows:
     runs = {"flying_objects": ["flying_objects"], "dancers": ["blinkflow", *dancers], "stereo": ["stereo"]}
     counts = (1, 2) if options.small else (1, 4, 12)
     for workers, size, name in itertools.product(counts, sizes, runs):
-        said = f"{name}, {size[0]}x{size[1]}, {workers} process{'es' if workers > 1 else ''}"
-        yield said, partial(_generated, options, runs[name], size, workers)
+        title = f"{name}, {size[0]}x{size[1]}, {workers} process{'es' if workers > 1 else ''}"
+        yield title, partial(_generated, options, runs[name], size, workers)
 
 
 def _generated(options: Namespace, run: list[str], size: tuple[int, int], workers: int) -> Row:

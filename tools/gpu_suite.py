@@ -30,6 +30,7 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from blinkgl.machine import bench
 from blinkgl.machine.interrupts import interruptible
 
 Row = dict[str, Any]
+"""A row of a table: title of a column -> text or number."""
 
 
 MEASURED, TRAINED = "blinkgl.tools.gpu_pieces", "blinkgl.tools.gpu_learning"
@@ -93,8 +95,8 @@ def write(out: Path, report: dict[str, Any]) -> None:
     lines = [f"# {report['machine']}, {report['device']}"]
     for stage, pieces in report["stages"].items():
         for name, piece in pieces.items():
-            said = f"{piece['state']}, {piece['seconds']:.0f} s {piece['said']}".rstrip()
-            lines += ["", f"## {stage}, {name}: {PIECES[name][1]}", "", said, ""]
+            summary = f"{piece['state']}, {piece['seconds']:.0f} s {piece['said']}".rstrip()
+            lines += ["", f"## {stage}, {name}: {PIECES[name][1]}", "", summary, ""]
             lines += table(piece["rows"]) if piece["rows"] else []
     plain = lambda value: value.item() if isinstance(value, np.generic) else str(value)
     text = json.dumps(report, indent=1, default=plain)
@@ -105,41 +107,41 @@ def write(out: Path, report: dict[str, Any]) -> None:
 # --- the process of a piece -------------------------------------------------------------------------------------------
 
 
-def answer(told: Any, name: str, module: str, first: int, options: Namespace) -> None:
+def answer(pipe: Connection, name: str, module: str, first: int, options: Namespace) -> None:
     """Measure the rows of a piece from number ``first`` on, and send them: (what, value), what being device, begin
     (number and name of a row), rows or state."""
     os.setsid()  # so that what it begins can be ended with it
     try:
-        told.send(("device", line := importlib.import_module(MEASURED).device_line(options)))
+        pipe.send(("device", line := importlib.import_module(MEASURED).device_line(options)))
         if line == "no torch" and name in NEED_TORCH:
             raise ImportError(line)
         for number, (title, measure) in enumerate(getattr(importlib.import_module(module), name)(options)):
             if number >= first:
-                told.send(("begin", (number, title)))
+                pipe.send(("begin", (number, title)))
                 rows, state = measured(title, measure)
-                told.send(("rows", rows))
-                told.send(("state", state))
+                pipe.send(("rows", rows))
+                pipe.send(("state", state))
     except Exception as error:  # noqa: BLE001 - the other pieces go on
-        told.send(("state", outcome(error)))
+        pipe.send(("state", outcome(error)))
 
 
 def measured(title: str, measure: Callable[[], Row | list[Row]]) -> tuple[list[Row], tuple[str, str]]:
     """Return the rows that a function gives, or one that says why it gives none; and the state of the piece."""
     try:
-        found = measure()
+        result = measure()
     except Exception as error:  # noqa: BLE001 - the other rows go on
-        state, said = outcome(error)
-        return [{"": title, "said": f"{state}: {said}"}], (state, f"'{title}' has no result")
-    rows = found if isinstance(found, list) else [{"": title, **found}]
+        state, reason = outcome(error)
+        return [{"": title, "said": f"{state}: {reason}"}], (state, f"'{title}' has no result")
+    rows = result if isinstance(result, list) else [{"": title, **result}]
     wrong = any(row.get(name) is False for row in rows for name in ("passed", "same numbers"))
     return rows, ("failed", f"'{title}' is wrong") if wrong else ("done", "")
 
 
 def outcome(error: Exception) -> tuple[str, str]:
     """Return "absent", where this machine cannot do something, or "failed"; and why, in a line."""
-    said = " ".join(str(error).split())[:300]
-    cannot = isinstance(error, (BlinkGLError, ImportError)) or "out of memory" in said
-    return ("absent", said) if cannot else ("failed", f"{type(error).__name__}: {said}")
+    reason = " ".join(str(error).split())[:300]
+    cannot = isinstance(error, (BlinkGLError, ImportError)) or "out of memory" in reason
+    return ("absent", reason) if cannot else ("failed", f"{type(error).__name__}: {reason}")
 
 
 def stop(process: Any) -> None:
@@ -161,18 +163,18 @@ def run_stage(name: str, options: Namespace, report: dict[str, Any]) -> None:
     deadline, done = time.monotonic() + seconds, report["stages"].setdefault(name, {})
     for piece in (piece for piece in pieces if piece in options.only):
         print(f"{name}, {piece} …", flush=True)
-        found = done[piece] = {"state": "begun", "said": "", "seconds": 0.0, "rows": []}
+        outcomes = done[piece] = {"state": "begun", "said": "", "seconds": 0.0, "rows": []}
         began, first = time.monotonic(), 0
         until = min(deadline, began + seconds * PIECES[piece][2])
         while first is not None:
-            first = run_process(piece, first, until, options, report, found)
-            found["seconds"] = time.monotonic() - began
+            first = run_process(piece, first, until, options, report, outcomes)
+            outcomes["seconds"] = time.monotonic() - began
             write(options.out, report)
-        print(f"{name}, {piece}: {found['state']}, {found['seconds']:.0f} s {found['said']}", flush=True)
+        print(f"{name}, {piece}: {outcomes['state']}, {outcomes['seconds']:.0f} s {outcomes['said']}", flush=True)
 
 
 def run_process(
-    name: str, first: int, deadline: float, options: Namespace, report: dict[str, Any], found: dict[str, Any]
+    name: str, first: int, deadline: float, options: Namespace, report: dict[str, Any], outcomes: dict[str, Any]
 ) -> int | None:
     """Run a piece from a row on until it ends, hangs or its time is over. Return the row that another process begins
     with, or None."""
@@ -191,15 +193,15 @@ def run_process(
             if at_work:
                 row = value
             elif what == "rows":
-                found["rows"] += value
+                outcomes["rows"] += value
                 print(*(f"  {next(iter(one.values()))}" for one in value), sep="\n", flush=True)
                 write(options.out, report)
             elif what == "device":
                 report["device"] = value
-            elif RANKS.index(value[0]) >= RANKS.index(found["state"]):
-                found |= dict(zip(("state", "said"), value, strict=True))
+            elif RANKS.index(value[0]) >= RANKS.index(outcomes["state"]):
+                outcomes |= dict(zip(("state", "said"), value, strict=True))
         if time.monotonic() >= deadline:
-            found |= {"state": "cut", "said": f"the time was over during '{row[1]}'"}
+            outcomes |= {"state": "cut", "said": f"the time was over during '{row[1]}'"}
             return None
         why = f"no result after {row_s:g} s"
     except EOFError:  # it has ended
@@ -209,8 +211,8 @@ def run_process(
         why = f"the process ended with status {process.exitcode}"
     finally:
         stop(process)
-    found |= {"state": "failed", "said": f"'{row[1]}': {why}"}
-    found["rows"].append({"": row[1], "said": why})
+    outcomes |= {"state": "failed", "said": f"'{row[1]}': {why}"}
+    outcomes["rows"].append({"": row[1], "said": why})
     return None if row[0] < 0 else row[0] + 1
 
 
@@ -237,8 +239,8 @@ def parsed(arguments: list[str] | None) -> Namespace:
         parser.add_argument(name, **how)
     options = parser.parse_args(arguments)
     options.only = options.only.split(",")
-    for option, given, known in (("--only", options.only, PIECES), ("--stage", options.stage, STAGES)):
-        if unknown := set(given) - set(known):
+    for option, names, known in (("--only", options.only, PIECES), ("--stage", options.stage, STAGES)):
+        if unknown := set(names) - set(known):
             parser.error(f"{option}: unknown {', '.join(sorted(unknown))}; expected {', '.join(known)}")
     options.events = options.events or (1e5 if options.small else 1e7)
     return options

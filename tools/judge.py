@@ -61,9 +61,9 @@ def judge_unlike(
 ) -> Judgement:
     """Compare sensors of different sizes by their non-empty patches at any position. Differences of the scenes count,
     too."""
-    found = [patches(events, size, span_us) for events, size in ((a, size_a), (b, size_b))]
-    full = [count >= LEAST_IN_PATCH for count, _ in found]
-    x = np.concatenate([values[some] for (_, values), some in zip(found, full)])
+    counted = [patches(events, size, span_us) for events, size in ((a, size_a), (b, size_b))]
+    full = [count >= LEAST_IN_PATCH for count, _ in counted]
+    x = np.concatenate([values[some] for (_, values), some in zip(counted, full)])
     label = np.repeat([0.0, 1.0], [int(some.sum()) for some in full])
     window = np.concatenate([np.nonzero(some)[0] for some in full])
     return _judged(x, label, window, (span_us[1] - span_us[0]) / WINDOWS)
@@ -92,20 +92,20 @@ def _judged(x: np.ndarray, label: np.ndarray, window: np.ndarray, window_us: flo
         x, label, window = x[keep], label[keep], window[keep]
     # Folds are stretches of time, so that no window is both trained on and tested.
     fold = window * FOLDS // WINDOWS
-    found, gains = [], np.zeros(x.shape[1])
+    areas, gains = [], np.zeros(x.shape[1])
     for k in range(FOLDS):
         train, test = fold != k, fold == k
         if min(label[test].sum(), (1 - label[test]).sum()) >= 5 and 0 < label[train].mean() < 1:
             score, gained = boosted(x[train], label[train], x[test])
-            found.append(area(score, label[test]))
+            areas.append(area(score, label[test]))
             gains += gained
-    if not found:
+    if not areas:
         raise EventDataError(
             "all events have the same time, so a judge cannot be trained and tested", where="compare --judge"
         )
     shares = gains / max(gains.sum(), 1e-30)
     telling = tuple((NAMES[k], float(shares[k])) for k in np.argsort(-gains)[:_TELLING])
-    return Judgement(float(np.mean(found)), float(np.std(found)), len(x), float(window_us), telling=telling)
+    return Judgement(float(np.mean(areas)), float(np.std(areas)), len(x), float(window_us), telling=telling)
 
 
 def boosted(x: np.ndarray, label: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

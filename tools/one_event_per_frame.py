@@ -76,8 +76,8 @@ def errors_us(events: Events, truth: Events) -> np.ndarray:
     keys = np.sort(place(truth) + truth.t)
     mine = place(events) + events.t
     after = np.searchsorted(keys, mine)
-    found = [mine - keys[np.clip(k, 0, len(keys) - 1)] for k in (after - 1, after)]
-    nearest = np.where(np.abs(found[0]) <= np.abs(found[1]), *found).astype(np.float64)
+    distances = [mine - keys[np.clip(k, 0, len(keys) - 1)] for k in (after - 1, after)]
+    nearest = np.where(np.abs(distances[0]) <= np.abs(distances[1]), *distances).astype(np.float64)
     nearest[np.abs(nearest) >= far // 2] = np.nan  # of another pixel
     return nearest
 
@@ -106,8 +106,8 @@ def main() -> None:
             interval_us = step / SPEED_PX_S * 1e6
             print(row(f"{step}: all crossings", all_crossings(frames, times), truth, interval_us))
             for to_the_frame in (False, True):
-                said = "one a frame, to the frame" if to_the_frame else "one a frame, by a threshold"
-                print(row(f"{step}: {said}", one_per_frame(frames, times, to_the_frame), truth, interval_us))
+                rule = "one a frame, to the frame" if to_the_frame else "one a frame, by a threshold"
+                print(row(f"{step}: {rule}", one_per_frame(frames, times, to_the_frame), truth, interval_us))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m blinkgl.tools.peers --v2e CHECKOUT --voltmeter CHECKOUT [--rounds 5] [--frames 24] [--page]
 
 ``--v2e`` is a checkout of SensorsINI/v2e, ``--voltmeter`` of Lynn0306/DVS-Voltmeter; either may be left out. Each
-program runs in a process of its own with one thread, on a clip of 640x480 at 1000 frames/s (`bench.clip`). The first
+program runs in a process of its own with one thread, on a clip of 640x480 at 1000 frames/s. The first
 frame, which only sets the state, is not timed. ``--page`` writes a section of docs/benchmarks.md.
 """
 
@@ -11,20 +11,17 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sized
-from statistics import median
 from types import ModuleType
 from unittest.mock import MagicMock
 
 import numpy as np
 
 from blinkgl.machine.bench import machine_line
-from blinkgl.tools.bench import FPS, HEIGHT, PAGE, PEERS as SECTION, WIDTH, clip
+from blinkgl.tools.bench import PAGE, PEERS as SECTION, measure
+from blinkgl.tools.bench_rows import FPS, HEIGHT, WIDTH, answer, clip
 
 NOT_USED = ("screeninfo", "easygui", "tkinter", "engineering_notation", "dv_processing", "easydict")
 """Modules that the programs import for windows, output files and options, and that need not be installed here."""
@@ -87,29 +84,23 @@ def voltmeter(checkout: str) -> Step:
     return lambda frame, t: counted(simulator.generate_events(frame, round(t * 1e6)))
 
 
-def timed(program: str, checkout: str, density: str, frames: int) -> dict[str, float]:
-    """Processor ms a frame and events of a program, in this process."""
-    pictures = clip(density, frames + 1)
-    step = PEERS[program](checkout) if checkout else ours(program)
-    for warm in (0, 1):  # compiling and first allocations
-        step(pictures[warm], warm / FPS)
-    began, events = time.process_time(), 0
-    for number in range(2, frames + 1):
-        events += step(pictures[number], number / FPS)
-    return {"ms": 1000 * (time.process_time() - began) / (frames - 1), "events": events}
+def timed(program: str, checkout: str, frames: int) -> dict[str, list[float]]:
+    """Density -> [processor ms a frame, events a pixel and frame] of a program, or of ours without a checkout."""
+    row = {}
+    for density in DENSITIES:
+        pictures = clip(density, frames + 1)
+        step = PEERS[program](checkout) if checkout else ours(program)
+        for warm in (0, 1):  # compiling and first allocations
+            step(pictures[warm], warm / FPS)
+        began, events = time.process_time(), 0
+        for number in range(2, frames + 1):
+            events += step(pictures[number], number / FPS)
+        spent = time.process_time() - began
+        row[density] = [1000 * spent / (frames - 1), events / (frames - 1) / (HEIGHT * WIDTH)]
+    return row
 
 
-PEERS = {"v2e": v2e, "voltmeter": voltmeter}
-
-
-def in_a_process(program: str, checkout: str, density: str, frames: int) -> dict[str, float]:
-    """:func:`timed`, with one thread of everything."""
-    one = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    command = [sys.executable, "-P", "-m", "blinkgl.tools.peers", "--answer", program, checkout, density, str(frames)]
-    done = subprocess.run(command, env={**os.environ, **one}, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
+PEERS, DENSITIES = {"v2e": v2e, "voltmeter": voltmeter}, ("mid", "dense")
 
 
 def table(checkouts: dict[str, str], rounds: int, frames: int) -> str:
@@ -117,14 +108,14 @@ def table(checkouts: dict[str, str], rounds: int, frames: int) -> str:
     lines = [
         "|model|events per pixel, frame: theirs, ours|authors' program, ms|BlinkGL, ms|ratio|\n|---|---|---|---|---|\n"
     ]
+    one = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    answers = [sys.executable, "-P", "-m", "blinkgl.tools.peers", "--answer"]
     for model, checkout in checkouts.items():
-        for density in ("mid", "dense"):
-            turns = [[in_a_process(model, c, density, frames) for c in (checkout, "")] for _ in range(rounds)]
-            theirs, own = (median(turn[k]["ms"] for turn in turns) for k in (0, 1))
-            rates = [turns[0][k]["events"] / (frames - 1) / (HEIGHT * WIDTH) for k in (0, 1)]
+        commands = {"theirs": [*answers, model, checkout, str(frames)], "ours": [*answers, model, "", str(frames)]}
+        for of in measure(commands, rounds, warm_up=0, variables=one).values():
+            (theirs, its_rate), (own, rate) = (np.median(of[name], axis=0) for name in commands)
             lines.append(
-                f"|{model}: {PARAMETERS[model]}|{rates[0]:.3f}, {rates[1]:.3f}|{theirs:.1f}|{own:.1f}|"
-                f"{theirs / own:.1f}|\n"
+                f"|{model}: {PARAMETERS[model]}|{its_rate:.3f}, {rate:.3f}|{theirs:.1f}|{own:.1f}|{theirs / own:.1f}|\n"
             )
             print(lines[-1], end="", flush=True)
     return "".join(lines)
@@ -137,11 +128,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--page", action="store_true", help=f"write {PAGE}")
-    parser.add_argument("--answer", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--answer", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.answer:
-        program, checkout, density, frames = options.answer
-        print(json.dumps(timed(program, checkout, density, int(frames))))
+        program, checkout, frames = options.answer
+        answer(lambda: timed(program, checkout, int(frames)))
         return
     checkouts = {name: path for name in PEERS if (path := getattr(options, name))}
     if not checkouts:

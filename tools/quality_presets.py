@@ -42,32 +42,32 @@ KEPT = (
 
 def rows_of(name: str, result: dict) -> list[tuple[str, dict, float]]:
     """(scene, row, by how much it is beaten there) of every scene where the setting's row counts."""
-    found = []
+    counted = []
     for scene, measured in result["scenes"].items():
         rows = [r for r in measured.get("settings", ()) if r["trusted"]]
-        found += [(scene, r, excess(r, rows, result["cost"], result["error"])) for r in rows if r["name"] == name]
-    return found
+        counted += [(scene, r, excess(r, rows, result["cost"], result["error"])) for r in rows if r["name"] == name]
+    return counted
 
 
 def preset_text(quality: str, name: str, result: dict) -> str:
     """One preset file."""
     overrides = {s.name: s.overrides for s in suite_design()}[name]
     tree = apply_overrides({"timeline": {}, "render": {}}, overrides)
-    found = rows_of(name, result)
-    free = sum(e <= 0 for *_, e in found)
+    counted = rows_of(name, result)
+    free = sum(e <= 0 for *_, e in counted)
     lines = [
         f"quality: {quality}",
-        f"{name}. Nothing beats it in {free} of {len(found)} scenes of the suite, {result['date']}",
+        f"{name}. Nothing beats it in {free} of {len(counted)} scenes of the suite, {result['date']}",
         "(docs/trade.md; measured.json). Processor seconds per simulated second at 240x180 px, missed and extra",
         "events, median error of event times, difference of voxel grids, by how much another setting is better in cost",
         "and error both:",
     ]
-    for scene, r, e in found:
+    for scene, r, e in counted:
         lines.append(
             f"  {scene:15} {r['cpu_s']:6.2f} s  {100 * r['missed']:5.1f} / {100 * r['extra']:5.1f} %  "
             f"{r['time_median_us']:5.0f} µs  {100 * r['voxel']:6.1f} %  {'-' if e <= 0 else f'{100 * e:.0f} %'}"
         )
-    without = [scene for scene in result["scenes"] if scene not in {s for s, *_ in found}]
+    without = [scene for scene in result["scenes"] if scene not in {s for s, *_ in counted}]
     if without:
         lines.append(f"No row that counts (the reference moved by more than a tenth of it): {', '.join(without)}.")
     return "".join(f"# {line}\n" for line in lines) + to_yaml(tree)
@@ -110,9 +110,9 @@ def main() -> None:
     text = json.dumps(kept, indent=0, ensure_ascii=False) + "\n"
     (folder / "measured.json").write_text(text, encoding="utf-8")
     for quality, name in chosen.items():
-        found = rows_of(name, kept)
-        beaten = [f"{scene} by {100 * e:.0f} %" for scene, _, e in found if e > 0]
-        print(f"{quality}: {name}: not beaten in {len(found) - len(beaten)} of {len(found)}; {', '.join(beaten)}")
+        counted = rows_of(name, kept)
+        beaten = [f"{scene} by {100 * e:.0f} %" for scene, _, e in counted if e > 0]
+        print(f"{quality}: {name}: not beaten in {len(counted) - len(beaten)} of {len(counted)}; {', '.join(beaten)}")
         (folder / f"{quality}.yaml").write_text(preset_text(quality, name, kept), encoding="utf-8")
 
 

@@ -34,7 +34,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -42,15 +42,16 @@ import numpy as np
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import read_any_image
+from blinkgl.io.images import read_npy
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.simulation import emulator_config, frames_to_events
 from blinkgl.scene.surfaces.images import photographs
 from blinkgl.types.events import Events
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
-from eflow.data.window import hit_pixels
+from eflow.data.window import RawSample, StreamWindow, hit_pixels
 from eflow.evaluate import best_motions
-from eflow.infer import LIKELY_PX, MethodPredictor, Predictor, StreamWindow, read_truth
+from eflow.infer import LIKELY_PX, Predictor
 from eflow.methods.iwe import flow_warp_loss
 from eflow.methods.table import METHODS, make_method
 
@@ -64,7 +65,7 @@ LONGEST_MS = 120.0
 MIDDLE = (260, 346)
 """Height and width, px, that are looked at of a large sensor."""
 PANNED = "pans across photographs"
-Answer = Callable[[StreamWindow], np.ndarray]
+Answer = Callable[[StreamWindow | RawSample], np.ndarray]
 
 
 def read(path: Path) -> tuple[Events, int, int]:
@@ -110,10 +111,8 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
     if name == "zero":
         return lambda window: np.zeros((height, width, 2), np.float32)
     plain = name.removesuffix(SHARPENED)
-    if name in METHODS:
-        predictor = MethodPredictor(make_method(name, focal), height, width, empty="zero")
-    else:
-        predictor = Predictor(load_model(plain), height, width, empty="zero", sharpen=plain != name)
+    model = make_method(name, focal) if name in METHODS else load_model(plain)
+    predictor = Predictor(model, height, width, sharpen=plain != name)
     return lambda window: predictor(window)[0]
 
 
@@ -137,7 +136,7 @@ def likely_span(events: Events, height: int, width: int) -> int:
     return span
 
 
-def judged(path: Path, names: list[str], most: int) -> dict[str, Any]:
+def judged(path: Path, names: list[str], most: int) -> dict[str, object]:
     """What a recording says of each: {"span_ms", "windows", "moves", "rows": {name: {...}}}."""
     events, height, width = looked_at(path)
     span = likely_span(events, height, width)
@@ -190,7 +189,7 @@ class Burst(NamedTuple):
         """Return the burst of a folder. Raises BlinkGLError."""
         events, height, width = read(folder / "events.txt")
         focal = float((folder / "calib.txt").read_text().split()[0])
-        return cls(events, read_truth(folder / "flow.npy", height, width).astype(np.float64), focal)
+        return cls(events, np.moveaxis(read_npy(folder / "flow.npy").reshape(2, height, width), 0, -1), focal)
 
     @property
     def times(self) -> tuple[int, int, int]:
@@ -294,7 +293,7 @@ def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float
     source = open_source(path)
     samples = (source[int(i)] for i in np.unique(np.linspace(0, len(source) - 1, most).round().astype(int)))
     pairs = (
-        (StreamWindow(s.new.t0, s.old, s.new), np.where(s.valid[..., None], s.flow, np.nan))
+        (s, np.where(s.valid[..., None], s.flow, np.nan))
         for s in samples
         if s.flow is not None and s.valid is not None and s.valid.any()
     )
@@ -302,7 +301,7 @@ def of_set(path: Path, names: list[str], most: int) -> dict[str, dict[str, float
 
 
 def of_pairs(
-    pairs: Iterable[tuple[StreamWindow, np.ndarray]], names: list[str], where: str
+    pairs: Iterable[tuple[StreamWindow | RawSample, np.ndarray]], names: list[str], where: str
 ) -> dict[str, dict[str, float]]:
     """The same of pairs of windows with their true flow, (H, W, 2) px, NaN where there is none."""
     answers: dict[str, Answer] = {}
@@ -313,8 +312,8 @@ def of_pairs(
         for name in names:
             answers.setdefault(name, answer_of(name, *size))
         hit, truth = hit_pixels((pair.old, pair.new), *size), np.where(valid[..., None], flow, 0.0).astype(np.float64)
-        for name, said in (best_of(truth, valid) | {name: answer(pair) for name, answer in answers.items()}).items():
-            judged.setdefault(name, []).append((np.asarray(said, np.float64), truth, valid, hit))
+        for name, flow_of in (best_of(truth, valid) | {name: answer(pair) for name, answer in answers.items()}).items():
+            judged.setdefault(name, []).append((np.asarray(flow_of, np.float64), truth, valid, hit))
     if not judged:
         raise BlinkGLError("no labelled sample", where=where)
     return {name: row_of(rows) for name, rows in judged.items()}
@@ -354,7 +353,7 @@ def of_pans() -> Iterator[tuple[StreamWindow, np.ndarray]]:
             yield cut(events, int(events.t[-1]) - 1000 - span, span), flow
 
 
-def table(title: str, heads: list[str], rows: list[list[Any]]) -> str:
+def table(title: str, heads: list[str], rows: list[list[object]]) -> str:
     """Markdown."""
     cell = lambda v: f"{v:.3g}" if isinstance(v, float) and np.isfinite(v) else "–" if isinstance(v, float) else str(v)
     lines = ["| " + " | ".join([title, *heads]) + " |", "|" + "---|" * (len(heads) + 1)]
@@ -374,7 +373,7 @@ def main() -> None:
     a = parser.parse_args()
     if a.sets and not a.bursts:
         parser.error("--sets: needs --bursts")
-    console, found = plain_console(), {}
+    console, results = plain_console(), {}
     if a.bursts:
         known = {folder.name: burst(folder, a.answers) for folder in sorted((a.recordings / TEST).iterdir())}
         try:
@@ -383,12 +382,12 @@ def main() -> None:
         except BlinkGLError as error:
             parser.error(str(error))
         for title, rows in known.items():
-            found[title] = rows
+            results[title] = rows
             keys = [f"{what}_{where}" for where in ("events", "all") for what in ("aee", "of_zero", "cosine", "length")]
             heads = [key.replace("_", " ") for key in keys]
             say(console, table(title, heads, [[n, *(row[k] for k in keys)] for n, row in rows.items()]) + "\n")
         for folder in sorted((a.recordings / TEST).iterdir()) if a.changed else ():
-            rows = found[f"{folder.name}, changed"] = changed(folder, a.answers)
+            rows = results[f"{folder.name}, changed"] = changed(folder, a.answers)
             title = f"{folder.name}: AEE of zero flow's"
             say(console, table(title, list(rows[a.answers[0]]), [[n, *row.values()] for n, row in rows.items()]) + "\n")
     else:
@@ -397,22 +396,22 @@ def main() -> None:
             if name.startswith(TEST):
                 continue
             try:
-                found[name] = judged(path, a.answers, a.windows)
+                results[name] = judged(path, a.answers, a.windows)
             except BlinkGLError as error:
                 say(console, f"left out: {error}")
                 continue
-            it = found[name]
+            it = results[name]
             title = f"{name}, {it['size']}, {it['windows']} of {it['span_ms']:.1f} ms, affine {it['moves']:.2f}"
             keys = ["fwl", "cosine", "length", "x", "ms"]
             say(console, table(title, keys, [[n, *(row[k] for k in keys)] for n, row in it["rows"].items()]) + "\n")
-        moving = [it for it in found.values() if it["moves"] > MOVES]
+        moving = [it for it in results.values() if it["moves"] > MOVES]
         if not moving:
             raise SystemExit(f"nothing moves below {a.recordings}")
         over = lambda name, key: float(np.nanmedian([it["rows"][name][key] for it in moving]))
         rows = [[n, *(over(n, k) for k in ("fwl", "cosine", "length"))] for n in a.answers]
         say(console, table(f"all that move ({len(moving)})", ["fwl", "cosine", "length"], rows))
     if a.json:
-        a.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        a.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

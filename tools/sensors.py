@@ -23,9 +23,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -51,7 +50,7 @@ FIT, WHOLE = 1_000_000, 10**10
 NOISE_ELSEWHERE = {"leak_rate_hz": 0.0, "leak_jitter": 0.0, "leak_cov_decades": 0.0, "shot_noise_rate_hz": 0.0}
 MOST_K6 = {"davis240c": 3e-5, "davis346": 2e-5}
 """Of 0.0005 and 0.0002 OFF events a second in still pixels."""
-HELD: dict[str, dict[str, Any]] = {"esim": {"log_eps": 0.01}, "v2e": {"full_scale": 255.0}, "voltmeter": {"k2": 5.0}}
+HELD: dict[str, dict[str, float]] = {"esim": {"log_eps": 0.01}, "v2e": {"full_scale": 255.0}, "voltmeter": {"k2": 5.0}}
 HOT = ("hot_pixel_fraction", "hot_pixel_rate_hz")
 THRESHOLDS = {"contrast_threshold", "contrast_threshold_off", "k1"}
 KICK = 0.35
@@ -68,8 +67,8 @@ def slider(root: Path) -> MakeClip:
 def _clip(events: Path, frames: Path, declared: Declared = NOTHING) -> MakeClip:
     stream, size, _ = read_recording(events)
     timed, exposures = timed_frames(frames, declared)
-    given, reading = list(timed), FrameReading(exposures=exposures, name=frames.name)
-    return lambda most: clip_of_frames(stream, given, size, reading, most=most)
+    stamped, reading = list(timed), FrameReading(exposures=exposures, name=frames.name)
+    return lambda most: clip_of_frames(stream, stamped, size, reading, most=most)
 
 
 def evbench(events: Path, frames: Path, first_ms: float, gap_ms: float) -> MakeClip:
@@ -78,9 +77,9 @@ def evbench(events: Path, frames: Path, first_ms: float, gap_ms: float) -> MakeC
     at = lambda k: int(stream.t[0]) * 1000 + round((first_ms + gap_ms * k) * 1e6)
     images = [read_any_image(file) for file in sorted(frames.glob("*.png"))]
     grey = [image if image.ndim == 2 else image[..., 1] for image in images]
-    given = [(image[:height, :width], at(k), f"#{k}") for k, image in enumerate(grey)]
+    stamped = [(image[:height, :width], at(k), f"#{k}") for k, image in enumerate(grey)]
     reading = FrameReading(exposures=True, name=frames.name)
-    return lambda most: clip_of_frames(stream, given, (height, width), reading, most=most)
+    return lambda most: clip_of_frames(stream, stamped, (height, width), reading, most=most)
 
 
 def cameras(root: Path, more: Path | None) -> dict[str, dict[str, MakeClip]]:
@@ -118,11 +117,11 @@ def kick_of(clip: Clip, config: EmulatorConfig) -> float:
         return float(inside_any(events.t[~clip.still[events.y, events.x]], clip.bursts).sum())
 
     wanted, without = inside(clip.events), inside(clip.simulate(config, 1))
-    found = [inside(clip.simulate(config, 1, readout=resets(clip, kick))) for kick in KICKS]
-    return float(np.exp(np.interp(wanted, [without, *found], np.log([KICKS[0] / 4, *KICKS]))))
+    rates = [inside(clip.simulate(config, 1, readout=resets(clip, kick))) for kick in KICKS]
+    return float(np.exp(np.interp(wanted, [without, *rates], np.log([KICKS[0] / 4, *KICKS]))))
 
 
-def noise(camera: str, emulator: str) -> dict[str, Any]:
+def noise(camera: str, emulator: str) -> Mapping[str, object]:
     """The emulator's noise of single pixels, which is not fitted."""
     leak_hz = load_sensor(camera).leak_rate_hz
     assert leak_hz is not None
@@ -130,7 +129,7 @@ def noise(camera: str, emulator: str) -> dict[str, Any]:
     return {"v2e": NOISE_ELSEWHERE, "voltmeter": leak}.get(emulator, {})
 
 
-def fitted(clips: list[Clip], camera: str, emulator: str, dark: dict[str, Any]) -> dict[str, float]:
+def fitted(clips: list[Clip], camera: str, emulator: str, dark: dict[str, float]) -> dict[str, float]:
     """One set of values for all of the clips, whole: those that they tell, and where the search has left the others (a
     default of 0 as the smallest value that is tried, which is as good as none). dark : of the dark offset, held."""
     held = {**noise(camera, emulator), **dark}
@@ -149,13 +148,13 @@ def of_camera(clips: list[Clip], camera: str, emulator: str) -> dict[str, float]
     return fitted(clips, camera, emulator, {} if len(clips) > 1 else HELD[emulator])
 
 
-def of_units(middle: dict[str, float], each: list[dict[str, float]]) -> dict[str, Any]:
+def of_units(middle: dict[str, float], each: list[dict[str, float]]) -> dict[str, object]:
     """The values with thresholds spread as widely as those of the recordings are round the middle."""
-    found: dict[str, Any] = dict(middle)
+    spread: dict[str, object] = dict(middle)
     for key in THRESHOLDS & middle.keys():
         factor = max(max(one[key] / middle[key], middle[key] / one[key]) for one in each)
-        found[key] = {"log_uniform": [float(f"{end:.3g}") for end in (middle[key] / factor, middle[key] * factor)]}
-    return found
+        spread[key] = {"log_uniform": [float(f"{end:.3g}") for end in (middle[key] / factor, middle[key] * factor)]}
+    return spread
 
 
 def row(clip: Clip, config: EmulatorConfig, kick: float = 0.0) -> list[str]:
@@ -164,18 +163,18 @@ def row(clip: Clip, config: EmulatorConfig, kick: float = 0.0) -> list[str]:
     stream, recorded = clip.simulate(config, 1, readout=readout), sums(clip.events, clip, 0, clip.intervals)
     half = judge_half(recorded, sums(stream, clip, 0, clip.intervals, recorded))
     try:
-        told = judge(clip.events, stream, clip.size, (int(clip.edges_us[0]), int(clip.edges_us[-1]))).auc
+        auc = judge(clip.events, stream, clip.size, (int(clip.edges_us[0]), int(clip.edges_us[-1]))).auc
     except BlinkGLError:
-        told = float("nan")
+        auc = float("nan")
     rate = len(stream) / max(len(clip.events), 1)
-    values = (rate, half.interval_distance, half.polarity_correlation, half.count_correlation, told)
+    values = (rate, half.interval_distance, half.polarity_correlation, half.count_correlation, auc)
     return [f"{value:.2f}" for value in values]
 
 
-def lines(found: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterator[str]:
+def lines(recorded: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterator[str]:
     heads = ["judged by", "fitted to", "rate", "intervals, KS", "polarity", "counts", "judge"]
     rows: list[list[str]] = []
-    for (camera, recordings), emulator in itertools.product(found.items(), emulators):
+    for (camera, recordings), emulator in itertools.product(recorded.items(), emulators):
         small, whole = ({name: make(most) for name, make in recordings.items()} for most in (FIT, WHOLE))
         middle = of_camera(list(small.values()), camera, emulator)
         dark = {key: middle[key] for key in HELD[emulator]}
@@ -183,11 +182,11 @@ def lines(found: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterat
         yield to_short_yaml({camera: {emulator: of_units(middle, each)}})
         for name, clip in whole.items():
             others = of_camera([one for other, one in small.items() if other != name], camera, emulator)
-            for said, values in (("the others", others), ("all", middle)):
+            for which, values in (("the others", others), ("all", middle)):
                 config = emulator_config({"emulator": emulator, **noise(camera, emulator), **values})
-                kick = kick_of(clip, config) if len(clip.bursts) and said == "all" else KICK
-                rows.append([f"{camera}, {emulator}", name, said, *row(clip, config, kick)])
-                if len(clip.bursts) and said == "all":
+                kick = kick_of(clip, config) if len(clip.bursts) and which == "all" else KICK
+                rows.append([f"{camera}, {emulator}", name, which, *row(clip, config, kick)])
+                if len(clip.bursts) and which == "all":
                     readout = resets(clip, kick)
                     assert readout is not None and readout.frame_resets is not None
                     every = readout.frame_resets.interval_ms
@@ -195,12 +194,12 @@ def lines(found: dict[str, dict[str, MakeClip]], emulators: list[str]) -> Iterat
     yield table("camera, emulator", heads, rows)
 
 
-def picture(found: dict[str, dict[str, MakeClip]], emulators: list[str], path: Path) -> None:
+def picture(recorded: dict[str, dict[str, MakeClip]], emulators: list[str], path: Path) -> None:
     """Events of one recording a camera beside those of its shipped file: ON blue, OFF red, 25 ms in the middle."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 1 + len(emulators), figsize=(12.5, 5.4), squeeze=False)
-    for row_of, (camera, recordings) in zip(axes, found.items()):
+    for row_of, (camera, recordings) in zip(axes, recorded.items()):
         name, make = next(iter(recordings.items()))
         clip, sensor = make(WHOLE), load_sensor(camera)
         middle_us = int(clip.edges_us[0] + clip.edges_us[-1]) // 2
@@ -229,12 +228,12 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="no fits: draw events recorded and simulated, as PNG")
     a = parser.parse_args()
     np.seterr(divide="ignore")
-    found = cameras(a.recordings, a.evbench)
-    found = {name: one for name, one in found.items() if not a.camera or name in a.camera}
+    recorded = cameras(a.recordings, a.evbench)
+    recorded = {name: one for name, one in recorded.items() if not a.camera or name in a.camera}
     if a.picture is not None:
-        picture(found, a.emulator or list(EmulatorConfig.members), a.picture)
+        picture(recorded, a.emulator or list(EmulatorConfig.members), a.picture)
         return
-    for line in lines(found, a.emulator or list(EmulatorConfig.members)):
+    for line in lines(recorded, a.emulator or list(EmulatorConfig.members)):
         say(plain_console(), line)
 
 

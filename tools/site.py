@@ -209,7 +209,7 @@ def problems(site: Path) -> list[str]:
         for path in sorted(site.rglob("*.html"))
     }
     pages.pop(ERROR_PAGE, None)
-    found, led_to = [], {name: set() for name in pages}
+    dead, led_to = [], {name: set() for name in pages}
     files = {path.relative_to(site).as_posix() for path in site.rglob("*") if path.is_file()}
     for name, page in pages.items():
         for link in [*page.links, *page.loads]:
@@ -218,21 +218,21 @@ def problems(site: Path) -> list[str]:
                 continue
             if parts.scheme or parts.netloc:
                 if link in page.loads:
-                    found.append(f"{name}: loads {link}")
+                    dead.append(f"{name}: loads {link}")
                 continue
             inside = posixpath.normpath(posixpath.join(posixpath.dirname(name), unquote(parts.path)))
             if not parts.path:
                 inside = name
             if inside.startswith(("..", "/")):
-                found.append(f"{name}: {link} leads out of the site")
+                dead.append(f"{name}: {link} leads out of the site")
             elif inside not in files:
-                found.append(f"{name}: {link} leads nowhere")
+                dead.append(f"{name}: {link} leads nowhere")
             elif inside in pages:
                 led_to[name].add(inside)
                 if parts.fragment and unquote(parts.fragment) not in pages[inside].anchors:
-                    found.append(f"{name}: {link} leads to no such place on the page")
+                    dead.append(f"{name}: {link} leads to no such place on the page")
     for style in sorted(site.rglob("*.css")):
-        found += [
+        dead += [
             f"{style.relative_to(site).as_posix()}: loads {url}"
             for url in re.findall(r"url\([\"']?((?:https?:)?//[^)\"']+)", style.read_text(encoding="utf-8"))
         ]
@@ -242,9 +242,7 @@ def problems(site: Path) -> list[str]:
         if name in led_to and name not in seen:
             seen.add(name)
             ahead += led_to[name]
-    return found + [
-        f"{name}: no link leads here" for name, page in pages.items() if name not in seen and not page.moved
-    ]
+    return dead + [f"{name}: no link leads here" for name, page in pages.items() if name not in seen and not page.moved]
 
 
 def markdown_problems(path: Path) -> list[str]:
@@ -266,9 +264,9 @@ def main() -> int:
     except BuildError as error:
         print(error, file=sys.stderr)
         return 1
-    found = [*problems(out), *markdown_problems(Path("README.md"))]
-    print("\n".join(found) or f"{sum(1 for _ in out.rglob('*.html'))} pages, no dead link: {out / 'index.html'}")
-    return bool(found)
+    dead = [*problems(out), *markdown_problems(Path("README.md"))]
+    print("\n".join(dead) or f"{sum(1 for _ in out.rglob('*.html'))} pages, no dead link: {out / 'index.html'}")
+    return bool(dead)
 
 
 if __name__ == "__main__":

@@ -17,10 +17,12 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.types.recent import Recent
 from eflow.config import AugmentConfig
-from eflow.data.representation import Representation
+from eflow.data.representation import Representation, grids_of
 from eflow.data.sources import Source
-from eflow.data.window import RawSample
+from eflow.data.window import SIDES, RawSample
+from eflow.types import Flow, Mask
 
 if TYPE_CHECKING:
     from blinkgl.online.stream import StreamStats
@@ -65,30 +67,28 @@ class Mixture:
         for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
             counts[i] += 1  # largest remainders: the counts add up to the total
         self.counts = [int(c) for c in counts]
-        self._cache: tuple[int, list[Key]] = (-1, [])
-        self._last: tuple[tuple[int, int], np.ndarray] = ((-1, -1), np.empty(0, np.int64))
+        self._epochs: Recent[int, list[Key]] = Recent(1)
+        self._orders: Recent[tuple[int, int], list[int]] = Recent(1)
 
     def epoch(self, epoch: int) -> list[Key]:
         """Return the samples of one epoch, in order."""
-        if self._cache[0] != epoch:
-            picks = []
-            for source, (size, count) in enumerate(zip(self.sizes, self.counts, strict=True)):
-                for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
-                    pass_, place = divmod(n, size)
-                    picks.append((source, n if self.endless[source] else int(self._order(source, pass_)[place])))
-            # First numbers of spawn keys: 0 for the mixture, 1 for passes over a source, 2 for the augmentation of a
-            # draw.
-            order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(
-                len(picks)
-            )
-            picks = [picks[i] for i in order]
-            # Endless sources give their samples in order, so their places in the mixture take them by number.
-            for source in np.flatnonzero(self.endless):
-                places = [i for i, (picked, _) in enumerate(picks) if picked == source]
-                for i, n in zip(places, sorted(picks[i][1] for i in places), strict=True):
-                    picks[i] = (int(source), n)
-            self._cache = (epoch, [Key(epoch, position, *pick) for position, pick in enumerate(picks)])
-        return self._cache[1]
+        return self._epochs.of(epoch, lambda: self._drawn(epoch))
+
+    def _drawn(self, epoch: int) -> list[Key]:
+        picks = []
+        for source, (size, count) in enumerate(zip(self.sizes, self.counts, strict=True)):
+            for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
+                pass_, place = divmod(n, size)
+                picks.append((source, n if self.endless[source] else self._order(source, pass_)[place]))
+        # First numbers of spawn keys: 0 for the mixture, 1 for passes over a source, 2 for the augmentation of a draw.
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch)))
+        picks = [picks[i] for i in rng.permutation(len(picks))]
+        # Endless sources give their samples in order, so their places in the mixture take them by number.
+        for source in np.flatnonzero(self.endless):
+            places = [i for i, (picked, _) in enumerate(picks) if picked == source]
+            for i, n in zip(places, sorted(picks[i][1] for i in places), strict=True):
+                picks[i] = (int(source), n)
+        return [Key(epoch, position, *pick) for position, pick in enumerate(picks)]
 
     def first(self, source: int, n: int, rank: int = 0, world: int = 1) -> int:
         """Return the number of the next sample of an endless ``source`` after n samples of the run.
@@ -109,12 +109,10 @@ class Mixture:
         epoch, position = divmod(n, self.epoch_length)
         return self.epoch(epoch)[position]
 
-    def _order(self, source: int, pass_: int) -> np.ndarray:
+    def _order(self, source: int, pass_: int) -> list[int]:
         """Return the order of the samples of a source in one pass over it."""
-        if self._last[0] != (source, pass_):
-            rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(1, source, pass_)))
-            self._last = ((source, pass_), rng.permutation(self.sizes[source]))
-        return self._last[1]
+        rng = lambda: np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(1, source, pass_)))
+        return self._orders.of((source, pass_), lambda: rng().permutation(self.sizes[source]).tolist())
 
 
 class FlowDataset(Dataset):
@@ -124,11 +122,10 @@ class FlowDataset(Dataset):
     A sample is a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400),
     mask (H, W) bool, name, scene. Without ground truth it has no flow, valid and mask.
 
-    raw : also return the RawSample, as "raw".
     reads : windows to convert to tensors (:attr:`eflow.models.FlowModel.reads`).
     empty : "error" raises for a sample with an empty window among these. "skip" leaves out samples of which either
     window is empty, whichever are read, so that all networks are scored on the same ones: ``dataset[i]`` is None then,
-    and training takes the next sample. The option that says so is called ``option`` in messages.
+    and training takes the next sample.
 
     Training takes the next sample for one without a valid pixel, too.
     """
@@ -142,13 +139,10 @@ class FlowDataset(Dataset):
         augment: AugmentConfig | None = None,
         crop: tuple[int, int] | None = None,
         empty: str = "error",
-        raw: bool = False,
-        reads: tuple[str, ...] = ("old", "new"),
-        option: str = "data.empty=skip",
+        reads: tuple[str, ...] = SIDES,
     ):
-        self.sources, self.representation, self.seed, self.raw = sources, representation, seed, raw
-        self.reads, self.option = reads, option
-        self.augment, self.crop, self.empty = augment, crop, empty
+        self.sources, self.representation, self.seed = sources, representation, seed
+        self.reads, self.augment, self.crop, self.empty = reads, augment, crop, empty
         self._starts = np.cumsum([0, *(0 if is_endless(s) else len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
             raise ConfigError(
@@ -197,7 +191,7 @@ class FlowDataset(Dataset):
 
     def _with_events(self, sample: RawSample) -> RawSample | None:
         """Return the sample, or None if it is to be left out."""
-        sides = ("old", "new") if self.empty == "skip" else self.reads
+        sides = SIDES if self.empty == "skip" else self.reads
         side = next((side for side in sides if not len(getattr(sample, side))), None)
         if side is None or self.empty == "skip":
             return sample if side is None else None
@@ -205,31 +199,35 @@ class FlowDataset(Dataset):
         raise EventDataError(
             f"no events in the {side} window [{window.t0}, {window.t1}) µs",
             where=sample.name,
-            accepted=f"use {self.option} to leave such samples out",
+            accepted="use data.empty=skip to leave such samples out",
         )
 
     def _tensors(self, s: RawSample, rng: np.random.Generator | None) -> dict:
-        try:
-            grids = {k: self.representation(getattr(s, k), s.height, s.width) for k in self.reads}
-        except EventDataError as error:
-            raise EventDataError(error.problem, where=f"{s.name}: {error.where}") from None
-        out = {k: torch.from_numpy(g) for k, g in grids.items()}
-        if s.flow is not None and s.valid is not None:
-            if not np.isfinite(s.flow[s.valid]).all():
-                raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
-            out["flow"] = torch.from_numpy(np.ascontiguousarray(s.flow.transpose(2, 0, 1), dtype=np.float32))
-            with np.errstate(over="ignore", invalid="ignore"):  # invalid pixels may have any value
-                moves = np.square(s.flow[..., 0]) + np.square(s.flow[..., 1])  # torch would use all threads
-            out["valid"] = torch.from_numpy(s.valid & (moves < MAX_FLOW**2))
-            out["mask"] = (
-                torch.from_numpy(np.ascontiguousarray(s.mask)) if s.mask is not None else torch.ones_like(out["valid"])
-            )
+        grids = grids_of(self.representation, s, self.reads, (s.height, s.width))
+        out = {k: torch.from_numpy(grid) for k, grid in grids.items()}
+        if (truth := truth_of(s)) is not None:
+            flow, valid, mask = truth
+            out["flow"] = torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))
+            out["valid"], out["mask"] = torch.from_numpy(valid), torch.from_numpy(np.ascontiguousarray(mask))
         if rng is not None:
             if self.augment is not None and rng.random() < self.augment.scale_probability:
                 out = scaled(out, float(np.exp2(rng.uniform(*self.augment.scale))), least=self.crop)
             if self.crop is not None:
                 out = cropped(out, self.crop, rng, s.name)
-        return {**out, "name": s.name, "scene": s.scene} | ({"raw": s} if self.raw else {})
+        return {**out, "name": s.name, "scene": s.scene}
+
+
+def truth_of(s: RawSample) -> tuple[Flow, Mask, Mask] | None:
+    """Return the ground truth of a sample, where it is valid and shorter than :data:`MAX_FLOW`, and the pixels to
+    evaluate; None: it has none. Raises EventDataError: a valid pixel is not finite."""
+    if s.flow is None or s.valid is None:
+        return None
+    if not np.isfinite(s.flow[s.valid]).all():
+        raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid pixels may have any value
+        moves = np.square(s.flow[..., 0]) + np.square(s.flow[..., 1])  # torch would use all threads
+    valid = s.valid & (moves < MAX_FLOW**2)
+    return s.flow.astype(np.float32, copy=False), valid, np.ones_like(valid) if s.mask is None else s.mask
 
 
 def evenly(of: int, count: int) -> list[int]:
@@ -285,7 +283,7 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
-    out = {**sample, **{k: resize(sample[k]) for k in ("old", "new") if k in sample}}
+    out = {**sample, **{k: resize(sample[k]) for k in SIDES if k in sample}}
     if "flow" in sample:
         # Sizes are whole, so the factor of an axis is a little off the one that was drawn.
         ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]

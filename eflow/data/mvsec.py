@@ -19,8 +19,10 @@ from blinkgl.io.hdf5 import Data, Hdf5File, dataset, open_hdf5
 from blinkgl.io.images import npy_header, numpy_errors
 from blinkgl.io.mvsec import event_table, events_of_rows
 from blinkgl.io.sizes import check_claim
+from blinkgl.types.recent import Recent
 from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
+from eflow.types import Flow, Mask, Numbers, Times
 
 HEIGHT, WIDTH = 260, 346
 CROP = 256
@@ -82,8 +84,8 @@ class NpzRows:
     def shape(self, name: str) -> tuple[int, ...]:
         return self._layout[name][0]
 
-    def read(self, name: str, row: int | None = None) -> np.ndarray:
-        """Return one row, or the whole array."""
+    def read(self, name: str, row: int | None = None) -> Numbers:
+        """Return one row, or the whole array, of the dtype in the file."""
         shape, dtype, start = self._layout[name]
         shape = shape if row is None else shape[1:]
         count = math.prod(shape)
@@ -101,10 +103,10 @@ class MvsecSource:
     Times: µs since the sequence's first image.
 
     protocol : of :data:`PROTOCOLS`; at "flow" the windows of a sample are between time stamps i - 1, i, i + 1 of the
-    flow.   truth : of :data:`TRUTHS`; None: that of the protocol.   frames : ranges [first, end) of images or flow
-    fields to score, in place of the protocol's.   dense : score pixels without events, too.
+    flow.   frames : ranges [first, end) of images or flow fields to score, in place of the protocol's.   dense : score
+    pixels without events, too.
     Raises AssetError: no sequence, or one without the frames that the protocol scores. EventDataError: bad dt.
-    ConfigError: unknown protocol or truth."""
+    ConfigError: unknown protocol."""
 
     has_backward = False
 
@@ -113,42 +115,39 @@ class MvsecSource:
         root: Path,
         dt: int = 1,
         protocol: str = "all",
-        truth: str | None = None,
         frames: Sequence[tuple[int, int]] = (),
         dense: bool = False,
     ):
         if dt not in (1, 4):
             raise EventDataError("MVSEC interval", where="dt", value=dt, accepted="1 or 4")
-        for name, value, known in (("protocol", protocol, PROTOCOLS), ("truth", truth or TRUTHS[0], TRUTHS)):
-            if value not in known:
-                raise ConfigError("unknown choice", where=name, value=value, accepted=", ".join(known))
+        if protocol not in PROTOCOLS:
+            raise ConfigError("unknown choice", where="protocol", value=protocol, accepted=", ".join(PROTOCOLS))
         self.protocol = PROTOCOLS[protocol]
         if self.protocol.at == "flow" and dt != 1:
             raise ConfigError(f"{protocol} has samples at 20 Hz", where="dt", value=dt, accepted="1")
         files = [root] if root.is_file() else sorted(below(root, "*_data.hdf5"))
         if not files:
             raise AssetError("no *_data.hdf5", where=str(root))
-        self.dt, self.truth, self._index, self._sequences = dt, truth or self.protocol.truth, [], []
-        self.dense = dense
+        self.dt, self.dense, self._index = dt, dense, []
         for path in files:
-            self._sequences.append(s := _MvsecSequence(path))
+            s = _MvsecSequence(path)
             stamps = self._stamps(s)
             # Flow must cover [stamp i, stamp i + dt], and events [stamp i - dt, stamp i].
             i0, i1 = np.searchsorted(stamps, (s.flow_us[0], s.flow_us[-1]))
             end = i1 + 1 if self.protocol.at == "flow" else i1  # the last stamp is the end of a sample
-            found = range(max(int(i0), dt), min(int(end), len(stamps)) - dt)
+            all_frames = range(max(int(i0), dt), min(int(end), len(stamps)) - dt)
             ranges = tuple(frames) or self.protocol.frames.get(s.name)
-            scored = [i for i in found if ranges is None or any(a <= i < b for a, b in ranges)]
+            scored = [i for i in all_frames if ranges is None or any(a <= i < b for a, b in ranges)]
             if not scored and ranges is not None:
                 raise AssetError(
                     f"has no frame that {'--frames' if frames else protocol} scores",
                     where=str(path),
-                    value=f"{found.start} to {found.stop - 1}",
+                    value=f"{all_frames.start} to {all_frames.stop - 1}",
                     accepted=" and ".join(f"{a} to {b - 1}" for a, b in ranges),
                 )
             self._index += [(s, i) for i in scored]
 
-    def _stamps(self, s: _MvsecSequence) -> np.ndarray:
+    def _stamps(self, s: _MvsecSequence) -> Times:
         return s.image_us if self.protocol.at == "images" else s.flow_us
 
     def __len__(self) -> int:
@@ -158,7 +157,7 @@ class MvsecSource:
         s, i = self._index[index]
         t_old, t, t_new = (int(self._stamps(s)[j]) for j in (i - self.dt, i, i + self.dt))
         old, new = s.window(t_old, t), s.window(t, t_new)
-        flow, valid = s.flow_between(t, t_new, self.truth)
+        flow, valid = s.flow_between(t, t_new, self.protocol.truth)
         mask = np.full((HEIGHT, WIDTH), self.dense)
         mask[new.y, new.x] = True
         inside = np.zeros_like(mask)
@@ -200,7 +199,7 @@ class _MvsecSequence:
         self._file: Hdf5File | None = None
         self._pid: int | None = None
         self._table: Data | None = None
-        self._rows: dict[int, np.ndarray] = {}
+        self._rows: Recent[int, Flow] = Recent(9)
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_file": None, "_pid": None, "_table": None}
@@ -226,7 +225,7 @@ class _MvsecSequence:
         check_events(events, str(self.path), i, height=HEIGHT, width=WIDTH)
         return Window.of(events, t0, t1)
 
-    def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[np.ndarray, np.ndarray]:
+    def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[Flow, Mask]:
         """Return flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`. truth : of
         :data:`TRUTHS`."""
         k = int(np.clip(np.searchsorted(self.flow_us, t0, side="right") - 1, 0, len(self.flow_us) - 2))
@@ -240,17 +239,14 @@ class _MvsecSequence:
             k += 1
         return propagate(pieces)
 
-    def _field(self, k: int) -> np.ndarray:
-        if k not in self._rows:
-            while len(self._rows) > 8:
-                self._rows.pop(next(iter(self._rows)))
-            self._rows[k] = np.stack(
-                [self._flow.read(n, k).astype(np.float32) for n in ("x_flow_dist", "y_flow_dist")], axis=-1
-            )
-        return self._rows[k]
+    def _field(self, k: int) -> Flow:
+        parts = ("x_flow_dist", "y_flow_dist")
+        return self._rows.of(
+            k, lambda: np.stack([self._flow.read(name, k).astype(np.float32) for name in parts], axis=-1)
+        )
 
 
-def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
+def _stamps(seconds: Numbers, where: str) -> Times:
     """Return times as int64 µs. Raises AssetError: not a list of increasing times."""
     if seconds.ndim != 1 or len(seconds) < 2:
         raise AssetError("not a list of times", where=where, value=seconds.shape, accepted="(N,) with N >= 2")
@@ -264,7 +260,7 @@ def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
     return t
 
 
-def propagate(pieces: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
+def propagate(pieces: list[tuple[Flow, float]]) -> tuple[Flow, Mask]:
     """Return the displacement of every pixel through successive flow fields, each over a fraction of its interval.
 
     pieces : (flow (H, W, 2) px over the whole interval of the field, fraction in (0, 1]); (0, 0) is invalid. A field is

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
@@ -52,7 +52,7 @@ class PoolSource:
     def __init__(self, root: Path):
         self.root = root
         about = _about(root)
-        self.count, self.has_backward = about["samples"], about["backward"]
+        self.count, self.has_backward = about.samples, about.backward
         there = sum(1 for _ in root.glob("[!.]*.npz"))
         if there != self.count:
             raise AssetError(
@@ -87,10 +87,10 @@ class PoolSource:
             return raw_sample(sample)
 
 
-def _about(root: Path) -> dict[str, Any]:
+def _about(root: Path) -> _About:
     path = root / ABOUT
     try:
-        return parse(read_text(path), _MODEL)
+        return _About(**parse(read_text(path), _MODEL))
     except (FileNotFoundError, ValueError) as error:
         raise AssetError(
             f"not the description of a folder of windows: {error}",
@@ -104,7 +104,7 @@ def render_pool(
     count: int,
     out: str | os.PathLike,
     *,
-    about: dict[str, Any] | None = None,
+    about: Mapping[str, object] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> int:
     """Write the first ``count`` samples of an online source to the new folder ``out``; return their number.

@@ -3,14 +3,16 @@ called as ``representation(window, height, width)``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from blinkgl.errors import EventDataError
-from eflow.data.window import Window
+from eflow.data.window import RawSample, StreamWindow, Window
 from eflow.ops import voxel
+from eflow.types import Grid
 
 
 class Representation(Protocol):
@@ -19,9 +21,22 @@ class Representation(Protocol):
     @property
     def channels(self) -> int: ...
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         """Return (channels, height, width) float32. Raises EventDataError: events outside the window or the sensor."""
         ...
+
+
+def grids_of(
+    representation: Representation, pair: StreamWindow | RawSample, reads: Iterable[str], size: tuple[int, int]
+) -> dict[str, Grid]:
+    """Return the tensors of the windows of a pair that are in ``reads``, by name.
+
+    size : (height, width) of the sensor, px. Raises EventDataError: events outside the window or the sensor."""
+    try:
+        return {name: representation(getattr(pair, name), *size) for name in reads}
+    except EventDataError as error:
+        where = f"{pair.name}: {error.where}" if pair.name else error.where
+        raise EventDataError(error.problem, where=where) from None
 
 
 @dataclass(frozen=True)
@@ -38,24 +53,12 @@ class VoxelGrid:
     def channels(self) -> int:
         return self.bins
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         t0, t1 = window.t0, window.t1
         if self.bounds == "events" and len(window):
             t0, t1 = int(window.t[0]), int(window.t[-1])
-        return _guarded(
-            voxel.voxel_grid,
-            window,
-            window.x,
-            window.y,
-            window.t,
-            window.p,
-            t0,
-            t1,
-            self.bins,
-            height,
-            width,
-            normalise=self.normalise,
-        )
+        w = window
+        return voxel.voxel_grid(w.x, w.y, w.t, w.p, t0, t1, self.bins, height, width, normalise=self.normalise)
 
 
 @dataclass(frozen=True)
@@ -68,9 +71,9 @@ class CountSlices:
     def channels(self) -> int:
         return 2 * self.slices
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         w = _on_pixels(window, height, width)
-        counts = _guarded(voxel.count_slices, w, w.x, w.y, w.t, w.p, w.t0, w.t1, self.slices, height, width)
+        counts = voxel.count_slices(w.x, w.y, w.t, w.p, w.t0, w.t1, self.slices, height, width)
         return counts.reshape(-1, height, width)
 
 
@@ -80,9 +83,9 @@ class CountsAndTimes:
 
     channels: int = 4
 
-    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, window: Window, height: int, width: int) -> Grid:
         w = _on_pixels(window, height, width)
-        return _guarded(voxel.counts_and_times, w, w.x, w.y, w.t, w.p, w.t0, w.t1, height, width)
+        return voxel.counts_and_times(w.x, w.y, w.t, w.p, w.t0, w.t1, height, width)
 
 
 def _on_pixels(window: Window, height: int, width: int) -> Window:
@@ -94,10 +97,3 @@ def _on_pixels(window: Window, height: int, width: int) -> Window:
     return Window(
         x[keep].astype(np.uint16), y[keep].astype(np.uint16), window.t[keep], window.p[keep], window.t0, window.t1
     )
-
-
-def _guarded(function, window: Window, *args, **kw) -> np.ndarray:
-    try:
-        return function(*args, **kw)
-    except ValueError as error:
-        raise EventDataError(str(error), where=f"window [{window.t0}, {window.t1}) µs") from None

@@ -19,7 +19,7 @@ from collections import OrderedDict
 from collections.abc import Sized
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -32,16 +32,17 @@ from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
+from blinkgl.types.recent import Recent
 from eflow.data.folders import below
 from eflow.data.mvsec import MvsecSource
 from eflow.data.pool import ABOUT, PoolSource
 from eflow.data.window import RawSample, Window
+from eflow.types import Flow, Mask, Numbers
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Layouts of data sets.
 
 
-FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow", "windows")
 _OPEN_FILES = 16
 
 
@@ -86,7 +87,7 @@ class FolderSource:
         self._index = [(s, e) for s in sequences for e in s.entries]
         self.has_backward = bool(self._index) and all(e.backward is not None for _, e in self._index)
         self._readers: OrderedDict[Path, DsecEventReader] = OrderedDict()
-        self._maps: dict[Path, np.ndarray] = {}
+        self._maps: Recent[Path, Numbers] = Recent(len(sequences))
         self._pid = os.getpid()
 
     def __getstate__(self) -> dict:
@@ -103,7 +104,9 @@ class FolderSource:
         if entry.backward is not None:
             backward, backward_valid = read_flow(entry.backward)
         reader = self._reader(sequence.events)
-        rectify = self._map(sequence.rectify_map) if sequence.rectify_map else None
+        rectify = (
+            None if (path := sequence.rectify_map) is None else self._maps.of(path, lambda: read_rectify_map(path))
+        )
         height, width = self._size(sequence, reader, flow, rectify)
         span = entry.to_us - entry.from_us
         return RawSample(
@@ -133,19 +136,8 @@ class FolderSource:
         self._readers.move_to_end(path)
         return self._readers[path]
 
-    def _map(self, path: Path) -> np.ndarray:
-        if path not in self._maps:
-            with open_hdf5(path) as file:
-                rectify_map = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(
-                    np.float32
-                )
-            if not np.isfinite(rectify_map).all():
-                raise AssetError("rectification map with NaN or infinity", where=str(path))
-            self._maps[path] = rectify_map
-        return self._maps[path]
-
     @staticmethod
-    def _window(reader: DsecEventReader, t0: int, t1: int, rectify: np.ndarray | None) -> Window:
+    def _window(reader: DsecEventReader, t0: int, t1: int, rectify: Numbers | None) -> Window:
         e = reader.slice(t0, t1)
         if rectify is None:
             return Window(e.x, e.y, e.t, e.p, t0, t1)
@@ -160,7 +152,9 @@ class FolderSource:
         return Window(np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1]), e.t, e.p, t0, t1)
 
     @staticmethod
-    def _size(sequence: Sequence, reader: DsecEventReader, flow, rectify) -> tuple[int, int]:
+    def _size(
+        sequence: Sequence, reader: DsecEventReader, flow: Flow | None, rectify: Numbers | None
+    ) -> tuple[int, int]:
         sizes = {
             (int(s[0]), int(s[1]))
             for s in (
@@ -177,7 +171,16 @@ class FolderSource:
         return sizes.pop() if sizes else (480, 640)  # the sensor of DSEC and BlinkFlow, whose files do not store it
 
 
-def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_rectify_map(path: Path) -> Numbers:
+    """Return the rectified (x, y) of each pixel, (H, W, 2) float32 px. Raises AssetError."""
+    with open_hdf5(path) as file:
+        table = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(np.float32)
+    if not np.isfinite(table).all():
+        raise AssetError("rectification map with NaN or infinity", where=str(path))
+    return table
+
+
+def read_flow(path: Path) -> tuple[Flow, Mask]:
     """Return flow (H, W, 2) float32 px and valid (H, W) bool of a DSEC PNG or a BlinkFlow .npy (u, v, validity).
 
     Raises AssetError: missing, corrupt, wrong shape, or NaN / infinity in a valid pixel."""
@@ -198,7 +201,7 @@ def find_blinkgl(root: Path) -> list[Sequence]:
     """Return the sequence directories of ``index.jsonl`` in ``root``, or else all at or below ``root``.
 
     Sequences without forward flow are skipped. Flow is read from the 16-bit PNG (quantum 1/128 px)."""
-    found = []
+    sequences = []
     indexed = (root / INDEX).is_file()
     folders = (
         [root if line["path"] == "." else inside(root, line["path"]) for line in read_index(root)]
@@ -210,8 +213,8 @@ def find_blinkgl(root: Path) -> list[Sequence]:
             continue
         name = folder.relative_to(root).as_posix()
         if (sequence := blinkgl_sequence(folder, folder.name if name == "." else name)) is not None:
-            found.append(sequence)
-    return found
+            sequences.append(sequence)
+    return sequences
 
 
 def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
@@ -239,7 +242,7 @@ def find_dsec(root: Path) -> list[Sequence]:
 
     Events and flow are in one tree, or in the folders of the archives, ``train_events`` and ``train_optical_flow``.
     The times of a test sequence are in ``test_forward_flow_timestamps.csv`` or ``<sequence>.csv``."""
-    found = []
+    sequences = []
     for events in sorted(below(root, "events.h5")):
         if events.parent.name not in ("left", "events_left") or "forward_flow" in {
             p.name for p in events.parent.parent.iterdir()
@@ -275,8 +278,8 @@ def find_dsec(root: Path) -> list[Sequence]:
             continue
         if not rectify.is_file():
             raise AssetError("no rectification map beside the events", where=str(rectify))
-        found.append(Sequence(folder.name, folder.name, events, entries, rectify))
-    return found
+        sequences.append(Sequence(folder.name, folder.name, events, entries, rectify))
+    return sequences
 
 
 def find_blinkflow(root: Path) -> list[Sequence]:
@@ -284,7 +287,7 @@ def find_blinkflow(root: Path) -> list[Sequence]:
     ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``.
 
     Label 0 is skipped, since it has no events before it."""
-    found = []
+    sequences = []
     for folder in sorted(p.parent for p in below(root, "forward_flow") if p.is_dir()):
         fps = _fps(folder / "config.yaml")
         files, backward = (numbered(folder / name, "npy") for name in ("forward_flow", "backward_flow"))
@@ -294,22 +297,24 @@ def find_blinkflow(root: Path) -> list[Sequence]:
         entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in files.items() if i > 0)
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
         name = "/".join(parts[-2:])
-        found.append(Sequence(name, parts[-2] if len(parts) > 1 else name, folder / "events_left/events.h5", entries))
-    return found
+        sequences.append(
+            Sequence(name, parts[-2] if len(parts) > 1 else name, folder / "events_left/events.h5", entries)
+        )
+    return sequences
 
 
 def numbered(folder: Path, ending: str) -> dict[int, Path]:
     """Return the files of a folder by their numbers, in order; none without the folder. Hidden files, such as those
     that some systems write beside each file (``._000001.png``), are no labels. Raises AssetError: a name without a
     number, or a number twice."""
-    found: dict[int, Path] = {}
+    files: dict[int, Path] = {}
     for path in sorted(folder.glob(f"[!.]*.{ending}")):
-        if not re.fullmatch("[0-9]{1,9}", path.stem) or int(path.stem) in found:
+        if not re.fullmatch("[0-9]{1,9}", path.stem) or int(path.stem) in files:
             raise AssetError(
                 "not the number of a label", where=str(path), value=path.stem, accepted=f"000000.{ending}, each once"
             )
-        found[int(path.stem)] = path
-    return dict(sorted(found.items()))
+        files[int(path.stem)] = path
+    return dict(sorted(files.items()))
 
 
 def _fps(path: Path) -> float:
@@ -384,25 +389,32 @@ def detect_format(root: Path) -> str:
     )
 
 
-def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1, **mvsec: Any) -> Source:
+def open_source(
+    path: str | os.PathLike,
+    format: str = "auto",
+    *,
+    dt: int = 1,
+    protocol: str = "all",
+    frames: tuple[tuple[int, int], ...] = (),
+    dense: bool = False,
+) -> Source:
     """Open the data set at ``path``.
 
-    dt, and ``protocol``, ``truth``, ``frames``, ``dense`` : for MVSEC, see :class:`~eflow.data.mvsec.MvsecSource`.
-    Raises ConfigError: one of these for another data set. AssetError: no data set, or a damaged index. Files of
-    single samples are opened when they are read."""
+    dt, protocol, frames, dense : for MVSEC, see :class:`~eflow.data.mvsec.MvsecSource`.
+    Raises ConfigError: one of the last three for another data set. AssetError: no data set, or a damaged index. Files
+    of single samples are opened when they are read."""
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
-        return MvsecSource(root, dt, **mvsec)
-    for name, value in mvsec.items():
-        if value not in ("all", None, (), False):
+        return MvsecSource(root, dt, protocol, frames, dense)
+    for name, value, default in (("protocol", protocol, "all"), ("frames", frames, ()), ("dense", dense, False)):
+        if value != default:
             raise ConfigError("only for MVSEC", where=name, value=value, accepted="a data set in the layout of MVSEC")
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
     if kind == "windows":
         return PoolSource(root)
-    sequences = {"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[kind](root)
-    source = FolderSource(sequences)
+    source = FolderSource({"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[kind](root))
     if not len(source):
         raise AssetError(f"no {kind} sequence with flow labels", where=str(root))
     return source

@@ -13,6 +13,10 @@ import numpy as np
 
 from blinkgl.online.samples import WindowSample
 from blinkgl.types.events import Events
+from eflow.types import Flow, Mask
+
+SIDES = ("old", "new")
+"""The windows of a pair: the events before the reference time, and those after it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +79,31 @@ class Window:
         return Window(x, y, t, p, self.t0, self.t1)
 
 
-def hit_pixels(windows: Iterable[Window], height: int, width: int) -> np.ndarray:
+@dataclass(frozen=True)
+class StreamWindow:
+    """A reference time, the window before it and the window after it. name, scene : as of a
+    :class:`RawSample`."""
+
+    t_us: int
+    old: Window
+    new: Window
+    name: str = ""
+    scene: str = ""
+
+    @classmethod
+    def of(cls, events: Events, start: int, t_us: int, end: int) -> StreamWindow:
+        """Return the windows [start, t_us) and [t_us, end) µs of a stream."""
+        return cls(t_us, Window.of(events, start, t_us), Window.of(events, t_us, end))
+
+
+def hit_pixels(windows: Iterable[Window], height: int, width: int) -> Mask:
     """Return the pixels with an event in one of the windows, (H, W) bool; events outside are left out."""
-    found = np.zeros((height, width), bool)
+    hit = np.zeros((height, width), bool)
     for w in windows:
         x, y = (np.rint(c).astype(np.int64) for c in (w.x, w.y))
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        found[y[inside], x[inside]] = True
-    return found
+        hit[y[inside], x[inside]] = True
+    return hit
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +123,16 @@ class RawSample:
     width: int
     name: str
     scene: str
-    flow: np.ndarray | None = None
-    valid: np.ndarray | None = None
-    backward: np.ndarray | None = None
-    backward_valid: np.ndarray | None = None
-    mask: np.ndarray | None = None
+    flow: Flow | None = None
+    valid: Mask | None = None
+    backward: Flow | None = None
+    backward_valid: Mask | None = None
+    mask: Mask | None = None
 
     @property
-    def hit(self) -> np.ndarray:
-        """Return the pixels with an event in either window, (H, W) bool."""
-        return hit_pixels((self.old, self.new), self.height, self.width)
+    def has_events(self) -> bool:
+        """Return whether both windows have events."""
+        return len(self.old) > 0 and len(self.new) > 0
 
     def flip(self, axis: str) -> RawSample:
         """Return the sample mirrored horizontally (axis "x") or vertically ("y")."""

@@ -8,6 +8,7 @@ ECCV 2022), which penalises flow that maps all events to one point at one of the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy import ndimage, optimize
 from blinkgl.errors import EventDataError
 from eflow.data.window import Window
 from eflow.methods.iwe import slope_at, vote
+from eflow.types import Flow, Numbers
 
 LEAST_EVENTS = 50
 MOST_EVENTS = 60_000
@@ -42,9 +44,9 @@ time: the sharpest image, but not the motion (event collapse)."""
 class _Cloud:
     """Events as float64, at most :data:`MOST_EVENTS`. s : time as a share of the span, 0 to 1."""
 
-    x: np.ndarray
-    y: np.ndarray
-    s: np.ndarray
+    x: Numbers
+    y: Numbers
+    s: Numbers
     height: int
     width: int
 
@@ -76,26 +78,26 @@ class _Field:
     basis : two (N, k) matrices: flow of N points in px over the span is basis[0] @ p, basis[1] @ p.
     limits : (k,) largest absolute value of each parameter."""
 
-    def __init__(self, basis: tuple, limits: np.ndarray):
+    def __init__(self, basis: tuple[Numbers, Numbers], limits: Numbers):
         self.basis, self.limits = basis, limits
 
-    def at(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, p: Numbers) -> tuple[Numbers, Numbers]:
         return self.basis[0] @ p, self.basis[1] @ p
 
     def first(self, count: int) -> _Field:
         """Return the field of the first ``count`` parameters."""
-        return _Field(tuple(b[:, :count] for b in self.basis), self.limits[:count])
+        return _Field((self.basis[0][:, :count], self.basis[1][:, :count]), self.limits[:count])
 
-    def pulled(self, slope: np.ndarray) -> np.ndarray:
+    def pulled(self, slope: Numbers) -> Numbers:
         """Return the derivative (k,) by the parameters, given the derivative (N, 2) by the flow of the points."""
         return self.basis[0].T @ slope[:, 0] + self.basis[1].T @ slope[:, 1]
 
 
-def _centred(x: np.ndarray, y: np.ndarray, height: int, width: int, unit: float) -> tuple[np.ndarray, np.ndarray]:
+def _centred(x: Numbers, y: Numbers, height: int, width: int, unit: float) -> tuple[Numbers, Numbers]:
     return (x - (width - 1) / 2) / unit, (y - (height - 1) / 2) / unit
 
 
-def affine_field(x: np.ndarray, y: np.ndarray, height: int, width: int) -> _Field:
+def affine_field(x: Numbers, y: Numbers, height: int, width: int) -> _Field:
     """Return an affine field of six parameters, px at the border: a translation, then the change with x, then that with
     y. The first two alone are a translation."""
     u, v = _centred(x, y, height, width, max(height, width) / 2)
@@ -107,7 +109,7 @@ def affine_field(x: np.ndarray, y: np.ndarray, height: int, width: int) -> _Fiel
     )
 
 
-def rotation_field(x: np.ndarray, y: np.ndarray, height: int, width: int, focal: float) -> _Field:
+def rotation_field(x: Numbers, y: Numbers, height: int, width: int, focal: float) -> _Field:
     """Return the field of a rotating pin-hole camera, with three parameters, radians times the focal length
     (Longuet-Higgins and Prazdny 1980, the part that does not depend on depth)."""
     u, v = _centred(x, y, height, width, focal)
@@ -118,7 +120,7 @@ def rotation_field(x: np.ndarray, y: np.ndarray, height: int, width: int, focal:
     )
 
 
-def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -> tuple[float, np.ndarray]:
+def sharpness(cloud: _Cloud, flow: tuple[Numbers, Numbers], blur: float) -> tuple[float, Numbers]:
     """Return the mean squared gradient of the images of warped events over :data:`TIMES`, and its derivative (N, 2) by
     the flow of each event. flow : px over the span."""
     unit = max(1.0, blur / _FINEST_PX)  # a blurred image does not need fine pixels
@@ -157,7 +159,7 @@ sharpest image is often that of hardly any flow (docs/results_eflow.md has the b
 BLOCK = 16
 
 
-def sharpest_length(windows: list[Window], flow: np.ndarray) -> tuple[float, str]:
+def sharpest_length(windows: list[Window], flow: Flow) -> tuple[float, str]:
     """Return (factor of a flow with which the warped events are sharpest, "" or why it stays 1). Networks estimate the
     direction of motion better than its length.
 
@@ -198,25 +200,25 @@ def sharpest_length(windows: list[Window], flow: np.ndarray) -> tuple[float, str
 def _climb(
     cloud: _Cloud,
     field: _Field,
-    start: np.ndarray,
+    start: Numbers,
     blur: float,
     steps: int,
-) -> tuple[np.ndarray, float]:
+) -> tuple[Numbers, float]:
     """Return (parameters, relative sharpness) of the local maximum near ``start``."""
     none = (np.zeros_like(cloud.x),) * 2
     scale = sharpness(cloud, none, blur)[0] or 1.0
 
-    def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
+    def loss(p: Numbers) -> tuple[float, Numbers]:
         value, slope = sharpness(cloud, field.at(p), blur)
         return -value / scale, -field.pulled(slope) / scale
 
     bounds = list(zip(-field.limits, field.limits, strict=True))
     start = np.clip(start, -field.limits, field.limits)
-    found = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
-    return found.x, -float(found.fun)
+    best = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
+    return best.x, -float(best.fun)
 
 
-def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarray:
+def _best_translation(cloud: _Cloud, keep: Numbers, most: float) -> Numbers:
     """Return the best of a grid of translations up to ``most``, (2,) px over the span, by the variance of an image with
     pixels four times as large."""
     coarse = 4.0
@@ -249,22 +251,22 @@ class ContrastMaximisation:
         self.field, self.focal = field, focal
         self.name, self.about = f"contrast-{field}", f"contrast maximisation, {field}"
 
-    def __call__(self, old: Window, new: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, old: Window, new: Window, height: int, width: int) -> Flow:
         """Return the flow over the new window, see :class:`eflow.methods.Method`."""
         cloud = _Cloud.of([old, new], height, width)
         span = 2.0  # windows: the search is for the flow over both, the result is that over the new one
         make = self._family(height, width)
         field = make(cloud.x, cloud.y)
-        found = [self._from(cloud, field, start) for start in self._starts(cloud, field)]
+        maxima = [self._from(cloud, field, start) for start in self._starts(cloud, field)]
         # The maximum of the blurred images may be worse than zero flow without blur.
-        found.append(_climb(cloud, field, np.zeros(field.basis[0].shape[1]), BLURS_PX[-1], 30))
-        p = max(found, key=lambda one: one[1])[0]
+        maxima.append(_climb(cloud, field, np.zeros(field.basis[0].shape[1]), BLURS_PX[-1], 30))
+        p = max(maxima, key=lambda maximum: maximum[1])[0]
         grid = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
         rows, columns = grid
         flow = np.stack(make(columns, rows).at(p), axis=1)
         return (flow.reshape(height, width, 2) / span).astype(np.float32)
 
-    def _family(self, height: int, width: int):
+    def _family(self, height: int, width: int) -> Callable[[Numbers, Numbers], _Field]:
         if self.field == "rotation":
             focal = self.focal
             assert focal is not None
@@ -273,7 +275,7 @@ class ContrastMaximisation:
             return lambda x, y: affine_field(x, y, height, width).first(2)
         return lambda x, y: affine_field(x, y, height, width)
 
-    def _starts(self, cloud: _Cloud, field: _Field) -> list[np.ndarray]:
+    def _starts(self, cloud: _Cloud, field: _Field) -> list[Numbers]:
         """Return initial parameters: zero flow, the best translation, and the field nearest to the best translations of
         nine parts of the image."""
         most = FARTHEST * max(cloud.height, cloud.width)
@@ -295,12 +297,12 @@ class ContrastMaximisation:
         return starts
 
     @staticmethod
-    def _fit(field: _Field, flow: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    def _fit(field: _Field, flow: Numbers, keep: Numbers) -> Numbers:
         basis = np.concatenate([field.basis[0][keep], field.basis[1][keep]])
         return np.linalg.lstsq(basis, np.concatenate([flow[keep, 0], flow[keep, 1]]), rcond=None)[0]
 
     @staticmethod
-    def _from(cloud: _Cloud, field: _Field, start: np.ndarray) -> tuple[np.ndarray, float]:
+    def _from(cloud: _Cloud, field: _Field, start: Numbers) -> tuple[Numbers, float]:
         p, value = start, -math.inf
         # From coarse to fine: each maximum is the next start.
         for blur in BLURS_PX:

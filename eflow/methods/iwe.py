@@ -10,10 +10,11 @@ import numpy as np
 
 from blinkgl.machine.kernels import kernel
 from eflow.data.window import Window
+from eflow.types import Flow, Numbers
 
 
 @kernel
-def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
+def vote(x: Numbers, y: Numbers, image: Numbers) -> None:
     """Add 1 for every point (x, y), float64 px, to its four pixels, bilinearly; points outside are ignored."""
     height, width = image.shape
     for i in range(len(x)):
@@ -29,7 +30,7 @@ def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
 
 
 @kernel
-def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
+def slope_at(x: Numbers, y: Numbers, image: Numbers, out: Numbers) -> None:
     """Write the derivative of sum(image * votes) by x and y of each point to out (N, 2): the adjoint of
     :func:`vote`."""
     height, width = image.shape
@@ -47,7 +48,7 @@ def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -
         out[i, 1] = (r - p) * (1 - a) + (s - q) * a
 
 
-def warped(window: Window, flow: np.ndarray, span_us: int | None = None) -> np.ndarray:
+def warped(window: Window, flow: Flow, span_us: int | None = None) -> Numbers:
     """Return the image (H, W) float64 of the events of a window, moved back along ``flow`` to its start.
 
     flow : (H, W, 2) px per ``span_us`` (default: the window's length), read at each event's pixel."""
@@ -61,7 +62,7 @@ def warped(window: Window, flow: np.ndarray, span_us: int | None = None) -> np.n
     return image
 
 
-def flow_warp_loss(window: Window, flow: np.ndarray) -> float:
+def flow_warp_loss(window: Window, flow: Flow) -> float:
     """Return the flow warp loss (Stoffregen et al., ECCV 2020, eq. 6): the variance of the image of warped events over
     that of the events themselves.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
-
-import numpy as np
 
 from blinkgl.errors import ConfigError
 from eflow.data.window import Window
+from eflow.types import Flow
 
 
 class Method(Protocol):
@@ -18,12 +18,12 @@ class Method(Protocol):
     name: str
     about: str
 
-    def __call__(self, old: Window, new: Window, height: int, width: int) -> np.ndarray:
+    def __call__(self, old: Window, new: Window, height: int, width: int) -> Flow:
         """Return flow (H, W, 2) float32 px, +x right, +y down. Raises EventDataError: too few events."""
         ...
 
 
-def _contrast(field: str):
+def _contrast(field: str) -> Callable[[float | None], Method]:
     def make(focal: float | None) -> Method:
         from eflow.methods.contrast import ContrastMaximisation
 

@@ -7,15 +7,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from torch import Tensor, nn
 
 from blinkgl.errors import EventDataError
+from eflow.config import NetworkConfig
 
 if TYPE_CHECKING:
     from blinkgl.config.base import Config as BaseConfig
     from eflow.data.representation import Representation
+    from eflow.types import Batch
+
+C = TypeVar("C", bound=NetworkConfig)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class FlowPrediction:
         return self.flows[-1]
 
 
-class FlowModel(nn.Module):
+class FlowModel(nn.Module, Generic[C]):
     """Base class of networks. Subclasses set ``Config``, ``divisor``, ``least`` and ``representation``."""
 
     Config: ClassVar[type[BaseConfig]]
@@ -56,9 +60,9 @@ class FlowModel(nn.Module):
     pad_start: bool = False
     """Pad at the left and top instead of the right and bottom."""
     representation: Representation
-    config: Any
+    config: C
 
-    def check_input(self, batch: dict) -> None:
+    def check_input(self, batch: Batch) -> None:
         """Raise EventDataError if the network cannot process the size or shape of the batch."""
         new = batch["new"]
         channels = self.representation.channels

@@ -12,11 +12,12 @@ from torch import Tensor, nn
 
 from eflow.config import EFlowFormerConfig
 from eflow.models.contract import initialise
-from eflow.models.eraft import Eraft
+from eflow.models.eraft import Correlation, Eraft
 from eflow.models.unets import Consensus, Residual, double
 from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
 from eflow.ops.correlation import channels_of, pixel_grid
 from eflow.ops.upsample import bilinear_upsample
+from eflow.types import Batch
 
 LAYERS = {"base": 4, "small": 2, "tiny": 1}
 WINDOW, REDUCTION, MLP_RATIO, PER_HEAD = 10, 4, 4, 32
@@ -105,7 +106,7 @@ class QuickContext(nn.Module):
         return self.context(both), self.flow(both).float()
 
 
-class EFlowFormer(Eraft):
+class EFlowFormer(Eraft[EFlowFormerConfig]):
     """E-FlowFormer. With ``layers=0`` and ``init="zero"`` it is E-RAFT, with the same names of parameters.
 
     With ``quick`` it has the same correlation, layers (none by default) and GRU, but cheaper encoders and another
@@ -143,7 +144,7 @@ class EFlowFormer(Eraft):
         layers = [part for a, b in widths for part in (nn.Conv2d(a, b, 3, 2, 1), nn.ReLU(inplace=True))]
         return nn.Sequential(*layers), QuickContext(w.trunk[-1], channels_of(w.levels, w.radius), w.hidden)
 
-    def encode(self, batch: dict) -> tuple:
+    def encode(self, batch: Batch) -> tuple[Correlation, Tensor, Tensor, Tensor | None]:
         if self.project is None:
             return super().encode(batch)
         both = self.features(torch.cat([batch["old"], batch["new"]]))
@@ -164,7 +165,7 @@ class EFlowFormer(Eraft):
             x = layer(x)
         return self.norm(x).permute(0, 3, 1, 2).chunk(2)
 
-    def start(self, correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
+    def start(self, correlation: Correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
         if self.config.init == "zero":
             return super().start(correlation, warm, like)
         matched = correlation.match(*self._prior())

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +17,14 @@ from eflow.models.contract import FlowModel, FlowPrediction, initialise
 from eflow.ops.correlation import DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, channels_of, pixel_grid
 from eflow.ops.upsample import convex_upsample
 from eflow.precision import fp32
+
+if TYPE_CHECKING:
+    from eflow.types import Batch
+
+R = TypeVar("R", EraftConfig, EFlowFormerConfig)
+Correlation: TypeAlias = DenseCorrelation | OnDemandCorrelation
+Context: TypeAlias = "list[tuple[Tensor, Tensor]]"
+"""Weights over [hidden, motion], and the contribution of the context, of each convolution of a GRU."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +129,7 @@ class SepConvGru(nn.Module):
             [nn.Conv2d(3 * hidden, hidden, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
         )
 
-    def prepare(self, context: Tensor) -> list[tuple[Tensor, Tensor]]:
+    def prepare(self, context: Tensor) -> Context:
         """Return the weights over [hidden, motion] and the contribution of the context (with bias) of each
         convolution."""
         ready, first, last = [], self.hidden, 2 * self.hidden
@@ -131,7 +140,7 @@ class SepConvGru(nn.Module):
             ready.append((weight, F.conv2d(context, conv.weight[:, first:last], conv.bias, padding=conv.padding)))
         return ready
 
-    def forward(self, h: Tensor, ready: list[tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
+    def forward(self, h: Tensor, ready: Context, motion: Tensor) -> Tensor:
         for i, gate in enumerate(self.gates):
             assert isinstance(gate, nn.Conv2d)
             (w_gate, c_gate), (w_new, c_new) = ready[2 * i], ready[2 * i + 1]
@@ -157,7 +166,7 @@ class Update(nn.Module):
         )
 
     def forward(
-        self, h: Tensor, ready: list[tuple[Tensor, Tensor]], taps: Tensor, flow: Tensor, with_mask: bool
+        self, h: Tensor, ready: Context, taps: Tensor, flow: Tensor, with_mask: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return hidden state, Δflow and mask logits (None unless wanted).
 
@@ -167,13 +176,13 @@ class Update(nn.Module):
         return h, self.flow_head(h), 0.25 * self.mask_head(h) if with_mask else None
 
 
-class Eraft(FlowModel):
+class Eraft(FlowModel[R]):
     """E-RAFT (Gehrig et al., 3DV 2021), with RAFT's arithmetic in a faster order: look-ups by one gather, the context's
     part of the GRU's convolutions once, masks and upsampling only where they are used (a test compares)."""
 
     Config = EraftConfig
 
-    def __init__(self, config: EraftConfig | EFlowFormerConfig):
+    def __init__(self, config: R):
         super().__init__()
         self.config, self.widths = config, widths_of(config)
         w = self.widths
@@ -193,7 +202,7 @@ class Eraft(FlowModel):
         assert isinstance(last, nn.Conv2d)
         nn.init.normal_(last.weight, std=1e-3)
 
-    def forward(self, batch: dict) -> FlowPrediction:
+    def forward(self, batch: Batch) -> FlowPrediction:
         """Return the flow of a batch. Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution
         px."""
         self.check_input(batch)
@@ -230,7 +239,9 @@ class Eraft(FlowModel):
         )
 
     @torch.no_grad()
-    def _burn_in(self, h: Tensor, flow: Tensor, context, correlation, grid: Tensor) -> tuple[Tensor, Tensor]:
+    def _burn_in(
+        self, h: Tensor, flow: Tensor, context: Context, correlation: Correlation, grid: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return state and flow after a random number of refinements without gradients.
 
         The following refinements then learn to continue from any flow, and to stay at the right one. Half of the draws
@@ -257,7 +268,7 @@ class Eraft(FlowModel):
             Trunk(bins, w.trunk, 2 * w.hidden, self.config.context_norm),
         )
 
-    def encode(self, batch: dict) -> tuple:
+    def encode(self, batch: Batch) -> tuple[Correlation, Tensor, Tensor, Tensor | None]:
         """Return the correlation, state and context (N, 2 hidden, h, w) before their activations, and the two fields of
         :meth:`start`."""
         # Both windows share the weights, so they are one batch.
@@ -268,14 +279,14 @@ class Eraft(FlowModel):
     def enhance(self, f1: Tensor, f2: Tensor) -> tuple[Tensor, Tensor]:
         return f1, f2
 
-    def start(self, correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
+    def start(self, correlation: Correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the initial low-resolution flow of the GRU, and the supervised full-resolution flow it came from, if
         any."""
         n, _, h, w = like.shape
         zero = torch.zeros(n, 2, h, w, device=like.device, dtype=torch.float32)
         return (zero if warm is None else zero + warm), None
 
-    def _correlation(self, f1: Tensor, f2: Tensor):
+    def _correlation(self, f1: Tensor, f2: Tensor) -> Correlation:
         tokens = f1.shape[-1] * f1.shape[-2]
         if self.config.correlation == "on_demand" or (self.config.correlation == "auto" and tokens > DENSE_TOKENS):
             return OnDemandCorrelation(f1, f2, self.widths.levels, self.widths.radius)

@@ -13,9 +13,10 @@ from eflow.config import EvFlowNetConfig
 from eflow.data.representation import CountsAndTimes, VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
 from eflow.models.unets import Consensus, Residual, ScaledTanh, double, encoder_widths, seen_cells, to_size
+from eflow.types import Batch
 
 
-class EvFlowNet(FlowModel):
+class EvFlowNet(FlowModel[EvFlowNetConfig]):
     """A U-Net on one window: four stride-2 convolutions, two residual blocks, and four decoders with nearest-neighbour
     upsampling, skips and a tanh flow head. Every decoder also reads the flow of the previous one."""
 
@@ -45,7 +46,7 @@ class EvFlowNet(FlowModel):
         for head in heads:
             head.calm()
 
-    def forward(self, batch: dict) -> FlowPrediction:
+    def forward(self, batch: Batch) -> FlowPrediction:
         self.check_input(batch)
         x = batch["new"]
         height, width = x.shape[-2:]

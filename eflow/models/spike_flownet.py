@@ -12,6 +12,7 @@ from eflow.config import SpikeFlowNetConfig
 from eflow.data.representation import CountSlices
 from eflow.models.contract import FlowModel, FlowPrediction
 from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initialise_wide, to_size
+from eflow.types import Batch
 
 
 class _Fire(torch.autograd.Function):
@@ -26,7 +27,7 @@ class _Fire(torch.autograd.Function):
         return spikes
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):  # type: ignore[bad-override]
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[bad-override]
         # The surrogate gradient of Lee et al. 2020: 1 / threshold where a spike was.
         return gradient * ctx.saved_tensors[0] / ctx.threshold, None
 
@@ -37,7 +38,7 @@ def integrate_and_fire(membrane: Tensor, threshold: float) -> tuple[Tensor, Tens
     return spikes, membrane * (1 - spikes.detach())
 
 
-class SpikeFlowNet(FlowModel):
+class SpikeFlowNet(FlowModel[SpikeFlowNetConfig]):
     """A spiking encoder with ordinary residual blocks and decoders; no convolution has a bias.
 
     The window is divided into two groups of ``steps`` count frames; spike step s reads frame s of both groups (four
@@ -66,7 +67,7 @@ class SpikeFlowNet(FlowModel):
         )
         initialise_wide(self)
 
-    def forward(self, batch: dict) -> FlowPrediction:
+    def forward(self, batch: Batch) -> FlowPrediction:
         self.check_input(batch)
         steps = batch["new"]
         n, _, height, width = steps.shape

@@ -14,6 +14,7 @@ from eflow.models.contract import FlowModel, FlowPrediction
 from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initialise_wide, leaky, to_size
 from eflow.ops.correlation import local_correlation
 from eflow.ops.warp import backward_warp
+from eflow.types import Batch
 
 RADII = {"base": 4, "small": 3, "tiny": 2}
 TINY = 8
@@ -35,7 +36,7 @@ class ConvGru(nn.Module):
         return torch.lerp(h, torch.tanh(self.candidate(torch.cat([r * h, x], 1))).to(h.dtype), z.to(h.dtype))
 
 
-class SteFlowNet(FlowModel):
+class SteFlowNet(FlowModel[SteFlowNetConfig]):
     """STE-FlowNet: processes the count slices of the window one after the other, ``sweeps`` times.
 
     Every slice has its own flow at four scales, and each sweep adds to it. At each scale of the encoder, features of
@@ -67,7 +68,7 @@ class SteFlowNet(FlowModel):
         self.decoders = nn.ModuleList([UpDecoder(c, up, bias=True) for c, up in zip(inputs, (*ups, None), strict=True)])
         initialise_wide(self)
 
-    def forward(self, batch: dict) -> FlowPrediction:
+    def forward(self, batch: Batch) -> FlowPrediction:
         self.check_input(batch)
         new = batch["new"]
         n, _, height, width = new.shape
@@ -89,7 +90,7 @@ class SteFlowNet(FlowModel):
                     # The published code applies the activation twice, in the correlation and after it.
                     taps = leaky(leaky(local_correlation(there, aligned.to(here.dtype), self.radius)))
                     hidden[scale] = self.grus[scale](torch.cat([x, taps], 1), hidden[scale])
-                flows[i] = self._decode(hidden, flows[i])
+                flows[i] = self._decode([state for state in hidden if state is not None], flows[i])
         answer = [to_size(f * (height / f.shape[-2]), height, width) for f in flows[-1]]
         return FlowPrediction(answer if self.training else answer[-1:], kind="scales")
 
@@ -101,7 +102,7 @@ class SteFlowNet(FlowModel):
             features.append(leaky(layer(features[-1])))
         return features
 
-    def _decode(self, hidden: list, before: list[Tensor]) -> list[Tensor]:
+    def _decode(self, hidden: list[Tensor], before: list[Tensor]) -> list[Tensor]:
         """Return the decoders' flow from the states plus the slice's flow ``before``, coarse to fine."""
         # The coarsest state, and the output of the residual blocks.
         x = torch.cat([hidden[3], self.residuals(leaky(self.entry(hidden[3])))], 1)

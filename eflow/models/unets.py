@@ -8,11 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from eflow.config import EvFlowNetConfig, SpikeFlowNetConfig, SteFlowNetConfig
+
 WIDTHS = {"base": 64, "small": 32, "tiny": 16}
 """Channels of the first encoder, at 1/2; each further one has twice as many."""
 
 
-def encoder_widths(config) -> tuple[int, int, int, int]:
+def encoder_widths(config: EvFlowNetConfig | SpikeFlowNetConfig | SteFlowNetConfig) -> tuple[int, int, int, int]:
     """Return the channels at 1/2, 1/4, 1/8, 1/16, by the ``width`` of the configuration or its ``size``."""
     width = config.width or WIDTHS[config.size]
     return width, 2 * width, 4 * width, 8 * width

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from blinkgl.errors import EventDataError
 from blinkgl.machine.kernels import kernel
 
 
@@ -26,19 +27,26 @@ def voxel_grid(
     x, y : uint16 px, or float32 rectified px, which are splatted bilinearly (without corners outside the sensor).
     t : int64 µs, t0 <= t <= t1. p : uint8 {0, 1}, counted as -1 and +1.
     normalise : "nonzero" (zero mean, unit standard deviation over cells that are not 0), "all", "none".
-    Raises ValueError: an integer pixel or a time is outside the grid.
+    Raises EventDataError: an integer pixel or a time is outside the grid.
     """
     grid = np.zeros((bins, height, width), np.float32)
     if len(t):
         # A window of length 0: all events are in the first bin.
         scale = (bins - 1) / (int(t1) - int(t0)) if t1 > t0 else 0.0
         kernel = _splat_t if x.dtype.kind == "u" else _splat_xyt
-        outside = kernel(x, y, t, p, np.int64(t0), np.int64(t1), scale, grid)
-        if outside:
-            raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
+        _all_inside(kernel(x, y, t, p, np.int64(t0), np.int64(t1), scale, grid), t0, t1, grid)
     if normalise != "none":
         _normalise(grid.reshape(-1), normalise == "all")
     return grid
+
+
+def _all_inside(outside: int, t0: int, t1: int, grid: np.ndarray) -> None:
+    """Raise EventDataError if some events are outside the window or the sensor. grid : (…, H, W)."""
+    if outside:
+        height, width = grid.shape[-2:]
+        raise EventDataError(
+            f"{outside} events outside the window or the {width}x{height} sensor", where=f"window [{t0}, {t1}) µs"
+        )
 
 
 @kernel
@@ -120,11 +128,9 @@ def count_slices(
 ) -> np.ndarray:
     """Return event counts per slice of equal duration and polarity, (slices, 2, height, width) float32; 0 OFF, 1 ON.
 
-    x, y : uint16 px. t in [t0, t1]; t == t1 is in the last slice. Raises ValueError as :func:`voxel_grid`."""
+    x, y : uint16 px. t in [t0, t1]; t == t1 is in the last slice. Raises EventDataError as :func:`voxel_grid`."""
     counts = np.zeros((slices, 2, height, width), np.float32)
-    outside = _count(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), counts)
-    if outside:
-        raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
+    _all_inside(_count(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), counts), t0, t1, counts)
     return counts
 
 
@@ -146,12 +152,10 @@ def counts_and_times(
     x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, height: int, width: int
 ) -> np.ndarray:
     """Return the input of EV-FlowNet (Zhu et al., RSS 2018), (4, height, width) float32: OFF count, ON count, latest
-    OFF time, latest ON time. Times are fractions of the window, 0 without an event. Raises ValueError as
+    OFF time, latest ON time. Times are fractions of the window, 0 without an event. Raises EventDataError as
     :func:`voxel_grid`."""
     out = np.zeros((4, height, width), np.float32)
-    outside = _latest(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), out)
-    if outside:
-        raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
+    _all_inside(_latest(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), out), t0, t1, out)
     return out
 
 

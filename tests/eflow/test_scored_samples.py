@@ -57,14 +57,14 @@ def network(tree):
 def test_networks_are_scored_on_the_same_samples(folder):
     """Zero flow's error is that of the four samples with both windows, whatever a network reads."""
     source = Emptied(open_source(folder), old=[0], new=[4])
-    results = [evaluate(network(tree), source, empty="skip") for tree in (ONE, TWO)]
+    results = [evaluate(network(tree), source) for tree in (ONE, TWO)]
     speeds = [np.hypot(*source[i].flow[source[i].valid].T).mean() for i in (1, 2, 3, 5)]
     for result in results:
         assert (result["samples"], result["left_out"]) == (4, 2)
         scenes = result["methods"]["zero flow"]["scenes"].values()
         assert sum(s["AEE"] * s["frames"] for s in scenes) == pytest.approx(sum(speeds), rel=1e-6)
-    with pytest.raises(EventDataError, match="no events in the new window .*use --empty skip to leave"):
-        evaluate(network(ONE), source)
+    with pytest.raises(EventDataError, match="no events in the new window .*use data.empty=skip to leave"):
+        FlowDataset([source], network(ONE).representation)[4]
 
 
 def test_training_takes_the_next_sample_with_events_and_a_valid_pixel(folder):

@@ -89,7 +89,9 @@ def outdoor(root, fields=7):
 
 
 def protocol(monkeypatch, name, **changes):
-    monkeypatch.setitem(mvsec.PROTOCOLS, name, dataclasses.replace(mvsec.PROTOCOLS[name], **changes))
+    monkeypatch.setitem(
+        mvsec.PROTOCOLS, name, dataclasses.replace(mvsec.PROTOCOLS.get(name, mvsec.Protocol()), **changes)
+    )
 
 
 def test_mvsec_frames_of_a_protocol(tmp_path, monkeypatch):
@@ -120,19 +122,20 @@ def test_mvsec_frames_and_pixels_of_ones_own(tmp_path):
         open_source(blinkgl_set(tmp_path / "b", 1, 1), frames=((0, 1),))
 
 
-def test_both_conventions_of_mvsecs_ground_truth(tmp_path):
+def test_both_conventions_of_mvsecs_ground_truth(tmp_path, monkeypatch):
     """Images at 31 Hz, flow at 20: image 3 is at 96.8 ms, and its interval goes over the stamp at 100."""
     root = outdoor(tmp_path)
     interval, begin = 1 / 31 * 20, 3 / 31 * 20
     first, second = 2 - begin, interval - (2 - begin)  # shares of the fields of 2 and 3 px
     middle = (100, 150)
     for truth, u in (("propagated", 2 * first + 3 * second), ("scaled", 2 * interval)):
-        sample = MvsecSource(root, truth=truth)[2]
+        protocol(monkeypatch, truth, truth=truth)
+        sample = MvsecSource(root, protocol=truth)[2]
         assert sample.name.endswith("000003") and sample.valid[middle]
         assert sample.flow[middle] == pytest.approx((u, -u / 2), abs=1e-3), truth
-    inside = [MvsecSource(root, truth=t)[1].flow for t in mvsec.TRUTHS]  # image 2: within one field
+    inside = [MvsecSource(root, protocol=t)[1].flow for t in mvsec.TRUTHS]  # image 2: within one field
     np.testing.assert_allclose(*inside, atol=1e-6)
-    four = [MvsecSource(root, 4, truth=t)[0].flow for t in mvsec.TRUTHS]  # longer than a field: followed, either way
+    four = [MvsecSource(root, 4, t)[0].flow for t in mvsec.TRUTHS]  # longer than a field: followed, either way
     assert np.array_equal(*four)
 
 
@@ -153,7 +156,6 @@ def test_what_is_asked_of_mvsec_alone(tmp_path):
     root = mvsec_set(tmp_path / "m")
     for options, message in (
         ({"protocol": "kitti"}, "protocol: unknown choice .*all, ste-flownet, e-raft"),
-        ({"truth": "guessed"}, "truth: unknown choice"),
         ({"protocol": "e-raft", "dt": 4}, "dt"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -25,7 +25,7 @@ from blinkgl.io.formats import open_events
 from blinkgl.io.hdf5 import Data, Group, open_hdf5
 from blinkgl.io.imu import read_imu
 from blinkgl.io.intervals import intervals_in, read_intervals
-from eflow.data.sources import FolderSource
+from eflow.data.sources import read_rectify_map
 from tests.io.test_columns import dsec, mvsec
 
 SHAPE = (48, 64, 2)
@@ -88,7 +88,7 @@ DOORS = {
     "flow intervals": ("flow", (3, 4, 4, 2), "<f4", lambda path: read_intervals(path, ("flow",))),
     "event labels": ("velocity", (3, 2), "<f4", EventLabelsReader),
     "imu": ("rate", (3, 3), "<f8", lambda path: read_imu(path.parent.parent)),
-    "rectify map": ("rectify_map", (4, 4, 2), "<f4", lambda path: FolderSource([])._map(path)),
+    "rectify map": ("rectify_map", (4, 4, 2), "<f4", read_rectify_map),
 }
 """Readers, and the data set in which each is attacked."""
 

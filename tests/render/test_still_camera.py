@@ -17,7 +17,7 @@ from blinkgl.render.passes import Luminance
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Scene
-from blinkgl.tools.bench import probe_scene
+from blinkgl.tools.bench_rows import probe_scene
 from render_scenes import LEVEL, SECOND, cube, curve, drift, largest_speed, mixed_scene, scene, sphere, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")

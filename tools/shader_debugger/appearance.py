@@ -47,7 +47,7 @@ def surface(scene: Scene, hits: Hits) -> Surface:
     albedo, colour = np.zeros((n, 3)), np.full((n, 3), float(scene.backdrop))
     parts = scene_parts(scene)
     for p, rows in by_part(hits.part):
-        thing, part = parts[p]
+        body, part = parts[p]
         corners = part.mesh.faces[hits.triangle[rows]]
         bary = hits.bary[rows]
         # Interpolated over the triangle, as the rasteriser does, then made unit.
@@ -56,7 +56,7 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         length = np.maximum(np.linalg.norm(blend, axis=1, keepdims=True), 1e-15)
         # A surface seen from behind is lit from that side.
         sign = np.where(hits.front[rows], 1.0, -1.0)[:, None]
-        normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
+        normal[rows] = sign * (blend / length) @ body.path.pose(hits.t_ns)[:3, :3].T
         uv[rows] = np.einsum("nc,nck->nk", bary, part.mesh.uvs[corners].astype(np.float64))
         albedo[rows] = sample_albedo(part.material, uv[rows])
         if part.mesh.colours is not None:
@@ -103,8 +103,8 @@ def radiated(
 ) -> Radiated:
     """Return the radiance of the hits ``rows``, all of one lit part. albedo, normal : (N, 3), (N, 3) unit, world axes,
     without a normal map.   uv : (N, 2)."""
-    thing, part = scene_parts(scene)[int(hits.part[rows[0]])]
-    material, pose = part.material, thing.path.pose(hits.t_ns)
+    body, part = scene_parts(scene)[int(hits.part[rows[0]])]
+    material, pose = part.material, body.path.pose(hits.t_ns)
     # Maps are looked up at the base colour's coordinates.
     at = uv * np.asarray(material.uv_scale)
     emission = np.broadcast_to(np.asarray(material.emission, np.float64), albedo.shape)
@@ -120,8 +120,8 @@ def radiated(
         return Radiated(light, light.total, np.zeros_like(albedo), emission)
     metallic, roughness = np.full(len(at), material.gloss.metallic), np.full(len(at), material.gloss.roughness)
     if material.gloss.map is not None:
-        given = sample_map(material.gloss.map, at)
-        metallic, roughness = metallic * given[:, 2], roughness * given[:, 1]
+        texels = sample_map(material.gloss.map, at)
+        metallic, roughness = metallic * texels[:, 2], roughness * texels[:, 1]
     eye = scene.camera_path.pose(hits.t_ns)[:3, 3] - points
     eye /= np.linalg.norm(eye, axis=1, keepdims=True)
     matt, mirrored = shone(scene, hits.t_ns, light, points, normal, eye, albedo, metallic, roughness)
@@ -135,19 +135,19 @@ def bumped(
     mesh, bumps = part.mesh, part.material.bumps
     assert bumps is not None
     corners, bary = mesh.faces[hits.triangle[rows]], hits.bary[rows]
-    given = tangents(mesh).astype(np.float64)
+    tangent = tangents(mesh).astype(np.float64)
     # The tangent of the texture is transformed like a normal.
     if mesh.deformer is not None:
-        turned = mesh.deformer.normals(replace(mesh, normals=given[:, :3].astype(np.float32)), hits.t_ns)
-        given = np.column_stack([turned, given[:, 3]])
+        turned = mesh.deformer.normals(replace(mesh, normals=tangent[:, :3].astype(np.float32)), hits.t_ns)
+        tangent = np.column_stack([turned, tangent[:, 3]])
     side = np.where(hits.front[rows], 1.0, -1.0)[:, None]
     # Everything below is for the front; the result is turned back to the visible side.
     n = normal * side
-    along = np.einsum("nc,nck->nk", bary, given[:, :3][corners]) @ pose[:3, :3].T
+    along = np.einsum("nc,nck->nk", bary, tangent[:, :3][corners]) @ pose[:3, :3].T
     # Gram-Schmidt: the tangent without its part along the normal.
     along = along - n * (along * n).sum(axis=1, keepdims=True)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-15)
-    hand = np.sign(np.einsum("nc,nc->n", bary, given[:, 3][corners]))[:, None]
+    hand = np.sign(np.einsum("nc,nc->n", bary, tangent[:, 3][corners]))[:, None]
     # Stored as 0 to 1, used as -1 to 1.
     bump = 2.0 * sample_map(bumps, at) - 1.0
     x, y, z = (bump[:, k : k + 1] for k in range(3))
@@ -311,13 +311,13 @@ def _casters(scene: Scene) -> tuple[Scene, np.ndarray]:
     part)."""
     if scene not in _shadowers:
         kept, number, count = [], [], 0
-        for thing in scene.objects:
-            casting = [thing.category in ("object", "wall") and not part.material.unlit for part in thing.parts]
+        for body in scene.objects:
+            casting = [body.category in ("object", "wall") and not part.material.unlit for part in body.parts]
             # Numbers among the casting parts, in the scene's order.
             number += [count + sum(casting[:k]) if one else -1 for k, one in enumerate(casting)]
             count += sum(casting)
             if any(casting):
-                kept.append(replace(thing, parts=tuple(p for p, one in zip(thing.parts, casting) if one)))
+                kept.append(replace(body, parts=tuple(p for p, one in zip(body.parts, casting) if one)))
         _shadowers[scene] = replace(scene, objects=tuple(kept)), np.array([*number, -1])
     return _shadowers[scene]
 
@@ -330,18 +330,18 @@ def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:
     return sample_bilinear(material.texture, uv * np.asarray(material.uv_scale), material.wrap) * base
 
 
-def sample_map(given: Map, at: np.ndarray, colour: bool = False) -> np.ndarray:
+def sample_map(texture_map: Map, at: np.ndarray, colour: bool = False) -> np.ndarray:
     """Return a map's values at (N, 2) coordinates of the base colour, (N, 3): numbers as stored, 0 to 1, or linear
     light."""
-    a, b, c, d, e, f = given.at
+    a, b, c, d, e, f = texture_map.at
     # The map's own affine transform of the coordinates.
     there = at @ np.array([[a, b], [d, e]]).T + [c, f]
-    texture = given.texture
+    texture = texture_map.texture
     if not colour:
         if texture not in _as_numbers:
             _as_numbers[texture] = Texture(texture.image.astype(np.float32) / np.float32(255))
         texture = _as_numbers[texture]
-    return sample_bilinear(texture, there, given.wrap)
+    return sample_bilinear(texture, there, texture_map.wrap)
 
 
 _as_numbers: WeakKeyDictionary = WeakKeyDictionary()

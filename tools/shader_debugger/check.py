@@ -62,8 +62,8 @@ def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
         return [{}]
     if kind.more:
         three = {"RGB": 1} if (kind.rgb if pass_.one_channel else "GLOSSY" in kind.more) else {}
-        found = [light | three for light in (EXAMPLES[0], EXAMPLES[-1])]
-        return found if kind.whole else [{}, *found]
+        lights = [light | three for light in (EXAMPLES[0], EXAMPLES[-1])]
+        return lights if kind.whole else [{}, *lights]
     if kind.shape:
         return [{}, EXAMPLES[-1]]
     rgb = (kind.textured or not pass_.one_channel) and not kind.two_sided
@@ -72,7 +72,7 @@ def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
 
 
 def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]:
-    found: dict[tuple, dict[str, Any]] = {}
+    variants: dict[tuple, dict[str, Any]] = {}
     for one in passes:
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
@@ -81,8 +81,8 @@ def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[st
                 foggy = pass_.lit and kind in (KINDS[0], KINDS[-1])
                 for more in (*_lights(pass_, kind), *([{"FOG": 1}] if foggy else [])):
                     defines = plain | more
-                    found.setdefault(tuple(sorted(defines.items())), defines)
-    return list(found.values())
+                    variants.setdefault(tuple(sorted(defines.items())), defines)
+    return list(variants.values())
 
 
 @dataclass
@@ -97,18 +97,18 @@ class Finding:
 
 @dataclass
 class Result:
-    """The result of a check. renderer : the compiler.   programs : name -> number of variants.   found : by program and
-    message."""
+    """The result of a check. renderer : the compiler.   programs : name -> number of variants.   findings : by program
+    and message."""
 
     renderer: str = ""
     seconds: float = 0.0
     programs: dict[str, int] = field(default_factory=dict)
-    found: dict[tuple[str, Diagnostic], Finding] = field(default_factory=dict)
+    findings: dict[tuple[str, Diagnostic], Finding] = field(default_factory=dict)
 
     @property
     def errors(self) -> list[Finding]:
         """Return each error once, in order of occurrence."""
-        return list(self.found.values())
+        return list(self.findings.values())
 
     def as_dict(self) -> dict:
         return {
@@ -153,8 +153,8 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
             # An undefined name in an include is reported by every stage that includes it.
             for diagnostic in dict.fromkeys(diagnose(error, sources, folder)):
                 if diagnostic.kind == "error":
-                    found = result.found.setdefault((name, diagnostic), Finding(diagnostic, name, example=defines))
-                    found.count += 1
+                    finding = result.findings.setdefault((name, diagnostic), Finding(diagnostic, name, example=defines))
+                    finding.count += 1
             continue
         program.release()
 
@@ -210,14 +210,14 @@ def as_text(result: Result) -> str:
     """Return the check as text."""
     total = sum(result.programs.values())
     lines = []
-    for found in result.errors:
-        d = found.diagnostic
+    for finding in result.errors:
+        d = finding.diagnostic
         lines += [
             f"{d.where}: {d.kind}: {d.text}" + (f" [{d.stage} stage]" if d.stage else ""),
             d.excerpt,
             (
-                f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first "
-                f"{_defines(found.example)}"
+                f"         in {finding.count} of {result.programs[finding.program]} variants of {finding.program}, "
+                f"first {_defines(finding.example)}"
             ),
             "",
         ]

@@ -100,10 +100,10 @@ def diff(
     from blinkgl.tools.shader_debugger import commands
 
     subject, when = _opened(config, seed, sequence, overrides, time)
-    found, reports = commands.run_diff(subject, when, names, tolerance or [], shaders, out)
-    typer.echo(commands.diff_json(found, reports) if json else commands.diff_text(found, reports))
+    result, reports = commands.run_diff(subject, when, names, tolerance or [], shaders, out)
+    typer.echo(commands.diff_json(result, reports) if json else commands.diff_text(result, reports))
     # Exit status for scripts: 0 means that all compared buffers agree.
-    if not found["passed"]:
+    if not result["passed"]:
         raise typer.Exit(DIFFERENT)
 
 

@@ -93,8 +93,8 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
     """Return the output of ``blinkgl shader probe``."""
     x, y = check_pixel(subject.scene, pixel)
     with open_renderer(subject, shaders) as renderer:
-        found = probe(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps), x, y)
-    return json.dumps(_finite(found)) if as_json else as_text(found)
+        answer = probe(GpuMoment(renderer, when), open_reference(subject, when, renderer.maps), x, y)
+    return json.dumps(_finite(answer)) if as_json else as_text(answer)
 
 
 def run_diff(
@@ -116,7 +116,7 @@ def run_diff(
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]
-        found = verdict(reports, renderer.unused, comparison.left_out())
+        result = verdict(reports, renderer.unused, comparison.left_out())
     if out is not None:
         from blinkgl.tools.shader_debugger import picture
 
@@ -128,12 +128,12 @@ def run_diff(
             f"{when.t_ns * 1e-9:.6g} s"
         )
         picture.save_errors(folder / "diff.png", reports, title + "   (log scale; silhouettes and shared edges greyed)")
-    return found, reports
+    return result, reports
 
 
-def diff_json(found: dict, reports: list[BufferReport]) -> str:
+def diff_json(result: dict, reports: list[BufferReport]) -> str:
     """Return the output of ``diff --json``."""
-    return json.dumps(_finite(found | {"buffers": [r.summary() for r in reports]}))
+    return json.dumps(_finite(result | {"buffers": [r.summary() for r in reports]}))
 
 
 def _finite(value):
@@ -147,10 +147,10 @@ def _finite(value):
     return value
 
 
-def diff_text(found: dict, reports: list[BufferReport]) -> str:
+def diff_text(result: dict, reports: list[BufferReport]) -> str:
     """Return the verdict, the table, then histogram, suspicions and the worst pixel of each object, for each failed
     buffer or for a single one."""
-    lines = [*verdict_text(found), ""] if not found["passed"] else []
+    lines = [*verdict_text(result), ""] if not result["passed"] else []
     lines.append(
         f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} "
         f"{'max':>8}   silhouette band: over / pixels"
@@ -192,13 +192,13 @@ def diff_text(found: dict, reports: list[BufferReport]) -> str:
         ]
     failed = [s for s in summaries if not s["passed"]]
     if failed:
-        w = next(iter(found["objects"]), None)
+        w = next(iter(result["objects"]), None)
         closer = f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else ""
-        said = f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"
+        summary = f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"
     else:
         whole = f"all {len(summaries)} buffers agree" if len(summaries) > 1 else "agrees"
-        said = f"{whole} with the reference"
-    lines += ["", f"{said}; {found['not_graded']}"]
+        summary = f"{whole} with the reference"
+    lines += ["", f"{summary}; {result['not_graded']}"]
     return "\n".join(lines)
 
 

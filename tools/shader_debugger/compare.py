@@ -167,13 +167,13 @@ class Comparison:
             self.band |= reference.silhouette_band(flat.instance, flat.depth, jump=NEVER)
             # No buffer has the triangle that a lens's ray met on the GPU; away from the sides both met the same one.
             self._same_label = (seen.bary.min(axis=-1) > SIDE) | ~seen.hit
-        names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
+        names = [body.name or f"object {body.instance_id}" for body in ref.scene.objects]
         self.objects = [
-            name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
-            for name, thing in zip(names, ref.scene.objects)
+            name if names.count(name) == 1 else f"{name} (id {body.instance_id})"
+            for name, body in zip(names, ref.scene.objects)
         ] + [NOTHING]
         # In the order of casting.scene_parts; the last is that of part -1.
-        of_parts = [i for i, thing in enumerate(ref.scene.objects) for _ in thing.parts]
+        of_parts = [i for i, body in enumerate(ref.scene.objects) for _ in body.parts]
         self._object_of_part = np.array([*of_parts, len(names)], np.intp)
 
     def owner(self, name: str) -> np.ndarray:
@@ -428,10 +428,10 @@ def _not_graded(reports: list[BufferReport], left_out: list[str]) -> str:
     return "; ".join([line, *more, *whole])
 
 
-def as_text(found: dict) -> list[str]:
+def as_text(result: dict) -> list[str]:
     """Return the verdict as lines."""
-    lines = [f"{program}: the shader no longer uses '{name}'" for program, name in found["unused"]]
-    first = found["first"]
+    lines = [f"{program}: the shader no longer uses '{name}'" for program, name in result["unused"]]
+    first = result["first"]
     if first is None:
         return lines
     lines += [
@@ -440,7 +440,7 @@ def as_text(found: dict) -> list[str]:
     ]
     lines += [f"  it looks as if: {text}" for text in first["suspicions"]]
     lines += ["", f"  {'object':<16} {'first wrong':<22} {'over':>7} {'of px':>7}  {'worst at':<12} then also; why"]
-    for row in found["objects"]:
+    for row in result["objects"]:
         place = f"({row['x']}, {row['y']})"
         more = ", ".join(row["then"]) or "nothing"
         lines.append(

@@ -33,14 +33,14 @@ class Diagnostic:
 def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: Any) -> list[Diagnostic]:
     """Return every message of a ShaderError. ``sources``: by stage, empty when the includes of the program could not be
     resolved."""
-    found = []
+    diagnostics = []
     for stage, number, column, kind, text in messages(error.log):
         if stage not in sources:
             continue
         source = sources[stage]
         line, (file, own) = _line(source.text, number), source.locate(number)
         if not file:  # a generated line: an include guard, a #define
-            found.append(
+            diagnostics.append(
                 Diagnostic(
                     file=source.name,
                     line=0,
@@ -53,7 +53,7 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
             )
             continue
         column = _column(line, text, column)
-        found.append(
+        diagnostics.append(
             Diagnostic(
                 file=file,
                 line=own,
@@ -64,16 +64,16 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
                 excerpt=excerpt(folder, file, own, column),
             )
         )
-    if any(d.kind == "error" for d in found):
-        return found
-    said = str(error).removeprefix(f"{error.where}: ")
+    if any(d.kind == "error" for d in diagnostics):
+        return diagnostics
+    reason = str(error).removeprefix(f"{error.where}: ")
     if error.log and sources:  # linking: names, but no lines
         # The later stage first: it uses what the earlier one does not provide.
         for stage in reversed(list(sources)):
-            for name in _QUOTED.findall(said):
+            for name in _QUOTED.findall(reason):
                 if place := _declaration(sources[stage], name):
-                    return [Diagnostic(*place, "error", said, stage, excerpt(folder, *place))]
-        return [Diagnostic(next(iter(sources.values())).name, 0, 0, "error", said)]
+                    return [Diagnostic(*place, "error", reason, stage, excerpt(folder, *place))]
+        return [Diagnostic(next(iter(sources.values())).name, 0, 0, "error", reason)]
     file, _, number = (error.where or "").rpartition(":")
     if file and number.isdigit():
         return [
@@ -82,12 +82,12 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: An
                 line=int(number),
                 column=1,
                 kind="error",
-                text=said,
+                text=reason,
                 stage="",
                 excerpt=excerpt(folder, file, int(number), 1),
             )
         ]
-    return [Diagnostic(error.where or "shaders", 0, 0, "error", said)]
+    return [Diagnostic(error.where or "shaders", 0, 0, "error", reason)]
 
 
 def _line(text: str, number: int) -> str:

@@ -159,10 +159,10 @@ class _Pixel:
                     bent += 0.0 if seam else abs(share)
                 continue
             # A silhouette: its share moves light from the surface behind to the one in front.
-            found = self._sides(x, y, own, room, depth, line.left, further, kind < -0.5)
-            if found is None:
+            sides = self._sides(x, y, own, room, depth, line.left, further, kind < -0.5)
+            if sides is None:
                 continue
-            front, back, inside = found
+            front, back, inside = sides
             on_left = room > 0
             # A centre on the line itself belongs to the side that was drawn there.
             if abs(room) < SNAP and on_left != ((kind < -0.5) != inside):

@@ -132,18 +132,18 @@ def read_query(route: str, text: str) -> dict[str, Any]:
         raise ConfigError(
             "the question is too long", where=route, value=len(text), accepted=f"at most {LONGEST} characters"
         )
-    given: dict[str, str] = {}
-    # Programs differ in how they read a parameter that is given twice.
+    parameters: dict[str, str] = {}
+    # Programs differ in how they read a parameter that is parameters twice.
     for key, value in parse_qsl(text, keep_blank_values=True):
-        if key not in readers or key in given:
+        if key not in readers or key in parameters:
             raise ConfigError(
-                "asked twice" if key in given else "unknown parameter",
+                "asked twice" if key in parameters else "unknown parameter",
                 where=route,
                 value=key,
                 accepted="one of " + ", ".join(readers) if readers else "none",
             )
-        given[key] = value
-    return {key: read(key, given.get(key, "")) for key, read in readers.items()}
+        parameters[key] = value
+    return {key: read(key, parameters.get(key, "")) for key, read in readers.items()}
 
 
 POLL_S = 0.15  # between two checks of the shader files
@@ -290,10 +290,10 @@ class Inspector:
         """Return the comparison of all buffers with the reference: the verdict of ``diff``, and its text."""
         comparison = self.comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
-        found = verdict(reports, self.renderer.unused, comparison.left_out())
+        result = verdict(reports, self.renderer.unused, comparison.left_out())
         titles = {name: info.title for name, info in PASSES.items()}
         return _finite(
-            found
+            result
             | {
                 "titles": titles,
                 "buffers": [r.quantity.name for r in reports if not r.passed],
@@ -306,11 +306,11 @@ class Inspector:
         when = self._when(q["t"])
         x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")
         comparison = self.comparison(when)
-        found = probe(comparison.gpu, comparison.ref, x, y, comparison)
-        for row in (*found["buffers"], *found["positions"]):
+        answer = probe(comparison.gpu, comparison.ref, x, y, comparison)
+        for row in (*answer["buffers"], *answer["positions"]):
             row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
-        found["surface_text"] = {side: _surface_text(found["surface"][side]) for side in SOURCES}
-        return _finite(found)
+        answer["surface_text"] = {side: _surface_text(answer["surface"][side]) for side in SOURCES}
+        return _finite(answer)
 
     # ---- reloading ---------------------------------------------------------------------------------------------
 
@@ -324,8 +324,8 @@ class Inspector:
             self._draw_all(self._shown)
         except ShaderError as error:
             # Each stage that includes the line reports the same message.
-            found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
-            self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
+            diagnostics = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
+            self.errors = [d for d in diagnostics if d.kind == "error"][:MOST_ERRORS]
         except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
             self.errors = [
                 Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")

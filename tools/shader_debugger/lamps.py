@@ -102,13 +102,13 @@ def _flat(scene: Scene, frame: reference.ReferenceFrame, rows: np.ndarray) -> np
     """Return the (n, 3) unit normals of the triangles themselves, world axes."""
     part, triangle = frame.part.ravel()[rows], frame.triangle.ravel()[rows]
     out = np.zeros((len(rows), 3))
-    for p, (thing, own) in enumerate(casting.scene_parts(scene)):
+    for p, (body, own) in enumerate(casting.scene_parts(scene)):
         on = part == p
         if on.any():
             a, b, c = np.moveaxis(casting.vertices_at(own.mesh, frame.t_ns)[own.mesh.faces[triangle[on]]], 1, 0)
             normal = np.cross(b - a, c - a)
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-            out[on] = normal @ thing.path.pose(frame.t_ns)[:3, :3].T
+            out[on] = normal @ body.path.pose(frame.t_ns)[:3, :3].T
     return out
 
 
@@ -187,9 +187,9 @@ class _Place:
         for seed in SEEDS[::2]:
             aside = seed * search[:, None]
             # ivec2() truncates towards zero.
-            found = _fetched(depths, np.trunc((xy + aside) * self.size).astype(np.intp), empty=True)
-            hides = found > self._limit(depth, aside)
-            blockers, count = blockers + np.where(hides, found, 0.0), count + hides
+            nearest = _fetched(depths, np.trunc((xy + aside) * self.size).astype(np.intp), empty=True)
+            hides = nearest > self._limit(depth, aside)
+            blockers, count = blockers + np.where(hides, nearest, 0.0), count + hides
         # The penumbra's width, by similar triangles from the mean blocker.
         blocker = blockers / np.maximum(count, 1)
         if self.sun:

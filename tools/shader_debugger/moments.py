@@ -164,7 +164,7 @@ def buffers_of(scene: Scene, filtered: tuple[str, ...] = ()) -> dict[str, Pass]:
         if there.get(lookup_of(name)[1], True)
         and name not in MAPS[maps:]
         and (name not in FILTERED or name in filtered)
-        and ((found := view_of(name)) is None or found[0].can_be_of(scene))
+        and ((shown := view_of(name)) is None or shown[0].can_be_of(scene))
     }
 
 
@@ -304,8 +304,8 @@ class ReferenceMoment(_Lazy):
         return reference.render(self.scene, self.when.t_ns, xy=self._places.astype(np.float64))
 
     def _make(self, name):
-        if (found := view_of(name)) is not None:
-            label, view = found
+        if (shown := view_of(name)) is not None:
+            label, view = shown
             try:
                 return {name: np.asarray(view.reference(self.seen, self.labels))}
             except Exception as error:
@@ -345,10 +345,10 @@ class ReferenceMoment(_Lazy):
         out["texture_size"][:] = out["needles"][:] = 1.0
         out["lamps"] = np.zeros((*frame.hit.shape, len(lamps_of(self.scene.light))))
         out["matt"] = np.ones(frame.hit.shape)
-        for p, (thing, part) in enumerate(casting.scene_parts(self.scene)):
+        for p, (body, part) in enumerate(casting.scene_parts(self.scene)):
             on = frame.part == p
             if on.any():
-                self._look_up(out, frame, thing, part, on)
+                self._look_up(out, frame, body, part, on)
                 self._light_up(out, frame, part, on)
         radiance = out["lit"] + out["mirrored"] + out["emission"]
         # Fog is between the surface and the camera: apply it after all light.
@@ -361,14 +361,14 @@ class ReferenceMoment(_Lazy):
         self,
         out: dict[str, np.ndarray],
         frame: reference.ReferenceFrame,
-        thing: SceneObject,
+        body: SceneObject,
         part: Part,
         on: np.ndarray,
     ) -> None:
         """Write the texture coordinates of the pixels ``on`` of a part, and the albedo there."""
         scene, mesh, material = self.scene, part.mesh, part.material
         corners = mesh.faces[frame.triangle[on]]
-        pose = casting.relative_pose_at(scene, thing, frame.t_ns)
+        pose = casting.relative_pose_at(scene, body, frame.t_ns)
         # In the axes of the camera, with the shape at this time.
         points = casting.vertices_at(mesh, frame.t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
         out["needles"][on] = needles(points, scene.camera)

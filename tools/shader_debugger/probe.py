@@ -133,12 +133,12 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
 def _surface(parts, p, triangle, bary) -> dict:
     if p < 0:
         return {"object": None}
-    thing, part = parts[p]
+    body, part = parts[p]
     return {
-        "object": thing.name,
-        "category": thing.category,
-        "instance": thing.instance_id,
-        "part": [i for i, own in enumerate(thing.parts) if own is part][0],
+        "object": body.name,
+        "category": body.category,
+        "instance": body.instance_id,
+        "part": [i for i, own in enumerate(body.parts) if own is part][0],
         "mesh": part.mesh.name,
         "texture": part.material.texture.name if part.material.texture else None,
         "triangle": triangle,
@@ -173,12 +173,12 @@ def _positions(gpu, ref, x, y, point) -> list[dict]:
 
     p = int(gpu["part"][y, x])
     local = gpu["local"][y, x].astype(np.float64) if p >= 0 else None
-    thing = casting.scene_parts(scene)[p][0] if p >= 0 else None
+    body = casting.scene_parts(scene)[p][0] if p >= 0 else None
 
     def world(t_ns):
-        if thing is None:
+        if body is None:
             return None
-        pose = thing.path.pose(t_ns)
+        pose = body.path.pose(t_ns)
         return pose[:3, :3] @ local + pose[:3, 3]
 
     true_world, true_camera = _placed(scene, point, when.t_ns)
@@ -240,7 +240,7 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
     # The pixel that contains the point then.
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
     other = int(there["ids"][yn, xn])
-    names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
+    names = {body.instance_id: body.name for body in renderer.scene.objects}
     return (
         f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth "
         f"{there['depth'][yn, xn]:.6g}, the point is at Z' = {w:.6g}"
@@ -250,21 +250,21 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
 # ------------------------------------------------------------------------------------------------- text
 
 
-def as_text(found: dict) -> str:
+def as_text(result: dict) -> str:
     """Return the probe as fixed-width text."""
-    x, y = found["pixel"]
+    x, y = result["pixel"]
     lines = [
         (
-            f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
-            f"{found['times_s']['backward']:.9g} s (backward)"
+            f"pixel ({x}, {y}) at t = {result['t_s']:.9g} s; t' = {result['times_s']['forward']:.9g} s (forward), "
+            f"{result['times_s']['backward']:.9g} s (backward)"
         )
     ]
-    if found["band"]:
+    if result["band"]:
         lines.append(
             "in the silhouette band: the pixel's centre may fall on either side of an edge, so nothing is graded here"
         )
     lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]
-    for row in found["buffers"]:
+    for row in result["buffers"]:
         mark = {True: "", False: "!!", None: ""}[row["ok"]]
         count = "" if row["ulps"] is None else f"{row['ulps']:.3g}"
         lines.append(
@@ -275,14 +275,14 @@ def as_text(found: dict) -> str:
             lines.append(f"{'':24}{row['note']}")
     lines.append("")
     for side in ("gpu", "reference"):
-        lines.append(f"{'GPU drew' if side == 'gpu' else 'reference hit':<14} {_surface_text(found['surface'][side])}")
-    if found["positions"]:
+        lines.append(f"{'GPU drew' if side == 'gpu' else 'reference hit':<14} {_surface_text(result['surface'][side])}")
+    if result["positions"]:
         lines += ["", f"{'position':<20} {'GPU':<52} reference (float64)"]
         lines += [
-            f"{row['name']:<20} {_numbers(row['gpu']):<52} {_numbers(row['reference'])}" for row in found["positions"]
+            f"{row['name']:<20} {_numbers(row['gpu']):<52} {_numbers(row['reference'])}" for row in result["positions"]
         ]
     lines.append("")
-    for way, why in found["why"].items():
+    for way, why in result["why"].items():
         for side in ("gpu", "reference"):
             lines.append(f"{way:<9} {'GPU' if side == 'gpu' else 'reference':<10} {why[side] or 'seen at both times'}")
     return "\n".join(lines)

@@ -88,9 +88,9 @@ def _misplaced(g, r, gpu, ref):
     wrong pose or shape is separated from later errors."""
     part, scene, camera = gpu["part"], ref.scene, ref.scene.camera
     out = np.zeros(part.shape)
-    for p, (thing, one) in enumerate(casting.scene_parts(scene)):
+    for p, (body, one) in enumerate(casting.scene_parts(scene)):
         y, x = np.nonzero(part == p)
-        local, pose = gpu["local"][y, x].astype(np.float64), casting.relative_pose_at(scene, thing, ref.when.t_ns)
+        local, pose = gpu["local"][y, x].astype(np.float64), casting.relative_pose_at(scene, body, ref.when.t_ns)
         there = local @ pose[:3, :3].T + pose[:3, 3]
         aside = np.linalg.norm(camera.project(there) - ref.frame.xy[y, x], axis=1)
         corners = casting.vertices_at(one.mesh, ref.when.t_ns)[one.mesh.faces[gpu["triangle"][y, x].astype(int) - 1]]

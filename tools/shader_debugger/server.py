@@ -45,10 +45,10 @@ def host_allowed(header: str | None, bound: str, port: int) -> bool:
         return False
     try:
         parts = urlsplit(f"//{header}")
-        name, given = (parts.hostname or "").lower(), parts.port
+        name, asked_port = (parts.hostname or "").lower(), parts.port
     except ValueError:
         return False
-    if parts.username is not None or parts.path or parts.query or parts.fragment or given not in (None, port):
+    if parts.username is not None or parts.path or parts.query or parts.fragment or asked_port not in (None, port):
         return False
     if name in LOCAL or name == bound.lower():
         return bool(name)

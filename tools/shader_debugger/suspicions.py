@@ -45,9 +45,9 @@ def suspicions(comparison: Any, report: Any) -> list[str]:
             _fitted(name, r[wrong[about]], g[wrong[about]], r),
         ):
             shares = [(_share(comparison, report, gpu, right, about, made), text) for text, made in candidates]
-            found = sorted((one for one in shares if one[0] >= EXPLAINED), key=lambda one: -one[0])
-            if found:
-                return [f"{text} (fits {100 * share:.1f} % of the wrong pixels)" for share, text in found[:MOST]]
+            likely = sorted((one for one in shares if one[0] >= EXPLAINED), key=lambda one: -one[0])
+            if likely:
+                return [f"{text} (fits {100 * share:.1f} % of the wrong pixels)" for share, text in likely[:MOST]]
     return []
 
 

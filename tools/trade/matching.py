@@ -54,10 +54,10 @@ def match_events(reference: Events, judged: Events, height: int, width: int, lim
     t_a, t_b = np.asarray(reference.t, np.int64), np.asarray(judged.t, np.int64)
     partner = np.full(len(reference), -1, np.int64)
     _match(starts_a, order_a, t_a, starts_b, order_b, t_b, np.int64(limit_us), partner)
-    found = partner >= 0
+    paired = partner >= 0
     dt = np.zeros(len(reference), np.int64)
-    dt[found] = t_b[partner[found]] - t_a[found]
-    return Matching(partner, dt, len(judged) - int(found.sum()))
+    dt[paired] = t_b[partner[paired]] - t_a[paired]
+    return Matching(partner, dt, len(judged) - int(paired.sum()))
 
 
 def _trains(events: Events, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -428,8 +428,8 @@ class Bench:
                 level.movement = {k: moved[k] + carried[k] for k in JUDGED}
                 level.smallest = {k: float(np.nanmin([r.errors.to_dict()[k] for r in results])) for k in JUDGED}
             levels.append(level)
-            said = f"; moved by {max(level.ratio.values()):.2g} of the smallest error" if level.ratio else ""
-            self.say(f"reference {scale}x{scale} samples, {max_px:g} px, {frames} frames, {level.seconds:.0f} s{said}")
+            drift = f"; moved by {max(level.ratio.values()):.2g} of the smallest error" if level.ratio else ""
+            self.say(f"reference {scale}x{scale} samples, {max_px:g} px, {frames} frames, {level.seconds:.0f} s{drift}")
             if level.converged:
                 break
         if levels[-1].whole and (moved := levels[-1].movement):

@@ -87,9 +87,9 @@ def event_errors(
     if mask is not None:
         mine, theirs = masked(mine, mask), masked(theirs, mask)
     matching = match_events(theirs, mine, height, width, limit_us)
-    found = matching.matched
-    late = np.abs(matching.dt_us[found])
-    shift = late * 1e-6 * speeds.at(theirs.x[found], theirs.y[found], theirs.t[found])
+    paired = matching.matched
+    late = np.abs(matching.dt_us[paired])
+    shift = late * 1e-6 * speeds.at(theirs.x[paired], theirs.y[paired], theirs.t[paired])
     total = len(theirs)
     share = lambda n: n / total if total else float("nan")
     true = voxel_grid(theirs, t0_us, t1_us, height, width, BINS)
@@ -100,7 +100,7 @@ def event_errors(
         total,
         *_spread(late),
         *_spread(shift),
-        share(total - int(found.sum())),
+        share(total - int(paired.sum())),
         share(matching.extra),
         difference / norm if norm else float("nan"),
     )

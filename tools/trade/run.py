@@ -47,15 +47,15 @@ def chosen(settings: tuple[Setting, ...], only: list[str], skip: Sequence[str] =
     """Return the settings whose name contains one of ``only`` (default: all) and none of ``skip``. Raises ConfigError
     when none is left."""
     has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)
-    found = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
-    if not found:
+    chosen = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
+    if not chosen:
         raise ConfigError(
             "no setting has this name",
             where="--only, --skip",
             value=", ".join([*only, *skip]),
             accepted="part of a name such as " + ", ".join(f"'{s.name}'" for s in settings[:3]),
         )
-    return found
+    return chosen
 
 
 def trade(

@@ -68,15 +68,15 @@ def clips(folder: str | Path | None = None, only: Sequence[str] = ()) -> tuple[T
     every = tuple(Trial(path.stem, path) for path in sorted(place.glob("*.yaml")))
     if not every:
         raise ConfigError("the folder has no scenes", where=str(folder), accepted="a folder with .yaml files")
-    found = tuple(c for c in every if not only or any(text.lower() in c.name.lower() for text in only))
-    if not found:
+    chosen = tuple(c for c in every if not only or any(text.lower() in c.name.lower() for text in only))
+    if not chosen:
         raise ConfigError(
             "no scene has this name",
             where="--scene",
             value=", ".join(only),
             accepted="part of one of " + ", ".join(c.name for c in every),
         )
-    return found
+    return chosen
 
 
 def run_suite(
@@ -164,9 +164,9 @@ def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any]
 def preset_names(names: Iterable[str]) -> dict[str, str]:
     """Return quality -> name of its setting, for those among ``names``."""
     known = {s.name: meaning(s.overrides) for s in suite_design()}
-    found = [(name, known[name]) for name in names if name in known]
+    meanings = [(name, known[name]) for name in names if name in known]
     presets = {quality: meaning(f"{t}={json.dumps(v)}" for t, v in _tables(quality)) for quality in QUALITIES}
-    return {quality: name for quality, wanted in presets.items() for name, meant in found if meant == wanted}
+    return {quality: name for quality, wanted in presets.items() for name, meant in meanings if meant == wanted}
 
 
 def _tables(quality: str) -> list[tuple[str, Any]]:

@@ -29,8 +29,8 @@ def run(
     """Measure the scenes and write the files. others : options of one scene, and whether they were given. Returns 3
     where a scene is missing, for scripts. Raises BlinkGLError."""
     check_cost(cost)
-    if given := [name for name, said in others.items() if said]:
-        raise ConfigError("these are options of a single scene", where=", ".join(given), accepted="without --suite")
+    if foreign := [name for name, set_here in others.items() if set_here]:
+        raise ConfigError("these are options of a single scene", where=", ".join(foreign), accepted="without --suite")
     console = plain_console()
     options = replace(OPTIONS, limit_us=round(limit_ms * 1000))
     result = run_suite(

@@ -174,12 +174,18 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "ample": {"readout": {"events_per_second": 1e9}},
         "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
         "clock": {"readout": {"clock_us": 10}},
+        "controlled": {"readout": {"roi": [1, 0, 4000, 4000], "max_rate": 1e6}},
         "resets": {"readout": {"frame_resets": {"interval_ms": 8, "kick": 1.2, "first_ms": 3}}},
         "pixels": {
             "readout": {
                 "pixels": {"dead_fraction": 0.1, "hot_fraction": 0.02, "hot_rate_hz": 500, "rate_hz": 5},
             }
         },
+    },
+    "optics": {
+        "none": NOTHING,
+        "spread": {"optics": {"psf": {"kind": "gaussian", "sigma": 0.4}}},
+        "filters": {"optics": {"bayer": "rggb", "lens": {"aperture": 0.05, "focus": 4.0}, "lens_points": 4}},
     },
     "anti-aliasing": {name: {"render": {"antialiasing": name}} for name in ("taps4", *FILTERS)},
     "images": {
@@ -232,6 +238,20 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "lit": NOTHING,
         "unlit": {"scene": {"light": {"unlit": True}}},
         "shadows": {"scene": {"light": {"shadows": "soft", "shadow_size": 64}}},
+        "flicker": {
+            "scene": {
+                "light": {
+                    "over_time": {"kind": "sine", "frequency": 100, "depth": 0.2},
+                    "lights": [
+                        {
+                            "kind": "point",
+                            "motion": {"position": [0.5, 0.5, 2.0]},
+                            "over_time": {"kind": "pwm", "frequency": 150},
+                        }
+                    ],
+                }
+            }
+        },
         "lamps": {
             "scene": {
                 "fog": {"density": 0.02},
@@ -312,6 +332,13 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
         if camera != "none"
     },
     **{
+        (("source", source), ("optics", what)): "optics: recorded frames have come through their own lens"
+        for source in FEATURES["source"]
+        if source.startswith("frames")
+        for what in FEATURES["optics"]
+        if what != "none"
+    },
+    **{
         (("source", source), ("over time", what)): ("tracks" if what == "drawn" else "imu") + ": recorded frames do not"
         for source in FEATURES["source"]
         if source.startswith("frames")
@@ -327,10 +354,16 @@ TOO_SLOW: set[tuple[Kind, Kind]] = {(("source", one), ("textures", "sharp")) for
 """Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with anisotropy
 where a ground ends at the horizon (the footprint of a pixel there is endless, and it adds up every texel of it)."""
 
+OTHER_WAY: set[tuple[Kind, Kind]] = {
+    (("source", one), ("flow", "backward")) for one in ("frames, motion", "frames, linear")
+}
+"""Pairs that set a sequence aside: the flow of a file leads forward (tests/sequence/test_flow_of_others.py)."""
+
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
     "camera moves, and what moves by itself",
     "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
+    "optics": "tests/imaging/test_optics.py: every point spread and pattern; here what is written and read",
     "frames.flow_direction": "tests/sequence/test_flow_of_others.py: it has to go with `labels.flow`",
     "events.device": "tests/tensors/test_device_emulator.py: either device writes the same files",
     "imu": "tests/sequence/test_inertial.py, tests/dataset/test_over_time.py; here what is written and read",
@@ -379,7 +412,9 @@ def refusal(row: dict[str, str]) -> str | None:
 
 def fits(row: dict[str, str]) -> bool:
     """Whether a row may be made here."""
-    return refusal(row) is None and not any(row.get(a[0]) == a[1] and row.get(b[0]) == b[1] for a, b in TOO_SLOW)
+    return refusal(row) is None and not any(
+        row.get(a[0]) == a[1] and row.get(b[0]) == b[1] for a, b in (*TOO_SLOW, *OTHER_WAY)
+    )
 
 
 def pairs(row: dict[str, str]) -> set[tuple[Kind, Kind]]:

@@ -47,6 +47,7 @@ ORDER = (
     "scene_in_python",
     "living_scene",
     "star_field",
+    "star_tracker",
     "optical_marker",
     "frame_with_labels",
     "own_label",

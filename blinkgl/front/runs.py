@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
@@ -53,6 +53,8 @@ class Settings(TypedDict, total=False):
     images: Section | None
     imu: Section | None
     tracks: Section | None
+    optics: Mapping[str, Any] | None
+    readout: Mapping[str, Any] | None
 
 
 @check.public(Settings)
@@ -71,7 +73,7 @@ def generate(
     source : :class:`Scene` or the result of :func:`load`.   num : number of sequences, dealt over the recipe's groups.
     workers : processes; 1: this one.
     resume : continue where ``out`` contains sequences of this run.   settings : emulator, sensor, timeline, quality,
-    labels, images, imu, tracks as of :func:`record`, rig as of :func:`record`.
+    labels, images, imu, tracks, optics, readout as of :func:`record`, rig as of :func:`record`.
     Returns the counts (``made.events``, ``made.labels`` …) and the sequences set aside.
     Raises BlinkGLError: ConfigError (also for a scene with arrays: save them to files
     first), AssetError, GLError, OutputError."""

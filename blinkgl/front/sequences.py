@@ -83,6 +83,7 @@ class Recording:
     camera : :class:`CameraImage` of the frame camera, with ``images:``.
     imu : measurements of the inertial unit, :class:`~blinkgl.sequence.inertial.Inertial`; None: no unit.
     tracks : tracked points, :class:`~blinkgl.render.tracks.Tracks`; None: not requested.
+    lights : arrays of light that changes over time, as of :func:`blinkgl.io.lights.read_lights`; {}: none does.
 
     cameras : recordings by name; that of a frame camera without events contains none.
     units : measurements of every sensor with an inertial unit, by name; ``T_cam_imu`` leads to that sensor's axes.
@@ -102,6 +103,7 @@ class Recording:
     camera: tuple[CameraImage, ...] = ()
     imu: Inertial | None = None
     tracks: Tracks | None = None
+    lights: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
     cameras: Mapping[str, Recording] = field(default_factory=dict, repr=False)
     units: Mapping[str, Inertial] = field(default_factory=dict, repr=False)
     T_rig_sensor: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
@@ -154,6 +156,7 @@ def record(source: Source, rig: Rig | str | None = None, *, index: int = 0, **se
     images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
+    optics, readout : tables of ``optics:`` and ``readout:``, ``{"psf": {"kind": "gaussian", "sigma": 0.8}}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     with simulate_sequence(source, rig, index=index, **settings) as sequence:
         gathered = {member.name: Gathered() for member in sequence.members}
@@ -213,6 +216,7 @@ class Gathered:
             camera=tuple(self._images),
             imu=sequence.imu(),
             tracks=sequence.tracks(),
+            lights=sequence.lights(),
         )
 
 

@@ -54,7 +54,10 @@ def new_app(name: str, about: str) -> typer.Typer:
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback(help=about, epilog=f"\b\ndocs/tasks.md: forty tasks, a few lines each.\ndocs/… in a message is a page below\n{pages()}")(_global_options)
+    app.callback(
+        help=about,
+        epilog=f"\b\ndocs/tasks.md: forty tasks, a few lines each.\ndocs/… in a message is a page below\n{pages()}",
+    )(_global_options)
     return app
 
 

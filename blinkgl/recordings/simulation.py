@@ -1,11 +1,9 @@
 """Conversion of any video to events.
 
-    for events in frames_to_events(frames, fps=1000, emulator="v2e"):
-        ...
+    for events in frames_to_events(frames, fps=1000, emulator="v2e"): ...
 
-``frames`` is any iterable, a generator included; only the current frames are stored. :func:`file_to_events` is the same
-from file to file (``blinkgl simulate``). :func:`blinkgl.simulate` and :func:`blinkgl.simulate_file` are their public
-interfaces.
+``frames`` is any iterable; only the current frames are stored. Public: :func:`blinkgl.simulate` and, from file to file
+(:func:`file_to_events`), :func:`blinkgl.simulate_file`.
 """
 
 from __future__ import annotations
@@ -67,12 +65,11 @@ class SimulationReport:
     emulator's max_events_per_step.   lost : events that found the queue of the sensor's read-out full.   late : events
     that were still on the read-out's bus at the last frame.   causes : events by cause, "signal", "leak", "shot" and
     "hot"; empty unless ``causes`` of the emulator is set.   displacement : for interpolate="motion".   moved_px : for
-    interpolate="linear", 99th percentile of the dense flow between a few pairs of given frames.   assumed_gamma :
-    assumed curve of codes without a given one, that of the sensor's own frames, srgb of integers, linear of floats.
+    interpolate="linear", 99th percentile of the dense flow between a few pairs of frames.   assumed_gamma : curve of
+    codes that state none: of the sensor's own frames its own, of integers srgb, of floats linear.
     fitting : conversion of frames to the sensor's size; None: not needed.   noise : of the frames, from which no events
-    were made; None: exact frames, or it was kept.   notes : what was read that is unusual, guessed or left out, a line
-    each, with the option that overrules it.   caveats : problems of the frames, a line each: few codes, clipped,
-    repeated, flicker."""
+    were made; None: exact frames, or it was kept.   notes : what was unusual or left out, a line each, with the option
+    that overrules it.   caveats : problems of the frames, a line each: few codes, clipped, repeated, flicker."""
 
     frames: int = 0
     steps: int = 0
@@ -459,10 +456,8 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
 
 
 def with_sensor(emulator: dict[str, Any], sensor: str | None) -> tuple[EmulatorConfig, SensorConfig | None]:
-    """Return the emulator of a plain table, with the values of a sensor where the table gives none, and that sensor.
-    Raises ConfigError.
-
-    sensor : the name of a shipped one, or a sensor file; None: the emulator's defaults."""
+    """Return the emulator of a plain table, with the values of a sensor where the table gives none, and that sensor, a
+    shipped one's name or a sensor file; None: the emulator's defaults. Raises ConfigError."""
     from blinkgl.config.sensor import load_sensor
 
     if sensor is None:

@@ -1,10 +1,7 @@
 """Reader of glTF 2.0 (.gltf with its buffers and images, .glb): meshes, cameras, node hierarchy, skins, animations.
 
-It replaces trimesh's reader, because a scene needs cameras, unlit and double-sided materials, node names and
-animations, and because every count and path of a file must be checked before it is used. Reference: Khronos glTF 2.0
-specification, sections 3.5 (scenes), 3.6 (accessors), 3.7 (meshes, skins), 3.10 (cameras), 3.11 (animations).
-:mod:`~blinkgl.scene.importing.gltf_file` reads its JSON and buffers, :mod:`~blinkgl.scene.importing.gltf_materials` its
-materials.
+It replaces trimesh's reader, because a scene needs cameras, materials, node names and animations, and because every
+count and path of a file must be checked before it is used. Reference: Khronos glTF 2.0, sections 3.5 to 3.11.
 
 Coordinates stay as in the file (y up); the caller turns them z up (:data:`~blinkgl.scene.importing.parts.Z_UP`).
 Features that are not drawn are collected in :attr:`Document.omissions`.

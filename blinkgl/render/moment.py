@@ -233,6 +233,15 @@ class Moment:
         """Return the nearest ``most`` bodies whose bounding sphere is under :data:`SPECK` samples of a picture of
         ``grid`` samples per pixel in x and y, front to back: (k,) int64 and (k, 4) float64, the sphere's middle, from
         the picture's corner, and its diameter, in samples, and its depth (near / Z), the nearest point's."""
+        if (grid, most) not in self._specks:
+            self._specks[grid, most] = self._found_specks(grid, most)
+        return self._specks[grid, most]
+
+    @cached_property
+    def _specks(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
+        return {}
+
+    def _found_specks(self, grid: int, most: int) -> tuple[np.ndarray, np.ndarray]:
         stage, camera, P = self._stage, self.view.camera, self.view.projection
         T, radius = self.T_cam_obj, stage.body_radius
         X, Y, Z = ((T[:, :3, :3] @ stage.body_centre[..., None])[..., 0] + T[:, :3, 3]).T

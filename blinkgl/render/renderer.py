@@ -113,6 +113,7 @@ class Renderer(Releasing):
             self._shadows = shadow_maps(scene, self.items) if beside is None else beside._shadows  # noqa: SLF001
         # The shadow of a moving object also changes surfaces at rest.
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
+        self.notes: tuple[str, ...] = ()  # what is drawn less well than it could be, a line each
         # A body under a pixel moves without a rectangle of its own.
         self._specks = self._most_specks(samples.grid) if samples.shared else 0
         lights_stand = lamps_stand and not scene.waveforms
@@ -144,7 +145,11 @@ class Renderer(Releasing):
     def _most_specks(self, grid: int) -> int:
         """Return how many bodies under a pixel get their light by their area: half more than at the
         busiest time."""
-        most = max(len(self.moment(t_ns).specks(grid, _MOST_SPECKS)[0]) for t_ns in self._some_times(_SPECK_LOOKS))
+        every = len(self.scene.objects)
+        most = max(len(self.moment(t_ns).specks(grid, every)[0]) for t_ns in self._some_times(_SPECK_LOOKS))
+        if most > _MOST_SPECKS:
+            line = f"{most:,} bodies under a pixel: the nearest {_MOST_SPECKS:,} shine by their area"
+            self.notes = (f"{line}, the others where they meet the centre of a sample",)
         return min(most + most // 2 + (most > 0), _MOST_SPECKS)
 
     def release(self) -> None:

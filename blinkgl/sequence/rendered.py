@@ -79,7 +79,8 @@ class RenderedSequence(SensorSimulation):
         size, span_ns = (renderer.height, renderer.width), request.window_ns or (scene.t0_ns, scene.t1_ns)
         self.scene, self.renderer = scene, renderer
         # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
-        self._notes = scene.omissions + (() if config.scene.kind == "random" else scene.log) + nothing_in_view(scene)
+        log = () if config.scene.kind == "random" else scene.log
+        self._notes = scene.omissions + log + nothing_in_view(scene) + renderer.notes
         if scene.dynamics is not None:
             self.libraries = {scene.dynamics.engine: scene.dynamics.version}
         if request.labels:

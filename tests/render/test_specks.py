@@ -120,3 +120,15 @@ def test_with_samples_instead_of_lines():
     for antialiasing in ("ssaa2", "ssaa4"):
         (image,) = picture([ball(20.3, 12.4, 0.2)], antialiasing=antialiasing)
         assert image.sum() == pytest.approx(3 * DISC * 0.04, rel=0.03)
+
+
+def test_more_specks_than_fit_are_said_and_the_nearest_are_right(monkeypatch):
+    monkeypatch.setattr("blinkgl.render.renderer._MOST_SPECKS", 3)
+    near = [ball(8.3 + 10 * k, 12.4, 0.2, k + 1) for k in range(3)]
+    far = [ball(8.3 + 10 * k, 24.4, 0.2, k + 4, away=2 * AWAY) for k in range(4)]
+    rig = Rig.alone(PinHole(W, H, F, F, (W - 1) / 2, (H - 1) / 2), still(rotation=LEVEL))
+    scene = Scene((*near, *far), rig, 0, SECOND, light=Light(sun=0.0, sky=0.0))
+    with create_context() as gl, Renderer(gl, scene, RenderConfig(antialiasing="edges")) as renderer:
+        image = renderer.luminance(0).read()
+        assert renderer.notes and renderer.notes[0].startswith("7 bodies under a pixel: the nearest 3 shine")
+    assert image[:18].sum() == pytest.approx(3 * 3 * DISC * 0.04, rel=0.04)

@@ -218,6 +218,8 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path, cost: Cost, 
             "no mask files, labels.occlusion: false, or no flow",
         ),
         ("preview", config.preview.enabled, "preview.enabled: false"),
+        ("light over time", bool(scene.waveforms), "no over_time: lamps and emission are constant"),
+        ("optics of the event camera", config.optics is not None, "optics: null (in focus, no point spread)"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
     )
     brought = {LABELS[name].heading for name in RECORDED}
@@ -260,6 +262,7 @@ def _describe(scene: Scene, renderer: Renderer, config: SequenceConfig) -> dict[
         "light": f"{_shining(scene.light)} on {lit} of {len(parts)} parts, the others unlit"
         if lit
         else "none: every surface is unlit",
+        **({"light over time": ", ".join(scene.waveforms)} if scene.waveforms else {}),
         **_fog(scene),
         "quality": quality_in_words(config),
         **({"anti-aliasing": f"{renderer.antialiasing}: {renderer.crowded}"} if renderer.crowded else {}),
@@ -304,6 +307,10 @@ def _passes(config: SequenceConfig, scene: Scene, renderer: Renderer, rate: floa
     _over_time(config, scene, result)
     if config.images is not None:
         result.passes.append(_frame_camera(config.images, renderer, scene))
+    if (optics := config.optics) is not None:
+        parts = [name for name in ("psf", "lens", "bayer") if getattr(optics, name) is not None]
+        points = f", {optics.lens_points} points of the lens in each frame" if optics.lens else ""
+        result.add("optics", ", ".join(parts) + points, result.frames)
     words = f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second"
     result.add("event kernel", words, result.frames)
 

@@ -218,8 +218,6 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path, cost: Cost, 
             "no mask files, labels.occlusion: false, or no flow",
         ),
         ("preview", config.preview.enabled, "preview.enabled: false"),
-        ("light over time", bool(scene.waveforms), "no over_time: lamps and emission are constant"),
-        ("optics of the event camera", config.optics is not None, "optics: null (in focus, no point spread)"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
     )
     brought = {LABELS[name].heading for name in RECORDED}
@@ -388,6 +386,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         ("inertial unit", config.imu is not None, "imu: null"),
         ("point tracks", config.tracks is not None, "tracks: null"),
         ("what made each event", config.labels.events, "labels.events: false"),
+        ("light over time", bool(scene.waveforms), "no over_time: lamps and emission are constant"),
+        ("optics of the event camera", config.optics is not None, "optics: null (in focus, no point spread)"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
         ("frame camera: motion blur, noise, lens", images is not None, "images: null"),
     )

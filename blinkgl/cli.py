@@ -337,7 +337,7 @@ def export(
         str | None,
         typer.Option(
             help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
-            "multiflow, eventkubric or rosbag."
+            "multiflow, eventkubric, rosbag or nerf."
         ),
     ] = None,
     shard_mb: Annotated[

@@ -16,6 +16,7 @@ from blinkgl.layouts.event_kubric import EventKubric
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
+from blinkgl.layouts.nerf import Nerf
 from blinkgl.layouts.planned import Planned
 from blinkgl.layouts.rosbag import RosBag
 from blinkgl.layouts.source import Source, sources_of
@@ -35,7 +36,10 @@ def register(layout: Layout) -> Layout:
     return layout
 
 
-for _layout in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()):
+for _layout in (
+    *(Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()),
+    Nerf(),
+):
     register(_layout)
 
 

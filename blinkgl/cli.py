@@ -337,7 +337,7 @@ def export(
         str | None,
         typer.Option(
             help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
-            "multiflow, eventkubric, rosbag or nerf."
+            "multiflow, eventkubric, rosbag, nerf or intervals."
         ),
     ] = None,
     shard_mb: Annotated[

@@ -17,7 +17,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
 from blinkgl.camera.pinhole import rectified
-from blinkgl.io.atomic import output_errors
 from blinkgl.io.formats import write_events
 from blinkgl.io.frame_camera import EXPOSURE_POSES, EXPOSURES, read_exposure_poses, read_exposures
 from blinkgl.io.images import encode_npy, encoded
@@ -80,9 +78,8 @@ class Nerf(Layout):
         for name, lines in _colmap(camera, T_world_cam[:, 1]).items():
             write_lines(folder / f"sparse/0/{name}.txt", lines)
         write_bytes(folder / "poses_bounds.npy", encode_npy(_llff(source, camera, T_world_cam[:, 1])))
-        write_events(folder / "events.npz", source.events(), source.height, source.width)
-        with output_errors(folder):
-            shutil.copyfile(source.folder / "events.h5", folder / "events.h5")
+        for name in ("events.npz", "events.h5"):
+            write_events(folder / name, source.events(), source.height, source.width, t_offset_us=source.start_us)
         for split in ("train", "validation"):
             _event_nerf(source, camera, frames, T_world_cam[:, 1], folder / "eventnerf" / split)
         return [f"{source.name}: {line}" for line in _notes(camera, frames)]

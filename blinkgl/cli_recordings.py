@@ -157,7 +157,6 @@ def saccade(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the run.")] = 0,
     workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes that make clips.")] = 1,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
     """Make event clips of still pictures, with classes. The sensor moves over each picture; no OpenGL is needed."""
     from blinkgl.show import saccade as command
@@ -174,7 +173,6 @@ def saccade(
         overrides=overrides or [],
         seed=seed,
         workers=workers,
-        quiet=quiet,
     )
 
 

@@ -275,6 +275,7 @@ def _made_by(sequence: Simulation | SensorSimulation, libraries: Mapping[str, st
         "seed": sequence.config.seed,
         "sequence": sequence.index,
         "split": sequence.config.output.split,
+        **({} if sequence.config.output.label is None else {"class": sequence.config.output.label}),
         "frames": sequence.frames,
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files

@@ -19,7 +19,6 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -93,9 +92,11 @@ def _camera_poses(source: Source, frames: Frames) -> np.ndarray:
     return np.repeat(source.poses["T_world_cam"][at][:, None], 3, axis=1)
 
 
-def _transforms(source: Source, camera: CameraModel, frames: Frames, T_world_cam: np.ndarray) -> dict[str, Any]:
+def _transforms(
+    source: Source, camera: CameraModel, frames: Frames, T_world_cam: np.ndarray
+) -> dict[str, dict[str, object]]:
     """Return the content of the JSON files by name."""
-    about: dict[str, Any] = {
+    about: dict[str, object] = {
         "camera_model": {"radtan": "OPENCV", "equidistant": "OPENCV_FISHEYE"}.get(camera.kind, "PINHOLE"),
         **dict(zip(("fl_x", "fl_y", "cx", "cy"), _intrinsics(camera))),
         **dict(zip(camera.coefficients, camera.distortion)),
@@ -113,24 +114,26 @@ def _transforms(source: Source, camera: CameraModel, frames: Frames, T_world_cam
     clock = (frames.t_us - frames.t_us[0]) / (frames.t_us[-1] - frames.t_us[0])
     matrices = (T_world_cam @ _TO_OPENGL).tolist()
     names = ("transform_matrix_start", "transform_matrix", "transform_matrix_end")
-    rows = [
-        {
-            "file_path": f"images/{k:06d}.png",
-            "time": float(clock[k]),
-            "t_us": int(frames.t_us[k]),
-            **(dict(zip(names, matrices[k])) if blurred else {"transform_matrix": matrices[k][1]}),
-        }
-        for k in range(len(matrices))
-    ]
-    splits: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
-    for k, row in enumerate(rows):
-        splits[{0: "test", _HOLD // 2: "val"}.get(k % _HOLD, "train")].append(row)
-    listed = {f"{split}_filenames": [row["file_path"] for row in rows] for split, rows in splits.items()}
-    still = lambda row: {**row, "file_path": row["file_path"].replace("images/", "sharp/")} if frames.sharp else row
-    held = {name: [still(row) for row in splits[name]] for name in ("val", "test")}
+
+    def rows(numbers: Iterable[int], shown: str = "images") -> list[dict[str, object]]:
+        return [
+            {
+                "file_path": f"{shown}/{k:06d}.png",
+                "time": float(clock[k]),
+                "t_us": int(frames.t_us[k]),
+                **(dict(zip(names, matrices[k])) if blurred else {"transform_matrix": matrices[k][1]}),
+            }
+            for k in numbers
+        ]
+
+    every = range(len(matrices))
+    val, test = every[_HOLD // 2 :: _HOLD], every[::_HOLD]
+    splits = {"train": sorted({*every} - {*val, *test}), "val": val, "test": test}
+    shown = {"train": "images", **dict.fromkeys(("val", "test"), "sharp" if frames.sharp else "images")}
+    listed = {f"{split}_filenames": [row["file_path"] for row in rows(numbers)] for split, numbers in splits.items()}
     return {
-        "transforms": {**about, **listed, "frames": rows},
-        **{f"transforms_{name}": {**about, "frames": rows} for name, rows in {**splits, **held}.items()},
+        "transforms": {**about, **listed, "frames": rows(every)},
+        **{f"transforms_{split}": {**about, "frames": rows(splits[split], shown[split])} for split in splits},
     }
 
 

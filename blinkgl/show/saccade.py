@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import functools
-import io
 import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -16,7 +15,7 @@ from blinkgl.io.atomic import atomic_folder, output_errors
 from blinkgl.io.reading import parsed_size
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.terminal import plain_console, say
-from blinkgl.recordings.saccades import ENDINGS, SACCADES, Clips, read_path, stills_of
+from blinkgl.recordings.saccades import ENDINGS, SACCADES, Clips, Still, read_path, stills_of
 from blinkgl.show.simulate import emulator_options
 from blinkgl.version import __version__
 
@@ -37,7 +36,6 @@ def run(
     overrides: Sequence[str],
     seed: int,
     workers: int,
-    quiet: bool,
 ) -> int:
     """Make the clips and print their number; return 0.   ``form``: one of ENDINGS. Raises BlinkGLError."""
     options = (("--format", form, list(ENDINGS)), ("--classes-from", classes_from, [None, "folders"]))
@@ -50,7 +48,7 @@ def run(
     readout = None if camera is None else camera.readout
     clips = Clips(config, readout, (height, width), points, seed, ENDINGS[form])
     stills = stills_of(Path(pictures), classes_from == "folders")
-    console = plain_console(quiet=quiet)
+    console = plain_console()
     with atomic_folder(out) as folder, announced_compiling(lambda text: say(console, text)):
         for place in {folder / still.label for still in stills}:
             place.mkdir(exist_ok=True)
@@ -61,32 +59,35 @@ def run(
             else:
                 with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
                     made = list(pool.map(functools.partial(_write, clips), tasks, chunksize=_CHUNK))
-        events = [count for count, _ in made]
-        table = io.StringIO()
-        writer = csv.writer(table, lineterminator="\n")
-        writer.writerow(["file", "class", "label", "events"])
-        writer.writerows([s.target(clips.ending), s.label, s.number, n] for s, n in zip(stills, events))
-        about = {
-            "format": "blinkgl-saccades",
-            "blinkgl": __version__,
-            "seed": seed,
-            "emulator": config.model_dump(mode="json"),
-            "sensor": sensor,
-            "size": [width, height],
-            "path": points.tolist(),
-            "classes": sorted({still.label for still in stills} - {""}),
-            "clips": len(stills),
-            "events": sum(events),
-        }
         with output_errors(folder):
-            (folder / "labels.csv").write_text(table.getvalue(), encoding="utf-8")
-            (folder / "manifest.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+            _write_records(folder, clips, stills, [count for count, _ in made])
     shapes = sorted({shape for _, shape in made})
     if len(shapes) > 1:
         (h0, w0), (h1, w1) = shapes[0], shapes[-1]
         say(console, f"pictures of {len(shapes)} sizes, {w0}x{h0} to {w1}x{h1}: each is scaled to the sensor")
-    say(console, f"{out}: {len(stills):,} clips of {width}x{height} px, {sum(events):,} events")
+    say(console, f"{out}: {len(stills):,} clips of {width}x{height} px, {sum(count for count, _ in made):,} events")
     return 0
+
+
+def _write_records(folder: Path, clips: Clips, stills: Sequence[Still], events: Sequence[int]) -> None:
+    """Write labels.csv and manifest.json."""
+    with open(folder / "labels.csv", "w", encoding="utf-8", newline="") as table:
+        writer = csv.writer(table, lineterminator="\n")
+        writer.writerow(["file", "class", "label", "events"])
+        writer.writerows([s.target(clips.ending), s.label, s.number, count] for s, count in zip(stills, events))
+    about = {
+        "format": "blinkgl-saccades",
+        "blinkgl": __version__,
+        "seed": clips.seed,
+        "emulator": clips.emulator.model_dump(mode="json"),
+        "readout": None if clips.readout is None else clips.readout.model_dump(mode="json"),
+        "size": [*clips.size[::-1]],
+        "path": clips.path.tolist(),
+        "classes": sorted({still.label for still in stills} - {""}),
+        "clips": len(stills),
+        "events": sum(events),
+    }
+    (folder / "manifest.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
 
 
 def _write(clips: Clips, task: tuple[int, Path, Path]) -> tuple[int, tuple[int, int]]:

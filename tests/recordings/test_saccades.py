@@ -13,7 +13,7 @@ from blinkgl.io.formats import open_events
 from blinkgl.recordings.saccades import SACCADES, Clips, linear_light, positions
 from blinkgl.recordings.simulation import emulator_config
 
-QUIET = ["--set", "threshold_sigma=0", "-q"]
+IDEAL = ["--set", "threshold_sigma=0"]
 
 
 def digits(folder, classes=("a", "b"), each=2, shape=(28, 28)):
@@ -75,7 +75,7 @@ def test_light_is_the_mean_over_a_pixels_square(tmp_path, shape, size):
 def test_counts_are_those_of_esims_closed_form(tmp_path):
     """A pixel crosses each of its levels, C apart from its first log intensity, as often as its log intensity does."""
     pictures, out = digits(tmp_path / "pictures", ("a",), 1), tmp_path / "out"
-    options = ["--classes-from", "folders", "--out", str(out), "--format", "npz", *QUIET]
+    options = ["--classes-from", "folders", "--out", str(out), "--format", "npz", *IDEAL]
     assert run(["saccade", str(pictures), *options]) == 0
     events = open_events(out / "a/0.npz").read()
     light = np.array([f.luminance for f in clips((34, 34)).frames(linear_light(pictures / "a/0.png"))], np.float64)
@@ -109,7 +109,7 @@ def test_formats_classes_and_manifest(tmp_path):
     for form in ("bin", "npz", "npy"):
         out = tmp_path / form
         options = ["--classes-from", "folders", "--format", form, "--seed", "7", "--workers", "2", "--out", str(out)]
-        assert run(["saccade", str(pictures), *options, "-q"]) == 0
+        assert run(["saccade", str(pictures), *options]) == 0
         made[form] = out
         with open(out / "labels.csv", newline="") as file:
             rows = list(csv.DictReader(file))
@@ -132,7 +132,7 @@ def test_formats_classes_and_manifest(tmp_path):
 def test_a_clip_depends_on_the_seed_and_its_number_alone(tmp_path):
     pictures = digits(tmp_path / "pictures")
     for name, options in {"one": [], "two": ["--workers", "2"], "other": ["--seed", "1"]}.items():
-        out = ["--out", str(tmp_path / name), "-q", *options]
+        out = ["--out", str(tmp_path / name), *options]
         assert run(["saccade", str(pictures), "--classes-from", "folders", *out]) == 0
     data = {name: (tmp_path / name / "b/1.bin").read_bytes() for name in ("one", "two", "other")}
     assert data["one"] == data["two"] != data["other"]
@@ -150,7 +150,7 @@ def test_sensor_path_and_mixed_sizes(tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert "pictures of 2 sizes, 30x30 to 50x50: each is scaled to the sensor" in lines
     assert lines[-1].startswith(f"{tmp_path}/out: 2 clips of 24x16 px, ")
-    assert run(["saccade", str(pictures), "--sensor", "dvxplorer", "--out", str(tmp_path / "large"), "-q"]) == 2
+    assert run(["saccade", str(pictures), "--sensor", "dvxplorer", "--out", str(tmp_path / "large")]) == 2
     assert "a sensor larger than .bin holds" in capsys.readouterr().err and not (tmp_path / "large").exists()
 
 

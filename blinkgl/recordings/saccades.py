@@ -153,12 +153,13 @@ def stills_of(folder: Path, classes: bool) -> list[Still]:
     if not folder.is_dir():
         raise AssetError("no such folder", where=str(folder), accepted=accepted)
     places = sorted(place for place in folder.iterdir() if place.is_dir()) if classes else [folder]
-    stills = [
-        Still(file, place.name if classes else "", number if classes else -1)
-        for number, place in enumerate(places)
-        for file in sorted(place.iterdir())
-        if file.suffix.lower() in IMAGE
-    ]
+    with input_errors(folder):
+        stills = [
+            Still(file, place.name if classes else "", number if classes else -1)
+            for number, place in enumerate(places)
+            for file in sorted(place.iterdir())
+            if file.suffix.lower() in IMAGE
+        ]
     if not stills:
         raise AssetError("no pictures", where=str(folder), accepted=accepted)
     names = [still.target("") for still in stills]

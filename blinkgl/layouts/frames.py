@@ -9,7 +9,7 @@ import numpy as np
 
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
 from blinkgl.labels import LABELS
-from blinkgl.layouts.layout import need
+from blinkgl.layouts.layout import need, write_bytes
 from blinkgl.layouts.source import Source
 
 
@@ -50,3 +50,11 @@ def picture(source: Source, file: Path) -> np.ndarray:
     of another size."""
     label = LABELS["images"]
     return label.read(file, label.forms[0], source.height, source.width)
+
+
+def write_frames(source: Source, frames: Frames, folder: Path) -> None:
+    """Write ``images/`` and ``sharp/``, numbered from 0. Raises AssetError as :func:`picture`; OutputError."""
+    for name, files in (("images", frames.files), ("sharp", frames.sharp)):
+        for k, file in enumerate(files):
+            picture(source, file)
+            write_bytes(folder / f"{name}/{k:06d}.png", file.read_bytes())

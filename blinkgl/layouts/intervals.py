@@ -21,7 +21,7 @@ import numpy as np
 from blinkgl.events.grids import voxel_grid
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.images import encoded
-from blinkgl.layouts.frames import Frames, frames_of, picture, two_frames
+from blinkgl.layouts.frames import Frames, frames_of, picture, two_frames, write_frames
 from blinkgl.layouts.layout import GZIP, Layout, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 from blinkgl.types.events import Events
@@ -44,10 +44,7 @@ class Intervals(Layout):
     def write(self, source: Source, folder: Path) -> list[str]:
         frames, own = frames_of(source), folder / source.name
         write_lines(own / "images/timestamp.txt", frames.t_us.tolist())
-        for name, files in (("images", frames.files), ("sharp", frames.sharp)):
-            for k, file in enumerate(files):
-                picture(source, file)
-                write_bytes(own / f"{name}/{k:06d}.png", file.read_bytes())
+        write_frames(source, frames, own)
         path = folder / f"{source.name}.h5"
         with output_errors(path), h5py.File(path, "w") as grids:
             for k, file in enumerate(frames.files):

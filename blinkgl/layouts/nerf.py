@@ -29,7 +29,7 @@ from blinkgl.io.formats import write_events
 from blinkgl.io.frame_camera import EXPOSURE_POSES, EXPOSURES, read_exposure_poses, read_exposures
 from blinkgl.io.images import encode_npy, encoded
 from blinkgl.io.poses import POSES
-from blinkgl.layouts.frames import Frames, frames_of, picture, two_frames
+from blinkgl.layouts.frames import Frames, frames_of, two_frames, write_frames
 from blinkgl.layouts.layout import Layout, need, write_bytes, write_lines
 from blinkgl.layouts.planned import Planned
 from blinkgl.layouts.source import Source
@@ -68,10 +68,7 @@ class Nerf(Layout):
         if source.rectified and not source.has(EXPOSURES):
             camera = rectified(camera)
         T_world_cam = _camera_poses(source, frames)
-        for name, files in (("images", frames.files), ("sharp", frames.sharp)):
-            for k, file in enumerate(files):
-                picture(source, file)
-                write_bytes(folder / f"{name}/{k:06d}.png", file.read_bytes())
+        write_frames(source, frames, folder)
         for name, content in _transforms(source, camera, frames, T_world_cam).items():
             write_bytes(folder / f"{name}.json", json.dumps(content, indent=1).encode())
         for name, lines in _colmap(camera, T_world_cam[:, 1]).items():

@@ -1,5 +1,5 @@
 """`blinkgl export --layout intervals`, read as the published loaders do: TimeLens' HybridStorage (rpg_timelens,
-common/event.py and image_sequence.py), EVREAL's tools/bs_ergb_to_memmap.py for BS-ERGB, and EvTexture's Hdf5Backend
+common/event.py and image_sequence.py), EVREAL's converter of BS-ERGB, and EvTexture's Hdf5Backend
 with the voxel grids of its DataPreparation.md. No reader here imports blinkgl."""
 
 import cv2

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from blinkgl.cli_recordings import calibrate, compare, convert, import_, simulate
+from blinkgl.cli_recordings import calibrate, compare, convert, import_, saccade, simulate
 from blinkgl.machine.command_line import new_app, run_app, safe_main
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
@@ -337,7 +337,7 @@ def export(
         str | None,
         typer.Option(
             help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
-            "multiflow, eventkubric or rosbag."
+            "multiflow, eventkubric, rosbag, nerf or intervals."
         ),
     ] = None,
     shard_mb: Annotated[
@@ -355,7 +355,7 @@ def export(
     return command.run(folder, out, layout=layout, shard_mb=shard_mb, seed=seed)
 
 
-for _command in (simulate, compare, calibrate, convert):
+for _command in (simulate, saccade, compare, calibrate, convert):
     app.command()(_command)
 app.command("import")(import_)
 

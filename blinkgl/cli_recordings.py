@@ -134,6 +134,48 @@ def simulate(
     )
 
 
+def saccade(
+    pictures: Annotated[str, typer.Argument(metavar="PICTURES", help="Folder of still pictures.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder for the clips, written completely or not at all.")],
+    classes_from: Annotated[
+        str | None, typer.Option("--classes-from", help="folders: each folder in PICTURES is a class.")
+    ] = None,
+    path: Annotated[
+        str | None,
+        typer.Option(help="CSV of the sensor's way, t,x,y in s and px, +y down (default: N-MNIST's saccades)."),
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(help="WIDTHxHEIGHT of the sensor (default: that of --sensor, else 34x34).")
+    ] = None,
+    form: Annotated[str, typer.Option("--format", help="bin (N-MNIST's), npz, or npy (one structured array).")] = "bin",
+    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", help="A shipped sensor, or a sensor file (.yaml), as of simulate.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the run.")] = 0,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes that make clips.")] = 1,
+) -> int:
+    """Make event clips of still pictures, with classes. The sensor moves over each picture; no OpenGL is needed."""
+    from blinkgl.show import saccade as command
+
+    return command.run(
+        pictures,
+        out,
+        classes_from=classes_from,
+        path=path,
+        size=size,
+        form=form,
+        emulator=emulator,
+        sensor=sensor,
+        overrides=overrides or [],
+        seed=seed,
+        workers=workers,
+    )
+
+
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
     b: Annotated[

@@ -47,7 +47,7 @@ from blinkgl.recordings.simulation import file_to_events
 
 HERE = Path(__file__).resolve().parents[1] / "tests" / "fingerprint"
 PINNED = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
-COLOUR = re.compile(r"(^|/)(images|clean|sharp|ev_inf|frame_camera|mvsec/train)$")
+COLOUR = re.compile(r"(^|/)(images|clean|sharp|ev_inf|rgb|frame_camera|mvsec/train|intervals/train)$")
 """Folders of colour pictures, whose sums are kept for each processor vendor."""
 GroupSums = dict[str, str | dict[str, str]]
 NOT_DATA = re.compile(r"(^|/)(manifest\.json|config\.yaml|rig\.yaml|README\.md|\.run/.*)$")

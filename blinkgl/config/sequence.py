@@ -212,6 +212,11 @@ class OutputConfig(Config):
         description="for events.h5 and event_labels.h5: zstd in Blosc, as DSEC's files; lz4 is faster to write "
         "and some percent larger; gzip is slower to write, but h5py reads it without hdf5plugin",
     )
+    label: str | None = Field(
+        None,
+        pattern=r"^[^\x00-\x1f]{1,255}$",
+        description="class of all sequences, for classification: `class` in manifest.json and in the shards' json",
+    )
 
 
 class CameraOnRig(NamedTuple):

@@ -18,7 +18,7 @@ from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.exposure import decibels
-from blinkgl.io.frame_camera import ExposureLine
+from blinkgl.io.frame_camera import EXPOSURE_POSES, ExposureLine
 from blinkgl.io.lights import LIGHTS
 from blinkgl.io.poses import POSES
 from blinkgl.io.tracks import TRACKS
@@ -215,6 +215,8 @@ def write_end(writer: SequenceWriter, sequence: SensorSimulation) -> None:
     with sequence.clock("write"):
         if poses := sequence.poses():
             writer.arrays(POSES, **poses)
+        if exposed := sequence.exposure_poses():
+            writer.arrays(EXPOSURE_POSES, **exposed)
         if (camera := sequence.lens) is not None:
             write_lens(writer, camera)
         if (inertial := sequence.imu()) is not None and sequence.config.imu is not None:
@@ -273,6 +275,7 @@ def _made_by(sequence: Simulation | SensorSimulation, libraries: Mapping[str, st
         "seed": sequence.config.seed,
         "sequence": sequence.index,
         "split": sequence.config.output.split,
+        **({} if sequence.config.output.label is None else {"class": sequence.config.output.label}),
         "frames": sequence.frames,
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files

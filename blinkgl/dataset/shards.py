@@ -113,6 +113,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         "width": manifest["width"],
         "emulator": manifest.get("emulator"),
         "seed": manifest.get("seed"),
+        **({"class": manifest["class"]} if "class" in manifest else {}),
     }
     about.update(_camera(folder, manifest, start))
     taken = _last_image(folder, manifest, start)

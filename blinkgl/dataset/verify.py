@@ -49,7 +49,8 @@ from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, manifest_problems
 
 def said_of(config: SequenceConfig) -> list[tuple[str, Any]]:
     """Return (key, value) pairs of every folder's manifest."""
-    return [("split", config.output.split), ("seed", config.seed), ("sequence", config.output.first_index)]
+    output = config.output
+    return [("split", output.split), ("class", output.label), ("seed", config.seed), ("sequence", output.first_index)]
 
 
 def times_of(config: SequenceConfig) -> list[tuple[str, Any]]:

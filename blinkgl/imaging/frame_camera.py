@@ -73,6 +73,7 @@ class FrameCamera:
 
     config : ``images:``.   seed : 64-bit, of its noise.   span_ns : first and last time of the sequence.
     due_ns : time of the next image; None: there are no more.   taken : images so far.   drawn : instants so far.
+    exposed_ns : start, middle and end of each exposure so far.
     largest_step_px : of all images, see :class:`CameraImage`.   seconds : wall time besides the drawing."""
 
     def __init__(self, renderer: Renderer, config: ImagesConfig, seed: int, span_ns: tuple[int, int]):
@@ -87,6 +88,7 @@ class FrameCamera:
         """Return to before the first image."""
         self._setting = self._first
         self.taken, self.drawn, self.largest_step_px, self.seconds = 0, 0, 0.0, 0.0
+        self.exposed_ns: list[tuple[int, int, int]] = []
 
     def __len__(self) -> int:
         """Return the total number of images."""
@@ -119,6 +121,7 @@ class FrameCamera:
         if "clean" in self.config.also:
             pictures["clean"] = self._codes(clean)
         self.taken, self.drawn = k + 1, self.drawn + count
+        self.exposed_ns.append((exposure.start_ns, exposure.middle_ns, exposure.end_ns))
         self.largest_step_px = max(self.largest_step_px, step_px)
         if self.config.auto_exposure is not None and self.taken < len(self._starts):
             dt_s = (self._starts[k + 1] - self._starts[k]) * 1e-9

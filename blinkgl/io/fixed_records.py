@@ -16,7 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, listed
 from blinkgl.io.records import input_errors
 from blinkgl.types.events import Events
@@ -117,3 +119,28 @@ class NMnistReader:
             t = ((rows["high"].astype(np.int64) & 0x7F) << 16) + rows["low"] + base
             x, y, p = rows["x"].astype(np.uint16), rows["y"].astype(np.uint16), rows["high"] >> 7
             yield Events(x, y, t, p).part(~marks)
+
+
+class NMnistWriter(CheckedWriter):
+    """Writes a .bin file. Raises OutputError: a sensor whose columns a byte cannot hold, or with the row that is a
+    mark."""
+
+    kind = "N-MNIST's .bin"
+    limits = 0, 1 << 23, "a time that 23 bits of .bin cannot hold"
+
+    def __init__(self, path: str | os.PathLike, height: int | None, width: int | None):
+        super().__init__(path, height, width)
+        if (width or 0) > 256 or (height or 0) > _PASSES:
+            raise OutputError(
+                "a sensor larger than .bin holds", where=str(path), value=f"{width}x{height}", accepted="256x240 px"
+            )
+        with output_errors(self.path):
+            self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
+
+    def _write(self, events: Events) -> None:
+        rows = np.empty(len(events), _NMNIST)
+        if events.x.max() > 255 or events.y.max() >= _PASSES:  # of a sensor whose size is not known
+            raise OutputError("an event outside what .bin holds", where=str(self.path), accepted="256x240 px")
+        rows["x"], rows["y"], rows["low"] = events.x, events.y, events.t & 0xFFFF
+        rows["high"] = events.p << 7 | (events.t >> 16).astype(np.uint8)
+        self._file.write(rows.tobytes())

@@ -97,7 +97,7 @@ for _one in (
     EventFormat("zip", (".zip",), "text", "TextReader"),
     EventFormat("es", (".es",), "event_stream", "EventStreamReader"),
     EventFormat("dat", (".dat",), "fixed_records", "DatReader"),
-    EventFormat("nmnist", (".bin",), "fixed_records", "NMnistReader"),
+    EventFormat("nmnist", (".bin",), "fixed_records", "NMnistReader", "NMnistWriter"),
     EventFormat("mat", (".mat",), "arrays", "MatReader"),
     EventFormat("mat73", (".mat",), "hdf5_tables", "Hdf5TableReader", magic=b"MATLAB 7.3"),
     EventFormat("rosbag", (".bag", ".mcap", ".db3"), "ros", "BagReader"),

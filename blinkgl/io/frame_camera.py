@@ -5,6 +5,7 @@ frame_camera/
   sharp/%06d.png, clean/%06d.png   side by side with them, on request
   images/timestamps.txt   middle of each exposure, one µs per line
   exposures.csv           a line per image, times of the first row's start and the last row's end (µs)
+  poses.npz               the camera's pose at the start, middle and end of each exposure
 """
 
 from __future__ import annotations
@@ -16,16 +17,19 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
 from pydantic import ValidationError
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.reader import read_yaml
 from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.io.images import checked_arrays
 from blinkgl.types.numbers import exact
 
 FOLDER = "frame_camera"
 STAMPS = f"{FOLDER}/images/timestamps.txt"
 EXPOSURES = f"{FOLDER}/exposures.csv"
+EXPOSURE_POSES = f"{FOLDER}/poses.npz"
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ def picture_file(picture: str, k: int) -> str:
 
 def files_of(images: ImagesConfig, count: int) -> Iterator[str]:
     """Yield the names of all files of ``count`` images."""
-    yield from (STAMPS, EXPOSURES)
+    yield from (STAMPS, EXPOSURES, EXPOSURE_POSES)
     for picture in images.pictures:
         yield from (picture_file(picture, k) for k in range(count))
 
@@ -105,3 +109,9 @@ def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
         ) from None
     except (OSError, ValueError, csv.Error) as error:
         raise AssetError(f"damaged list of exposures: {' '.join(str(error).split())[:120]}", where=str(path)) from None
+
+
+def read_exposure_poses(sequence: str | os.PathLike) -> dict[str, np.ndarray]:
+    """Return the poses of a sequence's frame camera: t_ns (N, 3) int64, the start, middle and end of each exposure, and
+    T_world_cam (N, 3, 4, 4) float64 at those times. Raises AssetError: missing, damaged, another shape or type."""
+    return checked_arrays(Path(sequence) / EXPOSURE_POSES, {"t_ns": ("N3", "i"), "T_world_cam": ("N344", "f")})

@@ -1,7 +1,7 @@
 """Data sets in the layouts of published data sets: their files, names, shapes, scales and clocks.
 
 In:    sequence directories
-Out:   folders that DSEC's, E-RAFT's, BlinkFlow's, MVSEC's, TAP-Vid's, MultiFlow's and EventKubric's loaders open
+Out:   folders that loaders of DSEC, E-RAFT, BlinkFlow, MVSEC, TAP-Vid, MultiFlow, EventKubric and NeRF sets open
 Start: export.py, then layout.py: a row of the table is a layout
 """
 

@@ -13,9 +13,11 @@ from blinkgl.io.records import inside
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
 from blinkgl.layouts.event_kubric import EventKubric
+from blinkgl.layouts.intervals import Intervals
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
+from blinkgl.layouts.nerf import Nerf
 from blinkgl.layouts.planned import Planned
 from blinkgl.layouts.rosbag import RosBag
 from blinkgl.layouts.source import Source, sources_of
@@ -35,7 +37,10 @@ def register(layout: Layout) -> Layout:
     return layout
 
 
-for _layout in (Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()):
+for _layout in (
+    *(Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()),
+    *(Nerf(), Intervals()),
+):
     register(_layout)
 
 
@@ -63,6 +68,12 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
     missing part, with the YAML that makes it; OutputError: ``out`` exists or cannot be written, two sequences in one
     place."""
     row, root, out = layout_of(layout), Path(root), Path(out)
+    if root.is_file():
+        raise AssetError(
+            "a file of events keeps no frames and no labels",
+            where=str(root),
+            accepted="a data set: 'blinkgl generate' with frames: {folders: […]} makes one of recorded frames",
+        )
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
     sources = sources_of(root)

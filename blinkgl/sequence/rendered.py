@@ -217,6 +217,12 @@ class RenderedSequence(SensorSimulation):
             ),
         }
 
+    def exposure_poses(self) -> dict[str, np.ndarray]:
+        if self.frame_camera is None:
+            return {}
+        t_ns = np.array(self.frame_camera.exposed_ns, np.int64).reshape(-1, 3)
+        return {"t_ns": t_ns, "T_world_cam": self.scene.camera_path.poses(t_ns.ravel()).reshape(-1, 3, 4, 4)}
+
     @property
     def lens(self) -> CameraModel | None:
         return self.scene.camera if self.scene.camera.coefficients else None

@@ -186,6 +186,10 @@ class SensorSimulation(ABC):
     def poses(self) -> dict[str, np.ndarray]:
         """Return the content of poses.npz; empty where poses are unknown."""
 
+    def exposure_poses(self) -> dict[str, np.ndarray]:
+        """Return the arrays of :func:`blinkgl.io.frame_camera.read_exposure_poses`; {}: there is no frame camera."""
+        return {}
+
     @property
     def lens(self) -> CameraModel | None:
         """Return the camera if it has distortion."""

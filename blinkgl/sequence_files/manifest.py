@@ -50,6 +50,7 @@ class _Common(BaseModel):
     seed: int | None = Field(None, ge=0, lt=2**63)
     sequence: int | None = Field(None, ge=0, le=_LARGEST)
     split: PlainName | None = None
+    label: str | None = Field(None, alias="class", max_length=255)
     blinkgl: str | None = Field(None, max_length=255)
     labels: int | None = Field(None, ge=0, le=_LARGEST)
     frames: int | None = Field(None, ge=0, le=_LARGEST)

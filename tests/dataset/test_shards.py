@@ -85,3 +85,19 @@ def test_bad_input(data, tmp_path):
     export_shards(data / "train", tmp_path / "a")
     with pytest.raises(OutputError, match="holds shards"):
         export_shards(data, tmp_path / "a")
+
+
+def test_a_groups_class_is_in_its_manifests_and_shards_alone(tmp_path, capsys):
+    groups = ["groups.fly.output={sequences: 1, label: 'cup, red'}", "groups.probe.output.sequences=1"]
+    run_dataset(load_run(recipe_file(tmp_path), groups), tmp_path / "out")
+    assert run(["verify", str(tmp_path / "out")]) == 0
+    assert run(["export", str(tmp_path / "out"), "--out", str(tmp_path / "shards")]) == 0
+    for split, name, label in (("train", "fly", "cup, red"), ("test", "probe", None)):
+        manifest = tmp_path / f"out/{split}/{name}_000000/manifest.json"
+        assert json.loads(manifest.read_text()).get("class") == label
+        texts = [json.loads(data) for member, data in members(tmp_path / "shards", split) if member.endswith(".json")]
+        assert len(texts) == 4 and {about.get("class") for about in texts} == {label}
+    manifest.write_text(manifest.read_text().replace('"split"', '"class": "other", "split"', 1))
+    capsys.readouterr()
+    assert run(["verify", str(tmp_path / "out")]) == 2
+    assert "class is other, config.yaml says None" in capsys.readouterr().out

@@ -1,6 +1,7 @@
 """Exports are opened by the published loaders' own code, where it is: BLINKGL_LOADERS is a folder with checkouts named
-bflow, DSEC, E-RAFT, ETAP, co-tracker and Spike-FlowNet (github.com: uzh-rpg/bflow, uzh-rpg/DSEC, uzh-rpg/E-RAFT,
-tub-rip/ETAP, facebookresearch/co-tracker, chan8972/Spike-FlowNet). BlinkFlow's loader is not public any more.
+bflow, DSEC, E-RAFT, ETAP, co-tracker, Spike-FlowNet, EventNeRF and rpg_timelens (github.com: uzh-rpg/bflow,
+uzh-rpg/DSEC, uzh-rpg/E-RAFT, tub-rip/ETAP, facebookresearch/co-tracker, chan8972/Spike-FlowNet, r00tman/EventNeRF,
+uzh-rpg/rpg_timelens). BlinkFlow's loader is not public any more.
 
 Each loader runs in a process of its own, because their packages share names. Replaced are only what an installation
 without a network lacks: imageio's FreeImage plug-in reads PNG files by OpenCV, and packages that draw are empty."""
@@ -281,3 +282,45 @@ def test_spike_flownets_encoding_of_mvsec(export, tmp_path):
         """,
     )
     assert said.rstrip().splitlines()[-1].endswith("True (4, 2, 260, 346) 4"), said
+
+
+RADIANCE = {
+    "camera": {"width": 346, "height": 260},
+    "time": {"duration": 0.4, "label_rate": 20},
+    "labels": {"images": True},
+}
+
+
+def test_eventnerfs_loader(export):
+    checkout("EventNeRF")
+    said = loaded(
+        "EventNeRF",
+        next(export("nerf", RADIANCE).glob("*/*")),
+        """
+        import data_loader_split
+        from nerf_sample_ray_split import CameraManager
+        cameras = CameraManager()
+        views = data_loader_split.load_event_data_split(out, "eventnerf", "train", cameras)
+        views[0].update_rays(cameras)
+        print(len(views), tuple(views[0].rays_d.shape), min(np.abs(view.event_frame).sum() for view in views) > 0)
+        """,
+    )
+    # The first two views of nine only begin windows.
+    assert said.rstrip().endswith("7 (89960, 3) True"), said
+
+
+def test_timelens_storage(export):
+    checkout("rpg_timelens")
+    said = loaded(
+        "rpg_timelens",
+        next(path for path in export("intervals", RADIANCE).glob("*/*") if path.is_dir()),
+        """
+        from timelens.common.hybrid_storage import HybridStorage
+        storage = HybridStorage.from_folders(out + "/events_aligned", out + "/images", "*.npz", "*.png")
+        times = list(storage.make_boundary_timestamps_iterator(0))
+        t = storage._events._features[:, 2]
+        inside = times[0] <= t.min() and t.max() < times[-1]
+        print(len(times), storage.get_image_size(), storage._events.is_self_consistent() and inside)
+        """,
+    )
+    assert said.rstrip().endswith("9 (260, 346) True"), said

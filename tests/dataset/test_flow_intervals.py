@@ -179,10 +179,9 @@ def test_written_and_verified(made_of_shown_labels):
 
 
 def test_report_shows_them(made_of_shown_labels):
-    others = dict(collect(made_of_shown_labels / "out").examples[0].others)
-    frame = collect(made_of_shown_labels / "out").examples[0].image
-    assert {"boxes", "semantics", "scene flow", "point tracks, 20"} <= set(others)
-    assert (others["boxes"] != frame).any() and (others["point tracks, 20"] != frame).any()
+    pictures = dict(collect(made_of_shown_labels / "out").examples[0].pictures)
+    assert {"boxes", "semantics", "scene flow", "point tracks, 20"} <= set(pictures)
+    assert (pictures["boxes"] != pictures["point tracks, 20"]).any()
 
 
 def test_a_table_that_fits_nothing_is_refused(made_of_shown_labels, tmp_path, capsys):

@@ -73,7 +73,7 @@ def test_stage_a_runs_here(tmp_path, capfd):
     assert all(row["frames go by"].startswith("plain") for row in rows["end_to_end"].values())
     assert rows["transfer"]["plain"]["same numbers"] and "asked for" in rows["transfer"]["interop"]["said"]
     page = (tmp_path / "gpu_suite.md").read_text()
-    assert "| OpenGL: renderer | info |" in page and page in capfd.readouterr().out
+    assert "| OpenGL: context | ok |" in page and page in capfd.readouterr().out
     assert "on cpu, no card" in report["device"]
 
 

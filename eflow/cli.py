@@ -178,8 +178,8 @@ def predict(
         typer.Argument(
             metavar="[NETWORK] EVENTS",
             help="A network or method, as evaluate has them, and an event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, "
-            "npz … Without a network (or with auto) the events choose: real_small where only the camera moves, "
-            "real_bodies where bodies move their own ways.",
+            "npz … Without a network (or with auto) the events choose: real_small where the flow is nearly affine, "
+            "real_bodies where depth or moving bodies show in it.",
         ),
     ],
     outputs: Outputs,
@@ -230,8 +230,10 @@ def submit(
     model = network_of(checkpoint, warm_start=warm_start)
     with plain_console(stderr=True).status("predicting") as status:
         progress = lambda i, n: status.update(f"{i}/{n} flows")
-        count = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
+        count, still = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
     typer.echo(f"written and checked: {out}, {count} files")
+    if still:
+        typer.echo(f"{still} of {count} flows are zero: a window without events, or nothing moves")
 
 
 @app.command("import")

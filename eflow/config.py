@@ -322,7 +322,11 @@ class OptimConfig(Config):
 
     steps: int = Field(200_000, ge=1, le=10**9, description="number of weight updates")
     accumulate: int = Field(
-        1, ge=1, le=4096, description="parts in which a step's batch is processed: less memory, the same gradient"
+        1,
+        ge=1,
+        le=4096,
+        description="parts in which a step's batch is processed: less memory, the same gradient, but batch norm "
+        "(context_norm: batch) takes its statistics from each part, and burn_in is drawn for each",
     )
     minutes: float | None = Field(
         None,
@@ -361,7 +365,7 @@ class RunConfig(Config):
     )
     tf32: bool = Field(True, description="use TF32 units for fp32 products, except in fp32 islands")
     channels_last: bool = Field(False, description="memory layout with faster convolutions on some GPUs")
-    compile: bool = Field(False, description="torch.compile of the update step")
+    compile: bool = Field(False, description="torch.compile of the update step, or of a whole network without one")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's default")
     log_every: int = Field(20, ge=1, description="steps between log lines")
     validate_every: int = Field(2000, ge=1, description="steps between validations")

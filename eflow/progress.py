@@ -15,6 +15,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from rich.progress import BarColumn, Progress
 from torch import Tensor
 
@@ -185,7 +186,8 @@ class TrainingError(BlinkGLError):
 
 
 class Readings:
-    """Loss, end-point error and gradient norm of the steps, kept on the device until they are read.
+    """Loss, end-point error and gradient norm of the steps, kept on the device until they are read, then averaged over
+    the processes.
 
     Reading a number from a GPU waits for everything computed before it. ``loss``, ``epe`` and ``norm`` are the last
     values read."""
@@ -203,7 +205,7 @@ class Readings:
 
         Raises TrainingError at the first value that is not finite, after writing the names of its samples to
         ``nan_batch.json``. Call this before saving a checkpoint: later steps are spoilt, too."""
-        read = torch.stack([v for _, _, v in self._pending]).tolist() if self._pending else []
+        read = _of_all(torch.stack([v for _, _, v in self._pending])).tolist() if self._pending else []
         for (step, names, _), (loss, _, norm) in zip(self._pending, read, strict=True):
             if not np.isfinite([loss, norm]).all():
                 _stop_on_nan(self._out, step, names, loss, norm)
@@ -211,6 +213,14 @@ class Readings:
             self.loss, self.epe, self.norm = read[-1]
         self._pending.clear()
         return [(loss, epe) for loss, epe, _ in read]
+
+
+def _of_all(values: Tensor) -> Tensor:
+    """Return the mean of the values of all processes, which read at the same steps."""
+    if dist.is_initialized():
+        dist.all_reduce(values)
+        values = values / dist.get_world_size()
+    return values
 
 
 def _stop_on_nan(out: Path, step: int, names: list[str], loss: float, norm: float) -> None:

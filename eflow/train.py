@@ -175,9 +175,8 @@ class Training:
     def _parallel(self) -> torch.nn.Module:
         """Return the network, compiled or wrapped to average gradients over processes if the configuration asks for
         it."""
-        update = getattr(self.model, "update", None)
-        if self.config.run.compile and isinstance(update, torch.nn.Module):
-            update.compile()
+        if self.config.run.compile:  # most of the time of a network with refinements goes to their steps
+            getattr(self.model, "update", self.model).compile()
         if self.world == 1:
             return self.model
         return DistributedDataParallel(
@@ -255,8 +254,7 @@ class Training:
 
     def _backward(self, batch: dict) -> tuple[Tensor, Tensor, Tensor]:
         """Add up the gradients of the batch's parts; return loss, end-point error, px, and the first part's flow."""
-        size, own = len(batch["name"]) // self.config.optim.accumulate, batch["valid"].sum()
-        count = own.float()
+        size, count = len(batch["name"]) // self.config.optim.accumulate, batch["valid"].sum().float()
         # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels.
         if self.world > 1:
             dist.all_reduce(count)
@@ -273,7 +271,7 @@ class Training:
                 done.append(_forward(self.net, part, self.config, count))
                 done[-1][0].backward()
         losses, errors, flows = zip(*((loss.detach(), error, flow) for loss, error, flow in done), strict=True)
-        return sum(losses[1:], losses[0]), sum(errors[1:], errors[0]) / own.clamp(min=1), flows[0]
+        return sum(losses[1:], losses[0]), sum(errors[1:], errors[0]) / count.clamp(min=1), flows[0]
 
     def _every(self, *whats: str) -> bool:
         """Whether one of these actions is due at this step."""

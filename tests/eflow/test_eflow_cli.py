@@ -16,6 +16,7 @@ torch = pytest.importorskip("torch")
 from shared_data import shared  # noqa: E402
 
 import eflow  # noqa: E402
+from blinkgl.io.dsec import DsecEventWriter  # noqa: E402
 from blinkgl.io.flow import read_flow_png  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from blinkgl.types.events import Events  # noqa: E402
@@ -200,7 +201,8 @@ def test_a_network_is_chosen_by_what_moves(moving, name, tmp_path, capsys):
     assert run(["predict", *([] if moving == "camera" else ["auto"]), str(path), "--window-ms", "90"]) == 0
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith(f"network: {name}, since ")
-    assert {"camera": "only the camera moves", "bodies": "bodies move", "nothing before": "no pair"}[moving] in first
+    why = {"camera": "off an affine field", "bodies": "depth shows, or bodies move", "nothing before": "no pair"}
+    assert why[moving] in first
 
 
 def test_flow_without_events_nearby_is_written_as_not_valid(network, tmp_path):
@@ -269,7 +271,7 @@ def test_submit_dsec(network, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(submit.BENCHMARKS, "dsec", replace(submit.BENCHMARKS["dsec"], sequences=names))
     root, out = dsec_set(tmp_path / "test", names, labels=1, test=True), tmp_path / "sub.zip"
     assert run(["submit", network, str(root), "--out", str(out)]) == 0, capsys.readouterr().err
-    assert "2 files" in capsys.readouterr().out
+    assert capsys.readouterr().out == f"written and checked: {out}, 2 files\n"
     with zipfile.ZipFile(out) as archive:
         assert sorted(archive.namelist()) == [f"{n}/{i:06d}.png" for n in names for i in (2,)]
         image = cv2.imdecode(np.frombuffer(archive.read(f"{names[0]}/000002.png"), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -277,6 +279,11 @@ def test_submit_dsec(network, tmp_path, monkeypatch, capsys):
     flow = (image[..., :0:-1].astype(float) - 2**15) / 128
     assert 0 < np.abs(flow).max() < 256
     assert run(["submit", network, str(root), "--out", str(out)]) == 2  # not overwritten
+    offset = 49_000_000_000
+    with DsecEventWriter(root / names[1] / "events/left/events.h5", 480, 640, offset) as writer:
+        writer.append(moving_events(480, 640, offset, offset + SPAN, n=100))  # and none in the new window
+    assert run(["submit", network, str(root), "--out", str(tmp_path / "silent.zip")]) == 0
+    assert "1 of 2 flows are zero: a window without events, or nothing moves\n" in capsys.readouterr().out
 
 
 def test_submit_refuses_an_incomplete_test_set(network, tmp_path, capsys):

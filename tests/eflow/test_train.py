@@ -324,6 +324,9 @@ def test_data_parallel_equals_one_process(tmp_path, data):
     a, b = tensors(tmp_path / "one"), tensors(tmp_path / "two")
     weights = [k for k in a if k.startswith("weights/")]
     assert weights and all(torch.allclose(a[k], b[k], atol=2e-5) for k in weights)
+    for key in ("loss", "epe", "grad_norm"):  # of all samples, not of the first process
+        one, two = ([row[key] for row in log(tmp_path / name)] for name in ("one", "two"))
+        assert two == pytest.approx(one, rel=1e-3), key
 
 
 # ---- configurations and checkpoints that cannot be used --------------------------------------------------------------
@@ -350,6 +353,15 @@ def test_sizes_are_refused_before_anything_is_written(tmp_path, model, crop, mes
     with pytest.raises(ConfigError, match=message):
         train(load_train_config(path), tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("model", [TINY, FAST], ids=["the update step", "the whole network"])
+def test_every_network_can_be_compiled(tmp_path, data, monkeypatch, model):
+    compiled = []
+    monkeypatch.setattr(torch.nn.Module, "compile", lambda module: compiled.append(type(module).__name__))
+    config = load_train_config(config_file(tmp_path, data, model, steps=1, crop=(128, 128), run__compile=True))
+    train(config, tmp_path / "run", quiet=True)
+    assert compiled == [{"eflowformer": "Update", "ev_flownet": "EvFlowNet"}[model["name"]]]
 
 
 @pytest.mark.slow

@@ -251,6 +251,30 @@ def import_(
 
 
 @app.command()
+def export(
+    checkpoint: Network,
+    onnx: Annotated[str | None, typer.Option(help="New file of ONNX.", show_default=False)] = None,
+    torchscript: Annotated[str | None, typer.Option(help="New file of TorchScript.", show_default=False)] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Sensor size; the file takes no other.")] = "640x480",
+) -> None:
+    """Write a network as a file for programs without this package. It appears after its flow was compared with the
+    network's own, on other inputs than those of the export."""
+    from blinkgl.io.reading import parsed_size
+    from eflow.export import export as write_export
+
+    outs = {kind: out for kind, out in (("onnx", onnx), ("torchscript", torchscript)) if out is not None}
+    if not outs:
+        raise ConfigError("no file to write", accepted="--onnx OUT or --torchscript OUT")
+    model, sides = network_of(checkpoint), parsed_size(size)
+    assert sides is not None
+    for kind, out in outs.items():
+        difference = write_export(model, out, kind, *sides)
+        typer.echo(
+            f"written and checked: {out}, reads {', '.join(model.reads)}, differs by {difference:.1g} px at most"
+        )
+
+
+@app.command()
 def models(
     name: Annotated[str | None, typer.Argument(help="Show only this network, with its whole card.")] = None,
 ) -> None:
@@ -294,7 +318,6 @@ _LAST_WEIGHTS = "the file weights.safetensors of a checkpoint in place of its fo
 _DEVICE = "nothing: a GPU is used if there is one; CUDA_VISIBLE_DEVICES= hides it"
 _PRECISION = "nothing: flow is computed in single precision"
 GONE = {
-    "export": "torch.onnx.export of eflow.load_model(NAME)'s network: ONNX files are no longer written here",
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
     "evaluate --confidence": "nothing: no network here estimates its confidence",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
 
@@ -205,7 +205,7 @@ class AugmentConfig(Config):
 
 
 class SourceConfig(Config):
-    """One data set: a folder, or a recipe that is rendered during training."""
+    """One data set: a folder, a recipe that is rendered during training, or a share of the training folders."""
 
     path: str | None = Field(None, description="folder; relative to the YAML file")
     format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow", "windows"] = Field(
@@ -213,6 +213,13 @@ class SourceConfig(Config):
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: number of images between the ends of the flow")
     weight: float = Field(1.0, gt=0, le=1e6, description="relative weight of this set in the mixture")
+    share: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="instead of a folder, for validation: this share of the sequences of the training folders, which "
+        "are then not trained on; their names decide, so that further sequences move none",
+    )
     recipe: str | None = Field(
         None, description="YAML file of `blinkgl generate`, instead of a folder; relative to the YAML file"
     )
@@ -243,10 +250,10 @@ class SourceConfig(Config):
         "below 0.01 the flow can hardly be estimated",
     )
 
-    @rule("path", "recipe", "online")
-    def _folder_or_recipe(path, recipe, online):
-        if (path is None) == (recipe is None):
-            raise Refused("give a folder (path) or a recipe, one of the two")
+    @rule("path", "recipe", "share", "online")
+    def _folder_or_recipe(path, recipe, share, online):
+        if [path, recipe, share].count(None) != 2:
+            raise Refused("give a folder (path) or a recipe, or for validation a share, one of these")
         if (recipe is not None) != online:
             raise Refused(
                 "a recipe is rendered while it is trained on: online: true says so"
@@ -263,11 +270,17 @@ class SourceConfig(Config):
             raise Refused("not a range", where="window_ms", value=list(window_ms), accepted="0.01 <= low <= high, ms")
 
 
+def _as_list(sets: object) -> object:
+    return [sets] if isinstance(sets, dict) else sets
+
+
 class DataConfig(Config):
     """Training and validation data."""
 
     train: tuple[SourceConfig, ...] = Field(min_length=1, description="training sets, mixed by weight")
-    validate_on: tuple[SourceConfig, ...] = Field((), description="validation sets; the first samples of each are used")
+    validate_on: Annotated[tuple[SourceConfig, ...], BeforeValidator(_as_list)] = Field(
+        (), description="validation sets; a single one needs no list: {share: 0.1}"
+    )
     validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
@@ -278,6 +291,17 @@ class DataConfig(Config):
     augment: AugmentConfig | None = Field(
         AugmentConfig(), description="random changes of the training samples; null: none"
     )
+
+    @rule("train.*.share", "train.*.path", "validate_on.*.share")
+    def _shared(shares: tuple[float | None, ...], folders, held):
+        for k, share in enumerate(shares):
+            if share is not None:
+                raise Refused("a share is for validation", where=f"train.{k}.share", value=share)
+        held = [share for share in held if share is not None]
+        if len(held) > 1 or (held and not any(folders)):
+            raise Refused(
+                "a share of what", where="validate_on", value=held, accepted="one share, with a folder in data.train"
+            )
 
     @rule("train.*.workers", "train.*.online", "workers")
     def _who_renders(rendering, online, loaders):
@@ -327,6 +351,10 @@ class OptimConfig(Config):
         le=4096,
         description="parts in which a step's batch is processed: less memory, the same gradient, but batch norm "
         "(context_norm: batch) takes its statistics from each part, and burn_in is drawn for each",
+    )
+    freeze_norm: bool = Field(
+        False,
+        description="batch norm keeps the statistics of init_from, for fine-tuning: they then depend on no batch",
     )
     minutes: float | None = Field(
         None,

@@ -23,6 +23,7 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.machine.interrupts import STOPS, Stop
 from blinkgl.machine.terminal import plain_column, plain_console
+from eflow.types import Picture
 
 T = TypeVar("T")
 _QUIET_S = 10.0
@@ -321,6 +322,21 @@ class Log:
             self._table_file.flush()
         for k, v in values.items():
             self._board.add_scalar(f"{kind}/{k}", v, step)
+
+    def describe(self, text: str, values: dict[str, object]) -> None:
+        """Show the configuration in tensorboard, as text and as hyper-parameters by their keys."""
+        from torch.utils.tensorboard.summary import hparams
+
+        self._board.add_text("configuration", f"```\n{text}\n```", self.start)
+        plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in values.items()}
+        writer = self._board.file_writer
+        assert writer is not None
+        for summary in hparams(plain, {"train/loss": 0.0, "train/epe": 0.0}):
+            writer.add_summary(summary)
+
+    def picture(self, step: int, strip: Picture) -> None:
+        """Show a picture in tensorboard."""
+        self._board.add_image("sample", strip, step, dataformats="HWC")
 
     def __exit__(self, *_) -> None:
         if self.enabled:

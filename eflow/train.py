@@ -50,6 +50,7 @@ from eflow.precision import precision_on
 from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, cost_of
 from eflow.schedule import Course, learning_rate
 from eflow.training_data import check_sizes, check_truth, training_sets, validate, validation_sets
+from eflow.types import Picture
 
 
 @dataclass
@@ -139,6 +140,9 @@ class Training:
         self.model = build_model(config.model)
         if config.init_from and self.saved is None:
             ckpt.load_weights(self.model, *weights_of(config))
+        self.norms = [m for m in self.model.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+        if config.optim.freeze_norm and not self.norms:
+            raise ConfigError("this network has no batch norm", where="optim.freeze_norm", value=True, accepted="false")
         self.model.to(self.device)
         if config.run.channels_last:
             self.model.to(memory_format=torch.channels_last)  # type: ignore[no-matching-overload]
@@ -204,6 +208,8 @@ class Training:
                 minutes=self.course.minutes_left(config.run.time_limit),
             ) as progress,
         ):
+            if self.lead:
+                log.describe(as_yaml(config), ckpt.leaves(json.loads(config.model_dump_json())))
             if self.begins_anew:
                 progress.say(f"no checkpoint in {self.out} yet: the training begins")
             waiting = Waiting(batches(self.dataset, sampler, config.data.workers, pin=device.type == "cuda"))
@@ -217,7 +223,9 @@ class Training:
                 if self.lead:
                     self._log(log, rate, progress, waiting)
                     if self._every("picture"):
-                        _picture(self.out / "pictures" / f"{self.step:09d}.png", batch, flow)
+                        strip = _picture(batch, flow)
+                        write_picture(self.out / "pictures" / f"{self.step:09d}.png", strip)
+                        log.picture(self.step, strip)
                     # A time limit validates as the last step does; a signal should end soon.
                     if self.validation and (self._every("validate") or reason in ("finished", "time limit")):
                         self._validate(log, progress)
@@ -241,6 +249,8 @@ class Training:
         rate = learning_rate(self.done, optim.lr, optim.warmup, optim.cooldown)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
+        for norm in self.norms:  # a validation before this step switched all layers
+            norm.train(not optim.freeze_norm)
         self.optimizer.zero_grad(set_to_none=True)
         loss, epe, flow = self._backward(batch)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), optim.clip)
@@ -386,16 +396,14 @@ def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
         ema[k].lerp_(v, 1 - decay) if v.is_floating_point() else ema[k].copy_(v)
 
 
-def _picture(path: Path, batch: dict, flow: Tensor) -> None:
+def _picture(batch: dict, flow: Tensor) -> Picture:
+    """Return the first sample of a batch as a strip: events, truth, prediction, error."""
     first = lambda k: batch[k][0].detach().float().cpu().numpy()
-    write_picture(
-        path,
-        comparison(
-            events_of(first("new")),
-            flow[0].float().cpu().numpy().transpose(1, 2, 0),
-            first("flow").transpose(1, 2, 0),
-            batch["valid"][0].cpu().numpy(),
-        ),
+    return comparison(
+        events_of(first("new")),
+        flow[0].float().cpu().numpy().transpose(1, 2, 0),
+        first("flow").transpose(1, 2, 0),
+        batch["valid"][0].cpu().numpy(),
     )
 
 

@@ -375,3 +375,31 @@ def test_recordings_with_little_in_them(network, tmp_path, capsys, name, options
         assert "mean speed" in printed.out
     else:
         assert said in printed.err and printed.err.startswith("error: ") and printed.err.count("\n") == 1
+
+
+def test_flow_at_times_within_a_window(network, tmp_path, capsys):
+    """One PNG for each share of each window; the whole one is what it is without --at."""
+    write_events(tmp_path / "e.h5", moving_events(128, 144, 0, 3 * SPAN, n=9000), 128, 144)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    for out, at in ((whole, []), (parts, ["--at", ".25,1"])):
+        assert run(["predict", network, str(tmp_path / "e.h5"), "--out", str(out), "--npy", *at]) == 0
+    lines = (parts / "timestamps.txt").read_text().splitlines()[1:]
+    starts = [int(line.split(",")[0]) for line in (whole / "timestamps.txt").read_text().splitlines()[1:]]
+    assert lines == [f"{t}, {t + end}" for t in starts for end in (SPAN // 4, SPAN)]
+    flows = [np.load(parts / f"npy/{k:06d}.npy") for k in range(len(lines))]
+    for k in range(len(starts)):
+        assert (flows[2 * k + 1] == np.load(whole / f"npy/{k:06d}.npy")).all()
+    assert flows[0] == pytest.approx(flows[1] / 4)  # no window before it
+    for at in ("x", "0", "0.5,1.2", ""):
+        assert run(["predict", network, str(tmp_path / "e.h5"), "--at", at]) == 2
+        assert f"--at: not shares of a window (got '{at}'); expected numbers above 0" in capsys.readouterr().err
+
+
+def test_within_a_window_acceleration_is_constant():
+    """A translation v s + a s²/2, whose flow over the window before is v - a/2, over this one v + a/2."""
+    v, a = np.float32([3, -1]), np.float32([2, 0.5])
+    field = lambda w: np.broadcast_to(w, (16, 24, 2)).astype(np.float32)
+    for share in (0.25, 0.5, 0.75, 1):
+        flow = infer.within(field(v + a / 2), field(v - a / 2), share)
+        inside = flow[4:-4, 4:-4]
+        assert inside == pytest.approx(np.broadcast_to(v * share + a * share**2 / 2, inside.shape), abs=1e-5)

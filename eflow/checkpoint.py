@@ -300,6 +300,7 @@ _OTHER = {
     "optim.loss.log": 0.0,
     "data.augment.transpose": 0.0,
     "optim.freeze_norm": False,
+    "data.leave_out": [0, 0],
     "model.quick": False,
 }
 """Keys that earlier versions had or lacked, with the values that reproduce what those versions computed."""

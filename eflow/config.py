@@ -194,7 +194,7 @@ class AugmentConfig(Config):
     noise_probability: Probability = Field(0.3, description="probability of adding background noise")
     noise_rate: float = Field(1.0, ge=0, le=1e4, description="largest rate of background noise, events/s per pixel")
     scale_probability: Probability = Field(
-        0.3, description="probability of scaling; needs data.crop (sparse labels take the nearest pixel's)"
+        0.3, description="probability of scaling; needs data.crop (sparse labels move pixel by pixel)"
     )
     scale: tuple[float, float] = Field((-0.2, 0.5), description="log2 of the scale factor, [low, high]")
 
@@ -283,6 +283,9 @@ class DataConfig(Config):
     )
     validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
+    leave_out: tuple[int, int] = Field(
+        (0, 0), description="[rows at the bottom, columns at the left] that are not trained on, px: a car's hood"
+    )
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
     workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0: load in the training process")
     empty: Literal["error", "skip"] = Field(
@@ -315,6 +318,13 @@ class DataConfig(Config):
     def _one_size(crop, scaling):
         if crop is None and scaling:
             raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
+
+    @rule("leave_out", "crop")
+    def _left_out(leave_out: tuple[int, int], crop):
+        if not all(0 <= side <= 10_000 for side in leave_out):
+            raise Refused("not numbers of px", where="leave_out", value=list(leave_out), accepted="0 to 10000")
+        if any(leave_out) and crop is None:
+            raise Refused("crops leave it out", where="leave_out", value=list(leave_out), accepted="with data.crop")
 
     @rule("crop", "augment.transpose")
     def _square(crop: tuple[int, int] | None, transpose: float):

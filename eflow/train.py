@@ -169,6 +169,7 @@ class Training:
             seed=config.seed,
             augment=config.data.augment,
             crop=config.data.crop,
+            leave_out=config.data.leave_out,
             empty=config.data.empty,
             reads=self.model.reads,
         )

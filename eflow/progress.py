@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import signal
 import sys
@@ -263,64 +261,41 @@ class Signals:
 
 
 class Log:
-    """Writes log.jsonl (one object per line), log.csv (one row per line, for plots) and tensorboard files.
+    """Writes log.jsonl (one object per line) and tensorboard files.
 
-    A resumed run drops the lines after its checkpoint, since those steps run again; seconds continue from the last row.
-    batch : samples per step.   validated : names of the columns of validation scores."""
+    A resumed run drops the lines after its checkpoint, since those steps run again; seconds continue from the last
+    line. batch : samples per step."""
 
-    COLUMNS = ("step", "samples", "processor_s", "wall_s", "loss", "epe", "lr")
+    SECONDS = ("processor_s", "wall_s")
 
-    def __init__(self, out: Path, start: int, batch: int, validated: Iterable[str], enabled: bool):
+    def __init__(self, out: Path, start: int, batch: int, enabled: bool):
         self.path, self.start, self.batch, self.enabled = out / "log.jsonl", start, batch, enabled
-        self.table, self.columns = out / "log.csv", [*self.COLUMNS, *validated]
 
     def __enter__(self) -> Log:
         if self.enabled:
             with output_errors(self.path):
                 lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
-                kept = [
-                    line
-                    for line in lines
-                    if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start
-                ]
-                write_whole(self.path, "".join(line + "\n" for line in kept))
+                # A power cut can leave half a line.
+                whole = [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+                kept = [row for row in whole if row["step"] <= self.start]
+                write_whole(self.path, "".join(json.dumps(row) + "\n" for row in kept))
                 self._file = open(self.path, "a", encoding="utf-8")
-            with output_errors(self.table):
-                kept = self._kept_rows()
-                text = io.StringIO()
-                rows = lambda file: csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")
-                rows(text).writeheader()
-                rows(text).writerows(kept)
-                write_whole(self.table, text.getvalue())  # a kill in between costs no row
-                self._table_file = open(self.table, "a", encoding="utf-8", newline="")
-                self._rows = rows(self._table_file)
-            before = [float(kept[-1][key]) if kept else 0.0 for key in ("processor_s", "wall_s")]
+            before = [kept[-1].get(key, 0.0) if kept else 0.0 for key in self.SECONDS]
             self._began = before[0] - time.process_time(), before[1] - time.monotonic()
             from torch.utils.tensorboard import SummaryWriter
 
             self._board = SummaryWriter(str(self.path.parent / "tb"), purge_step=self.start + 1 if self.start else None)
         return self
 
-    def _kept_rows(self) -> list[dict[str, str]]:
-        """Return the rows of log.csv up to the checkpoint. Their columns stay, since a resumed run may validate on
-        other sets."""
-        lines = self.table.read_text(encoding="utf-8").splitlines(keepends=True) if self.table.is_file() else []
-        # A power cut can leave half a line. A table of another program is replaced.
-        ours = lines[:1] and lines[0].startswith(",".join(self.COLUMNS))
-        rows = list(csv.DictReader(line for line in lines if line.endswith("\n"))) if ours else []
-        self.columns = list(dict.fromkeys([*self.COLUMNS, *(rows[0] if rows else ()), *self.columns]))
-        return [row for row in rows if int(row["step"]) <= self.start]
-
     def write(self, step: int, kind: str, **values: float) -> None:
+        """Write a line of values, with the samples and seconds of the whole training. Raises OutputError."""
+        clocks = (time.process_time(), time.monotonic())
+        spent = {k: round(b + t, 3) for k, b, t in zip(self.SECONDS, self._began, clocks, strict=True)}
+        row = {"step": step, "kind": kind, "samples": step * self.batch, **spent, **values}
         with output_errors(self.path):
-            self._file.write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+            self._file.write(json.dumps(row) + "\n")
             self._file.flush()
-        seconds = round(self._began[0] + time.process_time(), 3), round(self._began[1] + time.monotonic(), 3)
-        row = {"step": step, "samples": step * self.batch, "processor_s": seconds[0], "wall_s": seconds[1]}
-        with output_errors(self.table):
-            self._rows.writerow({**values, **row})
-            self._table_file.flush()
-        for k, v in values.items():
+        for k, v in {**spent, **values}.items():
             self._board.add_scalar(f"{kind}/{k}", v, step)
 
     def describe(self, text: str, values: dict[str, object]) -> None:
@@ -341,5 +316,4 @@ class Log:
     def __exit__(self, *_) -> None:
         if self.enabled:
             self._file.close()
-            self._table_file.close()
             self._board.close()

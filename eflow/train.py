@@ -6,7 +6,7 @@ It runs on the CPU or a GPU (``run.device``; auto uses a GPU if there is one), o
     eflow train configs/eflow/smoke.yaml --out out/smoke --resume
     torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
 
-A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/, pictures/ and the
+A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/, pictures/ and the
 weights of the best validation, best.safetensors. SIGINT and
 SIGTERM end the current step and write a checkpoint; the command then exits 130 or 143. ``--resume`` continues from the
 newest checkpoint, and begins where there is none yet, so that a job script needs one line. On the
@@ -196,10 +196,9 @@ class Training:
         stop = self.start if self.done >= 1 else self.stop
         sampler = StepSampler(self.mixture, config.data.batch, self.start, stop, self.rank, self.world)
         reason = None
-        validated = [f"{name}/{what}" for name, *_ in self.validation for what in ("AEE", "zero")]
         with (
             Signals() as signals,
-            Log(self.out, self.start, config.data.batch, validated, enabled=self.lead) as log,
+            Log(self.out, self.start, config.data.batch, enabled=self.lead) as log,
             TrainProgress(
                 config.optim.steps,
                 self.start,
@@ -318,7 +317,6 @@ class Training:
                 lr=rate,
                 grad_norm=self.read.norm,
                 samples_per_s=progress.rate,
-                processor_s=time.process_time(),
                 waited=waiting.share,
                 **_rendering(self.sources),
             )
@@ -413,6 +411,7 @@ def as_yaml(config: TrainConfig) -> str:
     return to_yaml(json.loads(config.model_dump_json()))
 
 
+# log.csv : of earlier versions.
 _OURS = {"config.yaml", "log.csv", "log.jsonl", "tb", "checkpoints", "pictures", "best.safetensors", "nan_batch.json"}
 
 

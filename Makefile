@@ -90,6 +90,7 @@ setup: .venv/.installed-dev opengl
 	@echo "installing the test tools into .venv"
 	@$(INSTALL) -e '.[dev]'
 	@$(INSTALL) -e '.[learn]' || echo "torch could not be installed: the tests of eflow will be skipped"
+	@$(INSTALL) -e '.[onnx]' || echo "ONNX could not be installed: the tests of eflow export --onnx will be skipped"
 	@$(INSTALL) -e '.[cluster]' || echo "Ray could not be installed: the tests of the Ray executor will be skipped"
 	@$(INSTALL) -e '.[physics]' || echo "MuJoCo could not be installed: the tests of falling bodies will be skipped"
 	@$(INSTALL) -e '.[formats]' || echo "rosbags and dv-processing could not be installed: the tests of ROS bags will be skipped"

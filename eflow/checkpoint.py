@@ -299,6 +299,8 @@ _OTHER = {
     "optim.loss.relative": 0.0,
     "optim.loss.log": 0.0,
     "data.augment.transpose": 0.0,
+    "optim.freeze_norm": False,
+    "data.leave_out": [0, 0],
     "model.quick": False,
 }
 """Keys that earlier versions had or lacked, with the values that reproduce what those versions computed."""
@@ -318,7 +320,7 @@ def resume_run(
     """Restore a run from its newest checkpoint ``folder``; return its state. A finished training may get more steps or
     minutes."""
     state = read_state(folder)
-    saved, now = _leaves(state.get("config", {})), {**_OTHER, **_leaves(json.loads(config.model_dump_json()))}
+    saved, now = leaves(state.get("config", {})), {**_OTHER, **leaves(json.loads(config.model_dump_json()))}
     saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
     done = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
     for path in sorted({*saved, *now}):
@@ -354,7 +356,7 @@ def _extends(wanted: object, before: object, done: float) -> bool:
 def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig) -> None:
     """Raise ConfigError where data have another content than in the run that is resumed. A file of ``init_from`` that
     has gone is not needed any more."""
-    places = _leaves(json.loads(config.model_dump_json()))
+    places = leaves(json.loads(config.model_dump_json()))
     for path in sorted({*saved, *now}):
         if saved.get(path) != now.get(path, saved.get(path) if path == "init_from" else None):
             raise ConfigError(
@@ -365,13 +367,14 @@ def same_content(saved: dict[str, str], now: dict[str, str], config: TrainConfig
             )
 
 
-def _leaves(tree: object, prefix: str = "") -> dict[str, object]:
+def leaves(tree: object, prefix: str = "") -> dict[str, object]:
+    """Return the values of a tree of tables by their dotted keys."""
     if isinstance(tree, dict) and tree:
         return {
-            k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()
+            k: v for key, node in tree.items() for k, v in leaves(node, f"{prefix}.{key}" if prefix else key).items()
         }
     if isinstance(tree, list) and tree and isinstance(tree[0], dict):
-        return {k: v for i, node in enumerate(tree) for k, v in _leaves(node, f"{prefix}.{i}").items()}
+        return {k: v for i, node in enumerate(tree) for k, v in leaves(node, f"{prefix}.{i}").items()}
     return {prefix: tree}
 
 

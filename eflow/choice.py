@@ -1,4 +1,5 @@
-"""Which of the networks that come with the package suits a recording: the one for a moving camera, or for bodies."""
+"""Which of the networks that come with the package suits a recording: the one for nearly affine flow, as of a camera
+that turns, or the one for depth and for bodies that move their own ways."""
 
 from __future__ import annotations
 
@@ -15,8 +16,9 @@ from eflow.types import Flow, Mask
 AUTO = "auto"
 CAMERA, BODIES = "real_small", "real_bodies"
 AFFINE = 0.33
-"""Mean distance of the flow from its nearest affine field, as a share of its mean length, below which only the camera
-moves. Medians of windows were .17 to .27 for seven recordings of moving cameras, .36 for a head that turns, and .42 to
+"""Mean distance of the flow from its nearest affine field, as a share of its mean length, below which the flow is that
+of a camera alone, before a scene of little depth. Medians of windows were .17 to .27 for seven recordings of moving
+cameras, .36 for a head that turns, and .42 to
 .88 for 24 simulated sequences of independent bodies (docs/results_eflow.md)."""
 
 
@@ -31,8 +33,8 @@ def chosen(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> 
     if not distances:
         return CAMERA, f"{CAMERA}, since there is no pair of windows with events ({BODIES} needs two)"
     distance = float(np.median(distances))
-    name, moves = (CAMERA, "only the camera moves") if distance < AFFINE else (BODIES, "bodies move their own ways")
-    return name, f"{name}, since {moves}: the flow is {100 * distance:.0f} % of its length off an affine field"
+    name, why = (CAMERA, "") if distance < AFFINE else (BODIES, ": depth shows, or bodies move their own ways")
+    return name, f"{name}, since the flow is {100 * distance:.0f} % of its length off an affine field{why}"
 
 
 def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> Iterator[StreamWindow]:

@@ -178,8 +178,8 @@ def predict(
         typer.Argument(
             metavar="[NETWORK] EVENTS",
             help="A network or method, as evaluate has them, and an event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, "
-            "npz … Without a network (or with auto) the events choose: real_small where only the camera moves, "
-            "real_bodies where bodies move their own ways.",
+            "npz … Without a network (or with auto) the events choose: real_small where the flow is nearly affine, "
+            "real_bodies where depth or moving bodies show in it.",
         ),
     ],
     outputs: Outputs,
@@ -230,8 +230,10 @@ def submit(
     model = network_of(checkpoint, warm_start=warm_start)
     with plain_console(stderr=True).status("predicting") as status:
         progress = lambda i, n: status.update(f"{i}/{n} flows")
-        count = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
+        count, still = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
     typer.echo(f"written and checked: {out}, {count} files")
+    if still:
+        typer.echo(f"{still} of {count} flows are zero: a window without events, or nothing moves")
 
 
 @app.command("import")
@@ -246,6 +248,30 @@ def import_(
 
     model = import_published(checkpoint, out)
     typer.echo(f"written: {out}, {parameters_of(model) / 1e6:.2f} M parameters")
+
+
+@app.command()
+def export(
+    checkpoint: Network,
+    onnx: Annotated[str | None, typer.Option(help="New file of ONNX.", show_default=False)] = None,
+    torchscript: Annotated[str | None, typer.Option(help="New file of TorchScript.", show_default=False)] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Sensor size; the file takes no other.")] = "640x480",
+) -> None:
+    """Write a network as a file for programs without this package. It appears after its flow was compared with the
+    network's own, on other inputs than those of the export."""
+    from blinkgl.io.reading import parsed_size
+    from eflow.export import export as write_export
+
+    outs = {kind: out for kind, out in (("onnx", onnx), ("torchscript", torchscript)) if out is not None}
+    if not outs:
+        raise ConfigError("no file to write", accepted="--onnx OUT or --torchscript OUT")
+    model, sides = network_of(checkpoint), parsed_size(size)
+    assert sides is not None
+    for kind, out in outs.items():
+        difference = write_export(model, out, kind, *sides)
+        typer.echo(
+            f"written and checked: {out}, reads {', '.join(model.reads)}, differs by {difference:.1g} px at most"
+        )
 
 
 @app.command()
@@ -292,7 +318,6 @@ _LAST_WEIGHTS = "the file weights.safetensors of a checkpoint in place of its fo
 _DEVICE = "nothing: a GPU is used if there is one; CUDA_VISIBLE_DEVICES= hides it"
 _PRECISION = "nothing: flow is computed in single precision"
 GONE = {
-    "export": "torch.onnx.export of eflow.load_model(NAME)'s network: ONNX files are no longer written here",
     "bench": "python -m blinkgl.tools.bench networks",
     "evaluate --by-density": "sets of several densities, evaluated one by one",
     "evaluate --confidence": "nothing: no network here estimates its confidence",

@@ -107,8 +107,8 @@ class Answering:
 class WindowsAsked:
     """The windows of an event file to process.
 
-    window_ms : length of each.   start_ms, end_ms : limits, as times after the first event; None: no limit.
-    whole : the whole file is one window, or its halves are a pair."""
+    window_ms : length of each.   at : shares of a window to which flow is wanted.   start_ms, end_ms : limits, as
+    times after the first event; None: no limit.   whole : the whole file is one window, or its halves are a pair."""
 
     window_ms: Annotated[
         str,
@@ -123,13 +123,31 @@ class WindowsAsked:
     whole: Annotated[
         bool, typer.Option("--whole", help="One flow for the whole file: as one window, or its halves as a pair.")
     ] = False
+    at: Annotated[
+        str,
+        typer.Option(
+            metavar="SHARES", help="Flow from the start of each window to these shares of it, such as .25,.5,.75,1."
+        ),
+    ] = "1"
 
     def __post_init__(self) -> None:
-        """Raise ConfigError unless the length is one."""
+        """Raise ConfigError unless the length is one, and the shares are."""
+        if not all(0 < share <= 1 for share in self.shares) or not self.shares:
+            raise ConfigError(
+                "not shares of a window", where="--at", value=self.at, accepted="numbers above 0, up to 1: .25,.5,.75,1"
+            )
         if self.window_ms != "auto" and not self.span_us:
             raise ConfigError(
                 "not a window length", where="--window-ms", value=self.window_ms, accepted="milliseconds, or auto"
             )
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Return the shares of a window to which flow is wanted; empty: not numbers."""
+        try:
+            return tuple(float(part) for part in self.at.split(","))
+        except ValueError:
+            return ()
 
     @property
     def span_us(self) -> int | None:

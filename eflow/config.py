@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
 
@@ -194,7 +194,7 @@ class AugmentConfig(Config):
     noise_probability: Probability = Field(0.3, description="probability of adding background noise")
     noise_rate: float = Field(1.0, ge=0, le=1e4, description="largest rate of background noise, events/s per pixel")
     scale_probability: Probability = Field(
-        0.3, description="probability of scaling; needs data.crop (sparse labels take the nearest pixel's)"
+        0.3, description="probability of scaling; needs data.crop (sparse labels move pixel by pixel)"
     )
     scale: tuple[float, float] = Field((-0.2, 0.5), description="log2 of the scale factor, [low, high]")
 
@@ -205,7 +205,7 @@ class AugmentConfig(Config):
 
 
 class SourceConfig(Config):
-    """One data set: a folder, or a recipe that is rendered during training."""
+    """One data set: a folder, a recipe that is rendered during training, or a share of the training folders."""
 
     path: str | None = Field(None, description="folder; relative to the YAML file")
     format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow", "windows"] = Field(
@@ -213,6 +213,13 @@ class SourceConfig(Config):
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: number of images between the ends of the flow")
     weight: float = Field(1.0, gt=0, le=1e6, description="relative weight of this set in the mixture")
+    share: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="instead of a folder, for validation: this share of the sequences of the training folders, which "
+        "are then not trained on; their names decide, so that further sequences move none",
+    )
     recipe: str | None = Field(
         None, description="YAML file of `blinkgl generate`, instead of a folder; relative to the YAML file"
     )
@@ -243,10 +250,10 @@ class SourceConfig(Config):
         "below 0.01 the flow can hardly be estimated",
     )
 
-    @rule("path", "recipe", "online")
-    def _folder_or_recipe(path, recipe, online):
-        if (path is None) == (recipe is None):
-            raise Refused("give a folder (path) or a recipe, one of the two")
+    @rule("path", "recipe", "share", "online")
+    def _folder_or_recipe(path, recipe, share, online):
+        if [path, recipe, share].count(None) != 2:
+            raise Refused("give a folder (path) or a recipe, or for validation a share, one of these")
         if (recipe is not None) != online:
             raise Refused(
                 "a recipe is rendered while it is trained on: online: true says so"
@@ -263,13 +270,22 @@ class SourceConfig(Config):
             raise Refused("not a range", where="window_ms", value=list(window_ms), accepted="0.01 <= low <= high, ms")
 
 
+def _as_list(sets: object) -> object:
+    return [sets] if isinstance(sets, dict) else sets
+
+
 class DataConfig(Config):
     """Training and validation data."""
 
     train: tuple[SourceConfig, ...] = Field(min_length=1, description="training sets, mixed by weight")
-    validate_on: tuple[SourceConfig, ...] = Field((), description="validation sets; the first samples of each are used")
+    validate_on: Annotated[tuple[SourceConfig, ...], BeforeValidator(_as_list)] = Field(
+        (), description="validation sets; a single one needs no list: {share: 0.1}"
+    )
     validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
+    leave_out: tuple[int, int] = Field(
+        (0, 0), description="[rows at the bottom, columns at the left] that are not trained on, px: a car's hood"
+    )
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
     workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0: load in the training process")
     empty: Literal["error", "skip"] = Field(
@@ -278,6 +294,17 @@ class DataConfig(Config):
     augment: AugmentConfig | None = Field(
         AugmentConfig(), description="random changes of the training samples; null: none"
     )
+
+    @rule("train.*.share", "train.*.path", "validate_on.*.share")
+    def _shared(shares: tuple[float | None, ...], folders, held):
+        for k, share in enumerate(shares):
+            if share is not None:
+                raise Refused("a share is for validation", where=f"train.{k}.share", value=share)
+        held = [share for share in held if share is not None]
+        if len(held) > 1 or (held and not any(folders)):
+            raise Refused(
+                "a share of what", where="validate_on", value=held, accepted="one share, with a folder in data.train"
+            )
 
     @rule("train.*.workers", "train.*.online", "workers")
     def _who_renders(rendering, online, loaders):
@@ -291,6 +318,13 @@ class DataConfig(Config):
     def _one_size(crop, scaling):
         if crop is None and scaling:
             raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
+
+    @rule("leave_out", "crop")
+    def _left_out(leave_out: tuple[int, int], crop):
+        if not all(0 <= side <= 10_000 for side in leave_out):
+            raise Refused("not numbers of px", where="leave_out", value=list(leave_out), accepted="0 to 10000")
+        if any(leave_out) and crop is None:
+            raise Refused("crops leave it out", where="leave_out", value=list(leave_out), accepted="with data.crop")
 
     @rule("crop", "augment.transpose")
     def _square(crop: tuple[int, int] | None, transpose: float):
@@ -322,7 +356,15 @@ class OptimConfig(Config):
 
     steps: int = Field(200_000, ge=1, le=10**9, description="number of weight updates")
     accumulate: int = Field(
-        1, ge=1, le=4096, description="parts in which a step's batch is processed: less memory, the same gradient"
+        1,
+        ge=1,
+        le=4096,
+        description="parts in which a step's batch is processed: less memory, the same gradient, but batch norm "
+        "(context_norm: batch) takes its statistics from each part, and burn_in is drawn for each",
+    )
+    freeze_norm: bool = Field(
+        False,
+        description="batch norm keeps the statistics of init_from, for fine-tuning: they then depend on no batch",
     )
     minutes: float | None = Field(
         None,
@@ -361,7 +403,7 @@ class RunConfig(Config):
     )
     tf32: bool = Field(True, description="use TF32 units for fp32 products, except in fp32 islands")
     channels_last: bool = Field(False, description="memory layout with faster convolutions on some GPUs")
-    compile: bool = Field(False, description="torch.compile of the update step")
+    compile: bool = Field(False, description="torch.compile of the update step, or of a whole network without one")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's default")
     log_every: int = Field(20, ge=1, description="steps between log lines")
     validate_every: int = Field(2000, ge=1, description="steps between validations")

@@ -27,14 +27,14 @@ def show_flows(
     Raises BlinkGLError: the file has no events, or is shorter than its windows."""
     stream, span, factor = _windows(file, predictor, asked, say)
     predictor.unsharpened.clear()  # of the windows that were looked at to choose their length
-    count = still = 0
+    count, still, before = 0, 0, None
     with contextlib.ExitStack() as opened:
         writers: list[Writer] = []
         if outputs.out:
             folder = flow_folder(outputs.out, npy=outputs.npy, at_events=outputs.at_events)
             writers.append(opened.enter_context(folder))
         if outputs.video:
-            fps = min(20.0, 1e6 / span)  # windows per second of video: real time, but at most 20
+            fps = min(20.0, 1e6 / span) * len(asked.shares)  # windows per second of video: real time, but at most 20
             writers.append(opened.enter_context(flow_video(outputs.video, *infer.sensor_of(file), fps)))
         for window in stream:
             flow, tensor = predictor(window)
@@ -46,8 +46,12 @@ def show_flows(
                 f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
-            for writer in writers:
-                writer.add(Answer(window, flow, tensor))
+            for share in asked.shares if writers else ():
+                end = window.new.t0 + round(share * (window.new.t1 - window.new.t0))
+                to_end = replace(window, new=replace(window.new, t1=end))
+                for writer in writers:
+                    writer.add(Answer(to_end, infer.within(flow, before, share), tensor))
+            before = flow
         if not count:
             raise BlinkGLError(
                 f"shorter than {'two windows' if 'old' in predictor.reads else 'a window'} of {span / 1000:g} ms",

@@ -73,6 +73,20 @@ def predict(model: FlowModel, batch: Batch, *, precision: str = "fp32") -> FlowP
     )
 
 
+def within(flow: Flow, before: Flow | None, share: float) -> Flow:
+    """Return the flow (H, W, 2) px from t to t + share · Δ of the flow t -> t + Δ: at the constant acceleration between
+    it and the flow ``before``, t - Δ -> t, where that leads to the pixel, else at constant velocity.
+
+    With acceleration a px/Δ², F = v + a / 2 and P = v - a / 2, and the way is v s + a s² / 2."""
+    if share == 1:
+        return flow
+    if before is None:
+        return flow * np.float32(share)
+    moved = forward_warp(torch.from_numpy(before).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy()
+    acceleration = np.where(moved.any(-1, keepdims=True), flow - moved, 0)
+    return (share * flow - 0.5 * share * (1 - share) * acceleration).astype(np.float32)
+
+
 def largest_change(model: FlowModel, other: FlowModel) -> float:
     """Return the largest difference between the flows of two networks of one kind, px, for 20,000 random events."""
     rng, count, side = np.random.default_rng(0), 20_000, 128

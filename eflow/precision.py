@@ -44,6 +44,15 @@ def use_tf32(device: torch.device, wanted: bool = True) -> bool:
     return able
 
 
+def runs_once(x: Tensor) -> bool:
+    """Whether the operations on ``x`` are executed on a processor, without gradients and without a record of them.
+
+    Short cuts of the processor (numba kernels, blocks that fit the cache) are taken only then: a trace or an export
+    would keep what they returned for its example as a constant."""
+    recorded = torch.is_grad_enabled() or torch.compiler.is_compiling() or torch.jit.is_tracing()
+    return x.device.type == "cpu" and not recorded
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Parts that bf16 would compute with errors of pixels: softmax and expectation, coordinates, accumulation of flow,
 # upsampling.

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import signal
 import sys
@@ -15,6 +13,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from rich.progress import BarColumn, Progress
 from torch import Tensor
 
@@ -22,6 +21,7 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.machine.interrupts import STOPS, Stop
 from blinkgl.machine.terminal import plain_column, plain_console
+from eflow.types import Picture
 
 T = TypeVar("T")
 _QUIET_S = 10.0
@@ -185,7 +185,8 @@ class TrainingError(BlinkGLError):
 
 
 class Readings:
-    """Loss, end-point error and gradient norm of the steps, kept on the device until they are read.
+    """Loss, end-point error and gradient norm of the steps, kept on the device until they are read, then averaged over
+    the processes.
 
     Reading a number from a GPU waits for everything computed before it. ``loss``, ``epe`` and ``norm`` are the last
     values read."""
@@ -203,7 +204,7 @@ class Readings:
 
         Raises TrainingError at the first value that is not finite, after writing the names of its samples to
         ``nan_batch.json``. Call this before saving a checkpoint: later steps are spoilt, too."""
-        read = torch.stack([v for _, _, v in self._pending]).tolist() if self._pending else []
+        read = _of_all(torch.stack([v for _, _, v in self._pending])).tolist() if self._pending else []
         for (step, names, _), (loss, _, norm) in zip(self._pending, read, strict=True):
             if not np.isfinite([loss, norm]).all():
                 _stop_on_nan(self._out, step, names, loss, norm)
@@ -211,6 +212,14 @@ class Readings:
             self.loss, self.epe, self.norm = read[-1]
         self._pending.clear()
         return [(loss, epe) for loss, epe, _ in read]
+
+
+def _of_all(values: Tensor) -> Tensor:
+    """Return the mean of the values of all processes, which read at the same steps."""
+    if dist.is_initialized():
+        dist.all_reduce(values)
+        values = values / dist.get_world_size()
+    return values
 
 
 def _stop_on_nan(out: Path, step: int, names: list[str], loss: float, norm: float) -> None:
@@ -252,68 +261,59 @@ class Signals:
 
 
 class Log:
-    """Writes log.jsonl (one object per line), log.csv (one row per line, for plots) and tensorboard files.
+    """Writes log.jsonl (one object per line) and tensorboard files.
 
-    A resumed run drops the lines after its checkpoint, since those steps run again; seconds continue from the last row.
-    batch : samples per step.   validated : names of the columns of validation scores."""
+    A resumed run drops the lines after its checkpoint, since those steps run again; seconds continue from the last
+    line. batch : samples per step."""
 
-    COLUMNS = ("step", "samples", "processor_s", "wall_s", "loss", "epe", "lr")
+    SECONDS = ("processor_s", "wall_s")
 
-    def __init__(self, out: Path, start: int, batch: int, validated: Iterable[str], enabled: bool):
+    def __init__(self, out: Path, start: int, batch: int, enabled: bool):
         self.path, self.start, self.batch, self.enabled = out / "log.jsonl", start, batch, enabled
-        self.table, self.columns = out / "log.csv", [*self.COLUMNS, *validated]
 
     def __enter__(self) -> Log:
         if self.enabled:
             with output_errors(self.path):
                 lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
-                kept = [
-                    line
-                    for line in lines
-                    if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start
-                ]
-                write_whole(self.path, "".join(line + "\n" for line in kept))
+                # A power cut can leave half a line.
+                whole = [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+                kept = [row for row in whole if row["step"] <= self.start]
+                write_whole(self.path, "".join(json.dumps(row) + "\n" for row in kept))
                 self._file = open(self.path, "a", encoding="utf-8")
-            with output_errors(self.table):
-                kept = self._kept_rows()
-                text = io.StringIO()
-                rows = lambda file: csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")
-                rows(text).writeheader()
-                rows(text).writerows(kept)
-                write_whole(self.table, text.getvalue())  # a kill in between costs no row
-                self._table_file = open(self.table, "a", encoding="utf-8", newline="")
-                self._rows = rows(self._table_file)
-            before = [float(kept[-1][key]) if kept else 0.0 for key in ("processor_s", "wall_s")]
+            before = [kept[-1].get(key, 0.0) if kept else 0.0 for key in self.SECONDS]
             self._began = before[0] - time.process_time(), before[1] - time.monotonic()
             from torch.utils.tensorboard import SummaryWriter
 
             self._board = SummaryWriter(str(self.path.parent / "tb"), purge_step=self.start + 1 if self.start else None)
         return self
 
-    def _kept_rows(self) -> list[dict[str, str]]:
-        """Return the rows of log.csv up to the checkpoint. Their columns stay, since a resumed run may validate on
-        other sets."""
-        lines = self.table.read_text(encoding="utf-8").splitlines(keepends=True) if self.table.is_file() else []
-        # A power cut can leave half a line. A table of another program is replaced.
-        ours = lines[:1] and lines[0].startswith(",".join(self.COLUMNS))
-        rows = list(csv.DictReader(line for line in lines if line.endswith("\n"))) if ours else []
-        self.columns = list(dict.fromkeys([*self.COLUMNS, *(rows[0] if rows else ()), *self.columns]))
-        return [row for row in rows if int(row["step"]) <= self.start]
-
     def write(self, step: int, kind: str, **values: float) -> None:
+        """Write a line of values, with the samples and seconds of the whole training. Raises OutputError."""
+        clocks = (time.process_time(), time.monotonic())
+        spent = {k: round(b + t, 3) for k, b, t in zip(self.SECONDS, self._began, clocks, strict=True)}
+        row = {"step": step, "kind": kind, "samples": step * self.batch, **spent, **values}
         with output_errors(self.path):
-            self._file.write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+            self._file.write(json.dumps(row) + "\n")
             self._file.flush()
-        seconds = round(self._began[0] + time.process_time(), 3), round(self._began[1] + time.monotonic(), 3)
-        row = {"step": step, "samples": step * self.batch, "processor_s": seconds[0], "wall_s": seconds[1]}
-        with output_errors(self.table):
-            self._rows.writerow({**values, **row})
-            self._table_file.flush()
-        for k, v in values.items():
+        for k, v in {**spent, **values}.items():
             self._board.add_scalar(f"{kind}/{k}", v, step)
+
+    def describe(self, text: str, values: dict[str, object]) -> None:
+        """Show the configuration in tensorboard, as text and as hyper-parameters by their keys."""
+        from torch.utils.tensorboard.summary import hparams
+
+        self._board.add_text("configuration", f"```\n{text}\n```", self.start)
+        plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in values.items()}
+        writer = self._board.file_writer
+        assert writer is not None
+        for summary in hparams(plain, {"train/loss": 0.0, "train/epe": 0.0}):
+            writer.add_summary(summary)
+
+    def picture(self, step: int, strip: Picture) -> None:
+        """Show a picture in tensorboard."""
+        self._board.add_image("sample", strip, step, dataformats="HWC")
 
     def __exit__(self, *_) -> None:
         if self.enabled:
             self._file.close()
-            self._table_file.close()
             self._board.close()

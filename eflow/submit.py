@@ -57,9 +57,9 @@ def submit(
     *,
     warm_start: bool = False,
     progress: Callable[[int, int], None] = lambda done, count: None,
-) -> int:
+) -> tuple[int, int]:
     """Write the zip of the benchmark whose layout the test set at ``root`` has, a file ``<sequence>/<name>`` for every
-    label; return the number of files.
+    label; return the number of files, and how many of them hold zero flow: a window has no events.
 
     Raises AssetError: no benchmark's layout, a test sequence is missing, or there are others. OutputError: the file
     exists, or its check failed (then nothing is written)."""
@@ -73,15 +73,17 @@ def submit(
     if len(set(names)) != len(names):
         raise AssetError("a file index is listed twice", where=str(root))
     sizes: dict[str, tuple[int, int]] = {}
+    still = 0
     predictor = Predictor(model, 0, 0, warm_start=warm_start)
     with atomic_file(out, overwrite=False) as temporary:
         with zipfile.ZipFile(temporary, "w", benchmark.compression) as archive:
             for i, sample, answer in answers(predictor, source, range(len(source))):
                 _member(archive, names[i], benchmark.encode(answer.flow, names[i]))
                 sizes[names[i]] = sample.height, sample.width
+                still += not answer.flow.any()
                 progress(i + 1, len(names))
         check_archive(temporary, benchmark, sizes)
-    return len(names)
+    return len(names), still
 
 
 def _check_sequences(source: FolderSource, sequences: tuple[str, ...], where: str) -> None:

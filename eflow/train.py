@@ -6,7 +6,7 @@ It runs on the CPU or a GPU (``run.device``; auto uses a GPU if there is one), o
     eflow train configs/eflow/smoke.yaml --out out/smoke --resume
     torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
 
-A run folder holds config.yaml, log.csv and log.jsonl, tb/ (tensorboard), checkpoints/<step>/, pictures/ and the
+A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/, pictures/ and the
 weights of the best validation, best.safetensors. SIGINT and
 SIGTERM end the current step and write a checkpoint; the command then exits 130 or 143. ``--resume`` continues from the
 newest checkpoint, and begins where there is none yet, so that a job script needs one line. On the
@@ -50,6 +50,7 @@ from eflow.precision import precision_on
 from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, cost_of
 from eflow.schedule import Course, learning_rate
 from eflow.training_data import check_sizes, check_truth, training_sets, validate, validation_sets
+from eflow.types import Picture
 
 
 @dataclass
@@ -139,6 +140,9 @@ class Training:
         self.model = build_model(config.model)
         if config.init_from and self.saved is None:
             ckpt.load_weights(self.model, *weights_of(config))
+        self.norms = [m for m in self.model.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+        if config.optim.freeze_norm and not self.norms:
+            raise ConfigError("this network has no batch norm", where="optim.freeze_norm", value=True, accepted="false")
         self.model.to(self.device)
         if config.run.channels_last:
             self.model.to(memory_format=torch.channels_last)  # type: ignore[no-matching-overload]
@@ -165,6 +169,7 @@ class Training:
             seed=config.seed,
             augment=config.data.augment,
             crop=config.data.crop,
+            leave_out=config.data.leave_out,
             empty=config.data.empty,
             reads=self.model.reads,
         )
@@ -175,9 +180,8 @@ class Training:
     def _parallel(self) -> torch.nn.Module:
         """Return the network, compiled or wrapped to average gradients over processes if the configuration asks for
         it."""
-        update = getattr(self.model, "update", None)
-        if self.config.run.compile and isinstance(update, torch.nn.Module):
-            update.compile()
+        if self.config.run.compile:  # most of the time of a network with refinements goes to their steps
+            getattr(self.model, "update", self.model).compile()
         if self.world == 1:
             return self.model
         return DistributedDataParallel(
@@ -192,10 +196,9 @@ class Training:
         stop = self.start if self.done >= 1 else self.stop
         sampler = StepSampler(self.mixture, config.data.batch, self.start, stop, self.rank, self.world)
         reason = None
-        validated = [f"{name}/{what}" for name, *_ in self.validation for what in ("AEE", "zero")]
         with (
             Signals() as signals,
-            Log(self.out, self.start, config.data.batch, validated, enabled=self.lead) as log,
+            Log(self.out, self.start, config.data.batch, enabled=self.lead) as log,
             TrainProgress(
                 config.optim.steps,
                 self.start,
@@ -205,6 +208,8 @@ class Training:
                 minutes=self.course.minutes_left(config.run.time_limit),
             ) as progress,
         ):
+            if self.lead:
+                log.describe(as_yaml(config), ckpt.leaves(json.loads(config.model_dump_json())))
             if self.begins_anew:
                 progress.say(f"no checkpoint in {self.out} yet: the training begins")
             waiting = Waiting(batches(self.dataset, sampler, config.data.workers, pin=device.type == "cuda"))
@@ -218,7 +223,9 @@ class Training:
                 if self.lead:
                     self._log(log, rate, progress, waiting)
                     if self._every("picture"):
-                        _picture(self.out / "pictures" / f"{self.step:09d}.png", batch, flow)
+                        strip = _picture(batch, flow)
+                        write_picture(self.out / "pictures" / f"{self.step:09d}.png", strip)
+                        log.picture(self.step, strip)
                     # A time limit validates as the last step does; a signal should end soon.
                     if self.validation and (self._every("validate") or reason in ("finished", "time limit")):
                         self._validate(log, progress)
@@ -242,6 +249,8 @@ class Training:
         rate = learning_rate(self.done, optim.lr, optim.warmup, optim.cooldown)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
+        for norm in self.norms:  # a validation before this step switched all layers
+            norm.train(not optim.freeze_norm)
         self.optimizer.zero_grad(set_to_none=True)
         loss, epe, flow = self._backward(batch)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), optim.clip)
@@ -255,8 +264,7 @@ class Training:
 
     def _backward(self, batch: dict) -> tuple[Tensor, Tensor, Tensor]:
         """Add up the gradients of the batch's parts; return loss, end-point error, px, and the first part's flow."""
-        size, own = len(batch["name"]) // self.config.optim.accumulate, batch["valid"].sum()
-        count = own.float()
+        size, count = len(batch["name"]) // self.config.optim.accumulate, batch["valid"].sum().float()
         # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels.
         if self.world > 1:
             dist.all_reduce(count)
@@ -273,7 +281,7 @@ class Training:
                 done.append(_forward(self.net, part, self.config, count))
                 done[-1][0].backward()
         losses, errors, flows = zip(*((loss.detach(), error, flow) for loss, error, flow in done), strict=True)
-        return sum(losses[1:], losses[0]), sum(errors[1:], errors[0]) / own.clamp(min=1), flows[0]
+        return sum(losses[1:], losses[0]), sum(errors[1:], errors[0]) / count.clamp(min=1), flows[0]
 
     def _every(self, *whats: str) -> bool:
         """Whether one of these actions is due at this step."""
@@ -309,7 +317,6 @@ class Training:
                 lr=rate,
                 grad_norm=self.read.norm,
                 samples_per_s=progress.rate,
-                processor_s=time.process_time(),
                 waited=waiting.share,
                 **_rendering(self.sources),
             )
@@ -388,16 +395,14 @@ def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
         ema[k].lerp_(v, 1 - decay) if v.is_floating_point() else ema[k].copy_(v)
 
 
-def _picture(path: Path, batch: dict, flow: Tensor) -> None:
+def _picture(batch: dict, flow: Tensor) -> Picture:
+    """Return the first sample of a batch as a strip: events, truth, prediction, error."""
     first = lambda k: batch[k][0].detach().float().cpu().numpy()
-    write_picture(
-        path,
-        comparison(
-            events_of(first("new")),
-            flow[0].float().cpu().numpy().transpose(1, 2, 0),
-            first("flow").transpose(1, 2, 0),
-            batch["valid"][0].cpu().numpy(),
-        ),
+    return comparison(
+        events_of(first("new")),
+        flow[0].float().cpu().numpy().transpose(1, 2, 0),
+        first("flow").transpose(1, 2, 0),
+        batch["valid"][0].cpu().numpy(),
     )
 
 
@@ -406,6 +411,7 @@ def as_yaml(config: TrainConfig) -> str:
     return to_yaml(json.loads(config.model_dump_json()))
 
 
+# log.csv : of earlier versions.
 _OURS = {"config.yaml", "log.csv", "log.jsonl", "tb", "checkpoints", "pictures", "best.safetensors", "nan_batch.json"}
 
 

@@ -15,7 +15,7 @@ from blinkgl.config.run import derived_seed
 from blinkgl.errors import AssetError, ConfigError
 from eflow.config import TrainConfig
 from eflow.data.dataset import FlowDataset, Key, Mixture, collate, evenly, is_endless
-from eflow.data.sources import Source, open_source
+from eflow.data.sources import Source, open_source, parts_of
 from eflow.infer import predict
 from eflow.metrics import frame_metrics
 from eflow.models import FlowModel
@@ -31,6 +31,8 @@ def training_sets(
     sources: dict[int, Source] = {
         k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if s.path is not None
     }
+    for share in (s.share for s in data.validate_on if s.share is not None):
+        sources = {k: parts_of(source, share, f"data.train.{k}.path")[0] for k, source in sources.items()}
     sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
     mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
     for k, s in enumerate(data.train):
@@ -68,13 +70,16 @@ def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | 
 def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:
     """Return (name, set, indices of the samples to score) for every set of ``data.validate_on``."""
     sets = []
-    for s in config.data.validate_on:
+    folders = [s for s in config.data.train if s.path is not None]
+    for s, share in ((s, held.share) for held in config.data.validate_on for s in (folders if held.share else [held])):
         if s.path is None:
-            from eflow.data.online import held
+            from eflow.data.online import held as rendered
 
-            source = held(s, config.data.validate_samples)
+            source = rendered(s, config.data.validate_samples)
         else:
             source = open_source(s.path, s.format, dt=s.dt)
+        if share is not None:
+            source = parts_of(source, share, s.path or "")[1]
         dataset = FlowDataset([source], model.representation, empty=config.data.empty, reads=model.reads)
         title = Path(s.path or str(s.recipe)).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
         sets.append((title, dataset, evenly(len(dataset), config.data.validate_samples)))

@@ -217,7 +217,7 @@ def test_constraints_pin_what_setup_cfg_asks_for():
     parser = configparser.ConfigParser()
     parser.read(REPOSITORY / "setup.cfg")
     wanted = parser["options"]["install_requires"].split("\n")
-    for extra in ("dev", "docs", "learn"):
+    for extra in ("dev", "docs", "learn", "onnx"):
         wanted += parser["options.extras_require"][extra].split("\n")
     for line in filter(None, wanted):
         requirement = Requirement(line)

@@ -15,6 +15,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, purpose)
         "Blender: blinkgl import; better in an environment of its own, see docs/install.md",
     ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
+    "onnx": (("onnx", "onnxscript", "onnxruntime"), "networks for programs without torch: eflow export --onnx"),
     "tensors": (("torch",), "events as tensors: TensorEsim, TensorV2e, events.device: cuda"),
     "cluster": (("ray",), "many machines"),
     "pyrender": (("pyrender",), "scenes of pyrender: Scene.from_pyrender; tests compare with its renderer"),

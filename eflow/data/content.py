@@ -25,6 +25,7 @@ def content_of(config: TrainConfig) -> dict[str, str]:
         f"data.{name}.{k}." + ("path" if s.recipe is None else "recipe"): _of_set(s)
         for name in ("train", "validate_on")
         for k, s in enumerate(getattr(config.data, name))
+        if s.share is None
     }
     with suppress(AssetError):
         if config.init_from:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol, TypeGuard
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
@@ -138,11 +139,13 @@ class FlowDataset(Dataset):
         seed: int = 0,
         augment: AugmentConfig | None = None,
         crop: tuple[int, int] | None = None,
+        leave_out: tuple[int, int] = (0, 0),
         empty: str = "error",
         reads: tuple[str, ...] = SIDES,
     ):
         self.sources, self.representation, self.seed = sources, representation, seed
         self.reads, self.augment, self.crop, self.empty = reads, augment, crop, empty
+        self.leave_out = leave_out
         self._starts = np.cumsum([0, *(0 if is_endless(s) else len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
             raise ConfigError(
@@ -172,6 +175,8 @@ class FlowDataset(Dataset):
         name = ""
         for step in range(tries):
             sample = source[key.index if is_endless(source) else (key.index + step) % len(source)]
+            if any(self.leave_out):
+                sample = sample.without(*self.leave_out)
             name, sample = sample.name, self._with_events(sample)
             if sample is None:
                 continue
@@ -279,7 +284,7 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
 
     Grids and flow are bilinear; flow is multiplied by the exact factor of each axis. A pixel is valid only if all four
     contributing pixels are. Of sparse truth (less than ``SPARSE`` is valid), of which hardly any pixel would be, each
-    pixel takes the flow and validity of the nearest one."""
+    valid pixel moves to the one nearest to its new place."""
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
@@ -288,11 +293,20 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
         # Sizes are whole, so the factor of an axis is a little off the one that was drawn.
         ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]
         if sample["valid"].float().mean() < SPARSE:
-            resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="nearest-exact")[0]
+            resize = lambda a: _moved(a, sample["valid"], size)
         out["flow"] = resize(torch.where(sample["valid"], sample["flow"], 0)) * ratio
         for k in ("valid", "mask"):
             out[k] = resize(sample[k][None].float())[0] > 0.999
     return out
+
+
+def _moved(a: Tensor, valid: Tensor, size: list[int]) -> Tensor:
+    """Return an array (C, *size), 0 but where a valid pixel of ``a`` (C, H, W) moved to; of several the last one."""
+    y, x = np.nonzero(valid.numpy())
+    (height, width), out = valid.shape, np.zeros((len(a), *size), np.float32)
+    # A pixel's centre is at + 0.5, before and after.
+    out[:, ((y + 0.5) * size[0] / height).astype(int), ((x + 0.5) * size[1] / width).astype(int)] = a.numpy()[:, y, x]
+    return torch.from_numpy(out)
 
 
 def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name: str) -> dict:

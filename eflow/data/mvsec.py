@@ -95,8 +95,47 @@ class NpzRows:
             return np.frombuffer(member.read(count * dtype.itemsize), dtype).reshape(shape)
 
 
+class NpzTruth:
+    """The 20 Hz flow of ``<seq>_gt_flow_dist.npz``. times : (N,) s. Raises AssetError."""
+
+    def __init__(self, path: Path):
+        self._rows = NpzRows(path, ("timestamps", "x_flow_dist", "y_flow_dist"))
+        self.path, self.times = path, self._rows.read("timestamps")
+        for name in ("x_flow_dist", "y_flow_dist"):
+            if self._rows.shape(name) != (expected := (len(self.times), HEIGHT, WIDTH)):
+                raise AssetError(
+                    f"array '{name}' has the wrong shape",
+                    where=str(path),
+                    value=self._rows.shape(name),
+                    accepted=str(expected),
+                )
+
+    def field(self, k: int) -> Flow:
+        """Return field k, (H, W, 2) float32 px."""
+        parts = ("x_flow_dist", "y_flow_dist")
+        return np.stack([self._rows.read(name, k).astype(np.float32) for name in parts], axis=-1)
+
+
+class Hdf5Truth:
+    """The same of ``<seq>_gt.hdf5``. times : (N,) s. Raises AssetError."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        with open_hdf5(path) as file:
+            self.times = dataset(file, "davis/left/flow_dist_ts", path, shape=(None,), kinds="f")[()]
+            self._flow(file)
+
+    def _flow(self, file: Hdf5File) -> Data:
+        return dataset(file, "davis/left/flow_dist", self.path, shape=(len(self.times), 2, HEIGHT, WIDTH), kinds="f")
+
+    def field(self, k: int) -> Flow:
+        """Return field k, (H, W, 2) float32 px. The file is open only meanwhile: handles do not survive a fork."""
+        with open_hdf5(self.path) as file:
+            return np.moveaxis(self._flow(file)[k].astype(np.float32), 0, -1)
+
+
 class MvsecSource:
-    """Samples of ``<seq>_data.hdf5`` + ``<seq>_gt_flow_dist.npz`` files at or below ``root``.
+    """Samples of ``<seq>_data.hdf5`` + ``<seq>_gt_flow_dist.npz`` or ``<seq>_gt.hdf5`` files at or below ``root``.
 
     Sample i of a sequence: events between images i - dt … i (old) and i … i + dt (new); ground truth over the same
     time. ``mask``: pixels with an event in the new window, inside the 256x256 centre crop, above the hood outdoors.
@@ -153,6 +192,10 @@ class MvsecSource:
     def __len__(self) -> int:
         return len(self._index)
 
+    def sequence_names(self) -> list[str]:
+        """Return the name of each sample's sequence."""
+        return [sequence.name for sequence, _ in self._index]
+
     def __getitem__(self, index: int) -> RawSample:
         s, i = self._index[index]
         t_old, t, t_new = (int(self._stamps(s)[j]) for j in (i - self.dt, i, i + self.dt))
@@ -181,21 +224,15 @@ class _MvsecSequence:
             ].astype(np.int64)
         if not len(stamps):
             raise AssetError("has no images, so samples have no times", where=str(path))
-        flow = path.with_name(f"{self.name}_gt_flow_dist.npz")
-        if not flow.is_file():
-            raise AssetError("no such file", where=str(flow), accepted="ground truth beside the events")
-        self._flow = NpzRows(flow, ("timestamps", "x_flow_dist", "y_flow_dist"))
+        flow, other = path.with_name(f"{self.name}_gt_flow_dist.npz"), path.with_name(f"{self.name}_gt.hdf5")
+        if not flow.is_file() and not other.is_file():
+            raise AssetError(
+                "no such file", where=str(flow), accepted=f"ground truth beside the events, this or {other.name}"
+            )
+        self._truth = NpzTruth(flow) if flow.is_file() else Hdf5Truth(other)
         self.t0_s = float(stamps[0])
         self.image_us = _stamps(stamps - self.t0_s, f"{path}: 'davis/left/image_raw_ts'")
-        self.flow_us = _stamps(self._flow.read("timestamps") - self.t0_s, f"{flow}: 'timestamps'")
-        for name in ("x_flow_dist", "y_flow_dist"):
-            if self._flow.shape(name) != (expected := (len(self.flow_us), HEIGHT, WIDTH)):
-                raise AssetError(
-                    f"array '{name}' has the wrong shape",
-                    where=str(flow),
-                    value=self._flow.shape(name),
-                    accepted=str(expected),
-                )
+        self.flow_us = _stamps(self._truth.times - self.t0_s, f"{self._truth.path}: its time stamps")
         self._file: Hdf5File | None = None
         self._pid: int | None = None
         self._table: Data | None = None
@@ -240,10 +277,7 @@ class _MvsecSequence:
         return propagate(pieces)
 
     def _field(self, k: int) -> Flow:
-        parts = ("x_flow_dist", "y_flow_dist")
-        return self._rows.of(
-            k, lambda: np.stack([self._flow.read(name, k).astype(np.float32) for name in parts], axis=-1)
-        )
+        return self._rows.of(k, lambda: self._truth.field(k))
 
 
 def _stamps(seconds: Numbers, where: str) -> Times:

@@ -7,6 +7,7 @@ All three have an event file and one flow file per label, so they share one read
 |---|---|---|---|
 | blinkgl | events.h5 | flow/{forward,backward}/*.png | flow/*_timestamps.txt |
 | dsec | events/left/events.h5, rectify_map.h5 | flow/forward/*.png | flow/forward_timestamps.txt, or the test CSV |
+| video | events.h5 of blinkgl simulate | flow/forward/*.flo, png, npy, pfm or flo5 | flow/forward_timestamps.txt |
 | blinkflow | events_left/events.h5 | forward_flow/*.npy, backward_flow/*.npy | index / fps (config.yaml) |
 """
 
@@ -18,6 +19,7 @@ import re
 from collections import OrderedDict
 from collections.abc import Sized
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Protocol
 
@@ -25,8 +27,9 @@ import numpy as np
 
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io import flow as flow_files
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.flow import read_flow_npy, read_flow_png
+from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
@@ -122,6 +125,10 @@ class FolderSource:
             backward_valid=backward_valid,
         )
 
+    def sequence_names(self) -> list[str]:
+        """Return the name of each sample's sequence."""
+        return [sequence.name for sequence, _ in self._index]
+
     def entry(self, index: int) -> tuple[Sequence, Entry]:
         """Return the sequence and the label of sample ``index``."""
         return self._index[index]
@@ -181,17 +188,55 @@ def read_rectify_map(path: Path) -> Numbers:
 
 
 def read_flow(path: Path) -> tuple[Flow, Mask]:
-    """Return flow (H, W, 2) float32 px and valid (H, W) bool of a DSEC PNG or a BlinkFlow .npy (u, v, validity).
+    """Return flow (H, W, 2) float32 px and valid (H, W) bool of a DSEC PNG, a BlinkFlow .npy (u, v, validity), or a
+    .flo, .pfm or .flo5.
 
     Raises AssetError: missing, corrupt, wrong shape, or NaN / infinity in a valid pixel."""
     if path.suffix != ".npy":
-        return read_flow_png(path)
+        return flow_files.read_flow(path)
     flow, valid = read_flow_npy(path)
     bad = valid & ~np.isfinite(flow).all(-1)
     if bad.any():
         y, x = np.argwhere(bad)[0]
         raise AssetError(f"flow is NaN or infinite at pixel ({x}, {y}) and marked valid", where=str(path))
     return np.where(valid[..., None], flow, np.float32(0)), valid
+
+
+class Part:
+    """The samples ``indices`` of a source, in order."""
+
+    def __init__(self, source: Source, indices: list[int]):
+        self.source, self.indices, self.has_backward = source, indices, source.has_backward
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> RawSample:
+        return self.source[self.indices[index]]
+
+
+def parts_of(source: Source, share: float, where: str) -> tuple[Part, Part]:
+    """Return the samples to train on, and those of the sequences held out: about a ``share`` of all, by digests of
+    their names, so that a sequence stays where it is when others are added.
+
+    Raises ConfigError: single windows, which are of no sequence, or one of the parts would be empty."""
+    if isinstance(source, PoolSource):
+        raise ConfigError("single windows are of no sequence", where=where, accepted="a folder of sequences")
+    assert isinstance(source, FolderSource | MvsecSource)
+    names = source.sequence_names()
+    draws = {name: int(sha256(name.encode()).hexdigest()[:12], 16) / 16**12 for name in names}
+    least, most = min(draws.values()), max(draws.values())
+    if not least < share <= most:
+        raise ConfigError(
+            "too few sequences for a share",
+            where=where,
+            value=f"{share}, {len(draws)} sequences",
+            accepted=f"a share from {least + 0.001:.3f} to {most:.3f}" if len(draws) > 1 else "a set to validate on",
+        )
+    train, held = (
+        Part(source, [k for k, name in enumerate(names) if (draws[name] < share) is kept]) for kept in (False, True)
+    )
+    return train, held
 
 
 # ---- where files lie -------------------------------------------------------------------------------------------------
@@ -238,21 +283,22 @@ def blinkgl_sequence(folder: Path, name: str) -> Sequence | None:
 
 
 def find_dsec(root: Path) -> list[Sequence]:
-    """Return the DSEC sequences at or below ``root``.
+    """Return the DSEC sequences at or below ``root``, and those of events made of video.
 
     Events and flow are in one tree, or in the folders of the archives, ``train_events`` and ``train_optical_flow``.
-    The times of a test sequence are in ``test_forward_flow_timestamps.csv`` or ``<sequence>.csv``."""
+    The times of a test sequence are in ``test_forward_flow_timestamps.csv`` or ``<sequence>.csv``. Events of video lie
+    in the folder of the sequence and need no rectification map."""
     sequences = []
     for events in sorted(below(root, "events.h5")):
-        if events.parent.name not in ("left", "events_left") or "forward_flow" in {
-            p.name for p in events.parent.parent.iterdir()
-        }:
+        place = events.parent
+        video = place.name not in ("left", "events_left")
+        if "forward_flow" in {p.name for p in place.parent.iterdir()} or (video and not (place / "flow").is_dir()):
             continue
-        folder = events.parent.parent.parent if events.parent.name == "left" else events.parent.parent
+        folder = place if video else place.parent.parent if place.name == "left" else place.parent
         flow_folder = next(
             (f for f in (folder / "flow", root / "train_optical_flow" / folder.name / "flow") if f.is_dir()), None
         )
-        rectify = events.parent / "rectify_map.h5"
+        rectify = None if video else place / "rectify_map.h5"
         test = next(
             (
                 c
@@ -268,7 +314,7 @@ def find_dsec(root: Path) -> list[Sequence]:
         if flow_folder is not None:
             times, files = (
                 read_times(flow_folder / "forward_timestamps.txt"),
-                numbered(flow_folder / "forward", "png"),
+                numbered(flow_folder / "forward", "*" if video else "png"),
             )
             _same_count(flow_folder / "forward", files, times)
             entries = tuple(Entry(k, t0, t1, f) for (k, f), (t0, t1) in zip(files.items(), times, strict=True))
@@ -276,7 +322,7 @@ def find_dsec(root: Path) -> list[Sequence]:
             entries = tuple(Entry(i, t0, t1) for t0, t1, i in read_submission_times(test))
         else:
             continue
-        if not rectify.is_file():
+        if rectify is not None and not rectify.is_file():
             raise AssetError("no rectification map beside the events", where=str(rectify))
         sequences.append(Sequence(folder.name, folder.name, events, entries, rectify))
     return sequences

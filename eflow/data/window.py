@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from blinkgl.errors import EventDataError
 from blinkgl.online.samples import WindowSample
 from blinkgl.types.events import Events
 from eflow.types import Flow, Mask
@@ -133,6 +134,32 @@ class RawSample:
     def has_events(self) -> bool:
         """Return whether both windows have events."""
         return len(self.old) > 0 and len(self.new) > 0
+
+    def without(self, bottom: int, left: int) -> RawSample:
+        """Return the sample without ``bottom`` rows and ``left`` columns, px. Raises EventDataError: none is left."""
+        height, width = self.height - bottom, self.width - left
+        if min(height, width) < 1:
+            size = f"less than {(self.height, self.width)}"
+            raise EventDataError("nothing is left of the sample", where=self.name, value=(bottom, left), accepted=size)
+
+        def cut(w: Window) -> Window:
+            # Rectified coordinates lie between pixels.
+            w = w.take((w.x > left - 1) & (w.y < height) if w.x.dtype.kind == "f" else (w.x >= left) & (w.y < height))
+            return replace(w, x=w.x - w.x.dtype.type(left))
+
+        rest = lambda a: None if a is None else a[:height, left:]
+        return replace(
+            self,
+            old=cut(self.old),
+            new=cut(self.new),
+            height=height,
+            width=width,
+            flow=rest(self.flow),
+            backward=rest(self.backward),
+            valid=rest(self.valid),
+            backward_valid=rest(self.backward_valid),
+            mask=rest(self.mask),
+        )
 
     def flip(self, axis: str) -> RawSample:
         """Return the sample mirrored horizontally (axis "x") or vertically ("y")."""

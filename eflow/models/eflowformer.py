@@ -17,6 +17,7 @@ from eflow.models.unets import Consensus, Residual, double
 from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
 from eflow.ops.correlation import channels_of, pixel_grid
 from eflow.ops.upsample import bilinear_upsample
+from eflow.precision import runs_once
 from eflow.types import Batch
 
 LAYERS = {"base": 4, "small": 2, "tiny": 1}
@@ -42,7 +43,7 @@ class Mlp(nn.Sequential):
 
     def forward(self, input: Tensor) -> Tensor:
         # Gradients need the hidden layers anyway, and a GPU is faster without blocks.
-        if torch.is_grad_enabled() or input.device.type != "cpu" or torch.compiler.is_compiling():
+        if not runs_once(input):
             return super().forward(input)
         blocks = input.reshape(-1, input.shape[-1]).split(_TOKENS)
         return torch.cat([super(Mlp, self).forward(block) for block in blocks]).view(input.shape)

@@ -15,27 +15,12 @@ from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initial
 from eflow.types import Batch
 
 
-class _Fire(torch.autograd.Function):
-    """Spikes where the membrane exceeds the threshold; gradients pass there, divided by the threshold."""
-
-    @staticmethod
-    def forward(ctx, membrane: Tensor, threshold: float) -> Tensor:
-        ctx.threshold = threshold
-        # The threshold itself does not fire.
-        spikes = (membrane > threshold).to(membrane.dtype)
-        ctx.save_for_backward(spikes)
-        return spikes
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[bad-override]
-        # The surrogate gradient of Lee et al. 2020: 1 / threshold where a spike was.
-        return gradient * ctx.saved_tensors[0] / ctx.threshold, None
-
-
 def integrate_and_fire(membrane: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
     """Return (spikes, membrane afterwards). Neurons that spiked are reset to 0 (hard reset)."""
-    spikes = _Fire.apply(membrane, threshold)
-    return spikes, membrane * (1 - spikes.detach())
+    # The threshold itself does not fire.
+    fired = (membrane > threshold).to(membrane.dtype)
+    # The surrogate gradient of Lee et al. 2020, 1 / threshold where a spike was, of a term that is 0.
+    return fired + fired * (membrane - membrane.detach()) / threshold, membrane * (1 - fired)
 
 
 class SpikeFlowNet(FlowModel[SpikeFlowNetConfig]):

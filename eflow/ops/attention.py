@@ -36,8 +36,8 @@ class WindowAttention(nn.Module):
         # While compiling, the size is unknown and may need the mask.
         if torch.compiler.is_compiling() or down or right:
             # True where a key is a real token, the same for all queries of a window.
-            real = x.new_zeros(rows * s, columns * s, dtype=torch.bool)
-            real[:h, :w].fill_(True)
+            tall = torch.arange(rows * s, device=x.device) < h
+            real = tall[:, None] & (torch.arange(columns * s, device=x.device) < w)
             real = real.view(rows, s, columns, s).transpose(1, 2).reshape(1, rows * columns, 1, 1, s * s)
             mask = real.expand(n, -1, 1, s * s, -1).reshape(n * rows * columns, 1, s * s, s * s)
         # softmax(q k^T / sqrt(d)) v, per head.

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from blinkgl.machine.kernels import kernel
-from eflow.precision import fp32
+from eflow.precision import fp32, runs_once
 
 # Largest number of tokens with a dense volume, whose memory grows with their square.
 DENSE_TOKENS = 8192
@@ -64,7 +64,7 @@ class DenseCorrelation:
         """Return the taps (N, taps, h, w) fp32 around target coordinates (N, 2, h, w) fp32.
 
         Channel (level*side + dy)*side + dx with side = 2r+1; zero outside the image."""
-        if coords.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
+        if runs_once(coords):
             return _lookup_cpu(self.levels, coords, self.radius)
         n, h, w = self.shape
         flat = coords.permute(0, 2, 3, 1).reshape(-1, 2)

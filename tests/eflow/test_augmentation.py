@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from blinkgl.errors import EventDataError
 from eflow.data.representation import VoxelGrid
 from eflow.data.window import RawSample, Window
 
@@ -55,6 +56,19 @@ def test_on_voxels_they_are_exact(rectified):
         close(of(s.reverse()), -before[::-1, ::-1])
         turned = s.transpose()
         close(np.stack([grid(w, W, H) for w in (turned.old, turned.new)]), before.swapaxes(-1, -2))
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_what_is_left_out_is_a_part_of_the_grid(rectified):
+    s = sample(rectified)
+    rest, grid = s.without(3, 5), VoxelGrid(15, "none")
+    assert (rest.height, rest.width) == (H - 3, W - 5)
+    for whole, part in ((s.old, rest.old), (s.new, rest.new)):
+        np.testing.assert_allclose(grid(part, H - 3, W - 5), grid(whole, H, W)[:, : H - 3, 5:], atol=3e-5)
+    assert (rest.flow == s.flow[: H - 3, 5:]).all() and (rest.valid == s.valid[: H - 3, 5:]).all()
+    assert (rest.backward == s.backward[: H - 3, 5:]).all() and rest.old.x.dtype == s.old.x.dtype
+    with pytest.raises(EventDataError, match=r"^s/0: nothing is left of the sample \(got \(12, 0\)\)"):
+        s.without(H, 0)
 
 
 def test_flow_follows():

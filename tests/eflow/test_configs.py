@@ -1,16 +1,19 @@
 """The configurations that ship: every one is valid, and what the README says about them holds."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
 from blinkgl.errors import ConfigError
+from blinkgl.io.flow import write_flow_png
 from eflow.cli import run
 from eflow.load_config import load_train_config
 from eflow.models import model_config
-from flow_data import blinkgl_set
+from flow_data import blinkgl_set, constant_flow, dsec_set
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "configs" / "eflow"
@@ -24,6 +27,25 @@ def test_training_configurations(name):
     assert model == config.model
     if config.data.crop is not None:
         assert all(side % 16 == 0 and side >= 128 for side in config.data.crop)
+
+
+def test_dsec_2026_trains_on_dsecs_layout(tmp_path, capsys):
+    """Real folders, sizes, rectification and sparse truth; only the network and the number of steps are small."""
+    root = dsec_set(tmp_path / "train", tuple(f"zurich_city_{k:02d}_a" for k in range(4)), labels=1)
+    sparse = np.random.default_rng(0).random((480, 640)) < 0.3
+    for path in root.glob("*/flow/forward/*.png"):
+        write_flow_png(path, constant_flow(480, 640), sparse)
+    words = ["model={name: eraft, size: tiny, train_iterations: 1, iterations: 1}", f"data.train=[{{path: {root}}}]"]
+    words += ["data.batch=2", "data.workers=0", "data.validate_samples=1", "optim.steps=2", "run.precision=fp32"]
+    words += ["data.validate_on={share: 0.6}", "data.augment.scale_probability=1", "run.picture_every=1"]
+    options = [word for pair in words for word in ("--set", pair)]
+    out = tmp_path / "run"
+    assert run(["train", str(FOLDER / "dsec_2026.yaml"), "--out", str(out), "-q", *options]) == 0, (
+        capsys.readouterr().err
+    )
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert [row["kind"] for row in rows] == ["train", "validation"] and 0 < rows[0]["epe"] < 20
+    assert rows[1]["train/zero"] == pytest.approx(np.hypot(4, 2), abs=0.01)  # of the whole frame, not of a crop
 
 
 @pytest.mark.parametrize("crop", ["[128, 144]", "null"])

@@ -35,6 +35,7 @@ COMMANDS = {  # as documented: what makes it short
     "eflow models": "",
     "eflow models NAME": "",
     "eflow train configs/eflow/finetune.yaml --out out/mine --set init_from=NAME": SHORT,
+    "eflow export out/smoke --onnx flow.onnx --size 640x480": "--size 32x32",
     "eflow predict contrast-affine recording.raw --window-ms 20 --out out/flow": "--end-ms 60",
 }  # fmt: skip
 

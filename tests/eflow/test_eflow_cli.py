@@ -16,6 +16,7 @@ torch = pytest.importorskip("torch")
 from shared_data import shared  # noqa: E402
 
 import eflow  # noqa: E402
+from blinkgl.io.dsec import DsecEventWriter  # noqa: E402
 from blinkgl.io.flow import read_flow_png  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from blinkgl.types.events import Events  # noqa: E402
@@ -200,7 +201,8 @@ def test_a_network_is_chosen_by_what_moves(moving, name, tmp_path, capsys):
     assert run(["predict", *([] if moving == "camera" else ["auto"]), str(path), "--window-ms", "90"]) == 0
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith(f"network: {name}, since ")
-    assert {"camera": "only the camera moves", "bodies": "bodies move", "nothing before": "no pair"}[moving] in first
+    why = {"camera": "off an affine field", "bodies": "depth shows, or bodies move", "nothing before": "no pair"}
+    assert why[moving] in first
 
 
 def test_flow_without_events_nearby_is_written_as_not_valid(network, tmp_path):
@@ -269,7 +271,7 @@ def test_submit_dsec(network, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(submit.BENCHMARKS, "dsec", replace(submit.BENCHMARKS["dsec"], sequences=names))
     root, out = dsec_set(tmp_path / "test", names, labels=1, test=True), tmp_path / "sub.zip"
     assert run(["submit", network, str(root), "--out", str(out)]) == 0, capsys.readouterr().err
-    assert "2 files" in capsys.readouterr().out
+    assert capsys.readouterr().out == f"written and checked: {out}, 2 files\n"
     with zipfile.ZipFile(out) as archive:
         assert sorted(archive.namelist()) == [f"{n}/{i:06d}.png" for n in names for i in (2,)]
         image = cv2.imdecode(np.frombuffer(archive.read(f"{names[0]}/000002.png"), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -277,6 +279,11 @@ def test_submit_dsec(network, tmp_path, monkeypatch, capsys):
     flow = (image[..., :0:-1].astype(float) - 2**15) / 128
     assert 0 < np.abs(flow).max() < 256
     assert run(["submit", network, str(root), "--out", str(out)]) == 2  # not overwritten
+    offset = 49_000_000_000
+    with DsecEventWriter(root / names[1] / "events/left/events.h5", 480, 640, offset) as writer:
+        writer.append(moving_events(480, 640, offset, offset + SPAN, n=100))  # and none in the new window
+    assert run(["submit", network, str(root), "--out", str(tmp_path / "silent.zip")]) == 0
+    assert "1 of 2 flows are zero: a window without events, or nothing moves\n" in capsys.readouterr().out
 
 
 def test_submit_refuses_an_incomplete_test_set(network, tmp_path, capsys):
@@ -368,3 +375,31 @@ def test_recordings_with_little_in_them(network, tmp_path, capsys, name, options
         assert "mean speed" in printed.out
     else:
         assert said in printed.err and printed.err.startswith("error: ") and printed.err.count("\n") == 1
+
+
+def test_flow_at_times_within_a_window(network, tmp_path, capsys):
+    """One PNG for each share of each window; the whole one is what it is without --at."""
+    write_events(tmp_path / "e.h5", moving_events(128, 144, 0, 3 * SPAN, n=9000), 128, 144)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    for out, at in ((whole, []), (parts, ["--at", ".25,1"])):
+        assert run(["predict", network, str(tmp_path / "e.h5"), "--out", str(out), "--npy", *at]) == 0
+    lines = (parts / "timestamps.txt").read_text().splitlines()[1:]
+    starts = [int(line.split(",")[0]) for line in (whole / "timestamps.txt").read_text().splitlines()[1:]]
+    assert lines == [f"{t}, {t + end}" for t in starts for end in (SPAN // 4, SPAN)]
+    flows = [np.load(parts / f"npy/{k:06d}.npy") for k in range(len(lines))]
+    for k in range(len(starts)):
+        assert (flows[2 * k + 1] == np.load(whole / f"npy/{k:06d}.npy")).all()
+    assert flows[0] == pytest.approx(flows[1] / 4)  # no window before it
+    for at in ("x", "0", "0.5,1.2", ""):
+        assert run(["predict", network, str(tmp_path / "e.h5"), "--at", at]) == 2
+        assert f"--at: not shares of a window (got '{at}'); expected numbers above 0" in capsys.readouterr().err
+
+
+def test_within_a_window_acceleration_is_constant():
+    """A translation v s + a s²/2, whose flow over the window before is v - a/2, over this one v + a/2."""
+    v, a = np.float32([3, -1]), np.float32([2, 0.5])
+    field = lambda w: np.broadcast_to(w, (16, 24, 2)).astype(np.float32)
+    for share in (0.25, 0.5, 0.75, 1):
+        flow = infer.within(field(v + a / 2), field(v - a / 2), share)
+        inside = flow[4:-4, 4:-4]
+        assert inside == pytest.approx(np.broadcast_to(v * share + a * share**2 / 2, inside.shape), abs=1e-5)

@@ -156,7 +156,7 @@ def test_a_full_disk_in_the_middle_of_a_checkpoint(tmp_path, data, capsys, monke
 
 INSTANTS = {
     "at once": lambda out: True,
-    "before the first checkpoint": lambda out: (out / "log.csv").exists(),
+    "before the first checkpoint": lambda out: (out / "log.jsonl").exists(),
     "in the middle of a checkpoint": lambda out: any((out / "checkpoints").glob(".*.blinkgl-tmp-*")),
     "after some": lambda out: (out / "checkpoints/000000004").is_dir(),
 }

@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 
 import pytest
 
@@ -40,6 +41,44 @@ def build(seed: int = 0, **tree):
 def batch_for(model, n=1, height=128, width=128, seed=0) -> dict:
     torch.manual_seed(seed)
     return {k: torch.randn(n, model.representation.channels, height, width) for k in ("old", "new")}
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"name": "eraft", "size": "tiny", "iterations": 2},
+        {"name": "eflowformer", "size": "tiny", "iterations": 2},
+        {"name": "eflowformer", "size": "tiny", "iterations": 2, "correlation": "on_demand"},
+        {"name": "eflowformer", "size": "tiny", "quick": True, "levels": 2},
+        {"name": "ev_flownet", "width": 8, "consensus": True},
+        {"name": "spike_flownet", "width": 8},
+        {"name": "ste_flownet", "width": 8, "sweeps": 1},
+    ],
+    ids=lambda tree: "-".join(map(str, tree.values())),
+)
+def test_a_trace_without_gradients_follows_its_input(tree):
+    model = build(**tree).eval()
+    for name, p in model.named_parameters():  # flow heads start near zero: agreement of nothing shows nothing
+        if "heads." in name or ".flow" in name:
+            torch.nn.init.normal_(p, std=0.05)
+    flow = FlowOnly(model)
+    inputs = [tuple(batch_for(model, seed=seed).values()) for seed in (1, 2)]
+    with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # that sizes are constants
+        traced = torch.jit.trace(flow, inputs[0], check_trace=False)
+    first, other = (flow(*pair).detach() for pair in inputs)  # with gradients no short cut is taken
+    assert (first - other).abs().max() > 0.1
+    assert (traced(*inputs[1]) - other).abs().max() < 1e-3 * other.abs().max()
+
+
+class FlowOnly(torch.nn.Module):
+    """A network with tensors as arguments and result."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, old, new):
+        return self.model({"old": old, "new": new}).flow
 
 
 PUBLISHED = [  # million parameters, GMACs at 480x640 with 12 and with 6 iterations

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import h5py
 import numpy as np
 import pytest
 
@@ -52,6 +53,27 @@ def test_blinkflow_label_0_has_no_past(sets):
     assert source[0].scene == "scene_a" and (source[0].new.t0, source[0].new.t1) == (SPAN, 2 * SPAN)
     e = moving_events(480, 640, 0, 3 * SPAN, n=6000)
     assert len(source[1].new) == len(e.window(2 * SPAN, 3 * SPAN))  # past the end of ms_to_idx
+
+
+def test_mvsec_with_its_truth_as_hdf5(tmp_path):
+    """MVSEC's own <sequence>_gt.hdf5, which IDNet's loader reads: the same samples as of the .npz."""
+    of_npz = MvsecSource(mvsec_set(tmp_path / "npz"))
+    path = mvsec_set(tmp_path / "hdf5") / "indoor_flying1_gt_flow_dist.npz"
+    with np.load(path) as arrays, h5py.File(path.with_name("indoor_flying1_gt.hdf5"), "w") as file:
+        flow = np.stack([arrays["x_flow_dist"], arrays["y_flow_dist"]], 1)
+        file.create_dataset("davis/left/flow_dist", data=flow, compression="gzip")
+        file["davis/left/flow_dist_ts"] = arrays["timestamps"]
+    path.unlink()
+    of_hdf5 = MvsecSource(tmp_path / "hdf5")
+    assert len(of_hdf5) == len(of_npz) > 3
+    for k in range(len(of_npz)):
+        assert (of_hdf5[k].flow == of_npz[k].flow).all() and (of_hdf5[k].valid == of_npz[k].valid).all()
+    with h5py.File(path.with_name("indoor_flying1_gt.hdf5"), "w") as file:
+        file["davis/left/flow_dist"], file["davis/left/flow_dist_ts"] = flow[:, 0], np.arange(float(len(flow)))
+    with pytest.raises(
+        AssetError, match=r"_gt\.hdf5: dataset 'davis/left/flow_dist' has the wrong shape .*, 2, 260, 346"
+    ):
+        MvsecSource(tmp_path / "hdf5")
 
 
 @pytest.mark.parametrize("compressed", [False, True])

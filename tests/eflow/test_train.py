@@ -1,6 +1,5 @@
 """Training: exactly resumable, stops cleanly, never leaves half a checkpoint, refuses what it cannot use."""
 
-import csv
 import json
 import os
 import signal
@@ -57,11 +56,6 @@ def log(run_folder: Path) -> list[dict]:
     return [json.loads(line) for line in (run_folder / "log.jsonl").read_text().splitlines()]
 
 
-def table(run_folder: Path) -> list[dict]:
-    with open(run_folder / "log.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 TINY = {"name": "eflowformer", "size": "tiny", "levels": 4, "train_iterations": 1, "input": {"bins": 3}}
 
 
@@ -81,13 +75,11 @@ def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path, data):
         files = [(folder / f"{name}.safetensors").read_bytes() for folder in folders]
         assert files[0] == files[1], name
     assert any(key.endswith("exp_avg") for key in a) and any(key.startswith("ema/") for key in a)
-    tables = [table(tmp_path / d) for d in ("whole", "parts")]
+    logs = [log(tmp_path / d) for d in ("whole", "parts")]
     same = ("step", "samples", "loss", "epe", "lr")
-    assert [[row[key] for key in same] for row in tables[0]] == [[row[key] for key in same] for row in tables[1]]
-    spent = [[float(row[key]) for row in tables[1]] for key in ("processor_s", "wall_s")]
-    assert all(sorted(seconds) == seconds and seconds[0] > 0 for seconds in spent)
-    losses = [[(r["step"], r["loss"], r["lr"], r["epe"]) for r in log(tmp_path / d)] for d in ("whole", "parts")]
-    assert losses[0] == losses[1] and len(losses[0]) == k + n
+    assert [[row[key] for key in same] for row in logs[0]] == [[row[key] for key in same] for row in logs[1]]
+    spent = [[row[key] for row in logs[1]] for key in ("processor_s", "wall_s")]
+    assert len(logs[0]) == k + n and all(sorted(seconds) == seconds and seconds[0] > 0 for seconds in spent)
 
 
 def test_it_learns_a_constant_flow(tmp_path, data):
@@ -120,9 +112,9 @@ def test_a_run_folder_is_complete_and_not_overwritten(tmp_path, data, capsys):
     kinds = [r["kind"] for r in log(out)]
     assert kinds == ["train", "train", "validation"]
     assert {f"{data.name}/AEE", f"{data.name}/zero"} <= log(out)[-1].keys()
-    rows = table(out)
-    assert [row["step"] for row in rows] == ["1", "2", "2"] and [row["samples"] for row in rows] == ["2", "4", "4"]
-    assert float(rows[-1][f"{data.name}/AEE"]) > 0 and rows[-1]["loss"] == rows[0][f"{data.name}/AEE"] == ""
+    rows = log(out)
+    assert [(row["step"], row["samples"]) for row in rows] == [(1, 2), (2, 4), (2, 4)]
+    assert rows[-1][f"{data.name}/AEE"] > 0
     assert sorted(p.name for p in ckpt.newest(out).iterdir()) == [
         "ema.safetensors",
         "optimizer.safetensors",
@@ -150,25 +142,19 @@ def test_resume_from_the_command_line_and_only_from_whole_checkpoints(tmp_path, 
     assert (out / "log.jsonl").read_bytes() == before  # nothing was touched
     assert run(["train", str(path), "--out", str(out), "--resume"]) == 0
     assert "finished at step 3" in capsys.readouterr().err and [r["step"] for r in log(out)] == [1, 2, 3]
-    assert [row["step"] for row in table(out)] == ["1", "2", "3"]
 
 
-def test_a_damaged_table_and_other_validation_sets(tmp_path):
-    """Half a line and rows past the checkpoint are dropped; columns of both parts stay."""
-    (tmp_path / "log.csv").write_text(
-        "step,samples,processor_s,wall_s,loss,epe,lr,a/AEE\n2,4,5.0,6.0,1,1,1,0.5\n3,6,7.0,8.0,1,1,1,\n3,6,7."
+def test_a_damaged_log_goes_on(tmp_path):
+    """Half a line and lines past the checkpoint are dropped, as older versions wrote them; seconds add up."""
+    (tmp_path / "log.jsonl").write_text(
+        '{"step": 1, "kind": "train", "loss": 1.0}\n{"step": 2, "kind": "train", "processor_s": 5.0, "wall_s": 6.0}\n'
+        '{"step": 3, "kind": "train"}\n{"step": 3, "ki'
     )
-    with Log(tmp_path, 2, 2, ["b/AEE"], enabled=True) as file:
-        file.write(3, "train", loss=2.0, grad_norm=1.0)
-        file.write(3, "validation", **{"b/AEE": 0.25})
-    rows = table(tmp_path)
-    assert list(rows[0]) == ["step", "samples", "processor_s", "wall_s", "loss", "epe", "lr", "a/AEE", "b/AEE"]
-    assert [(r["step"], r["loss"], r["a/AEE"], r["b/AEE"]) for r in rows] == [
-        ("2", "1", "0.5", ""),
-        ("3", "2.0", "", ""),
-        ("3", "", "", "0.25"),
-    ]
-    assert all(float(r["processor_s"]) >= 5 and float(r["wall_s"]) >= 6 for r in rows)
+    with Log(tmp_path, 2, 2, enabled=True) as file:
+        file.write(3, "train", loss=2.0)
+    rows = log(tmp_path)
+    assert [(r["step"], r.get("loss")) for r in rows] == [(1, 1.0), (2, None), (3, 2.0)]
+    assert rows[-1]["samples"] == 6 and rows[-1]["processor_s"] >= 5 and rows[-1]["wall_s"] >= 6
 
 
 def test_resuming_with_another_configuration_names_the_key(tmp_path, data):
@@ -324,6 +310,9 @@ def test_data_parallel_equals_one_process(tmp_path, data):
     a, b = tensors(tmp_path / "one"), tensors(tmp_path / "two")
     weights = [k for k in a if k.startswith("weights/")]
     assert weights and all(torch.allclose(a[k], b[k], atol=2e-5) for k in weights)
+    for key in ("loss", "epe", "grad_norm"):  # of all samples, not of the first process
+        one, two = ([row[key] for row in log(tmp_path / name)] for name in ("one", "two"))
+        assert two == pytest.approx(one, rel=1e-3), key
 
 
 # ---- configurations and checkpoints that cannot be used --------------------------------------------------------------
@@ -350,6 +339,15 @@ def test_sizes_are_refused_before_anything_is_written(tmp_path, model, crop, mes
     with pytest.raises(ConfigError, match=message):
         train(load_train_config(path), tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("model", [TINY, FAST], ids=["the update step", "the whole network"])
+def test_every_network_can_be_compiled(tmp_path, data, monkeypatch, model):
+    compiled = []
+    monkeypatch.setattr(torch.nn.Module, "compile", lambda module: compiled.append(type(module).__name__))
+    config = load_train_config(config_file(tmp_path, data, model, steps=1, crop=(128, 128), run__compile=True))
+    train(config, tmp_path / "run", quiet=True)
+    assert compiled == [{"eflowformer": "Update", "ev_flownet": "EvFlowNet"}[model["name"]]]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 #version 430 core
-// Bodies smaller than a pixel, added to a picture of the others: a pixel gets the share of its square that a body covers.
+// Bodies smaller than a pixel, added to a picture of the others: a pixel gets the share of its square that a body
+// covers.
 //
 // A body's portrait (passes/specks.py) is it alone, enlarged to PORTRAIT x PORTRAIT texels, negative where it is not.
 //

@@ -47,7 +47,8 @@ class LightNoise:
     def rates(self, luminance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ON and OFF noise events per second of a mean pixel, for any shape of linear luminance."""
         lux = np.log(np.maximum(self._white * np.asarray(luminance, np.float64), 1e-30))
-        return tuple(np.exp(np.interp(lux, self._lux, hz)) for hz in (self._on, self._off))  # type: ignore[return-value]
+        on, off = (np.exp(np.interp(lux, self._lux, hz)) for hz in (self._on, self._off))
+        return on, off
 
     def step(self, events: Events, until_us: int, luminance: np.ndarray) -> Events:
         """Return ``events`` with the noise up to ``until_us`` (that microsecond included), last within a microsecond.

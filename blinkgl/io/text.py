@@ -152,7 +152,8 @@ class TextReader:
                     name = names[chosen(self._reading.stream, names, str(self.path), "texts in the zip")]
                     yield cast(BinaryIO, stack.enter_context(archive.open(name)))
                 else:
-                    opened = gzip.open(self.path) if suffix == ".gz" else open(self.path, "rb")  # noqa: SIM115 - on the stack
+                    zipped = suffix == ".gz"
+                    opened = gzip.open(self.path) if zipped else open(self.path, "rb")  # noqa: SIM115 - on the stack
                     yield cast(BinaryIO, stack.enter_context(opened))
         except (OSError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
             reason = getattr(error, "strerror", None)

@@ -109,7 +109,7 @@ def test_nothing_to_follow_and_too_much_of_it():
         assert tracks.target_points.shape == (0, 2, 2) and tracks.t_us.tolist() == [50_000, 100_000]
     with pytest.raises(ConfigError, match="positions"):
         record(empty, tracks={"points": 1_000_000, "rate": 10_000})
-    with pytest.raises(ConfigError, match="not point tracks"):
+    with pytest.raises(ConfigError, match="tracks: not a name or a table"):
         record(empty, tracks=7)
     assert configured(empty, tracks="surface").sequence(0).tracks.choose == "surface"
 

@@ -24,7 +24,7 @@ seed: 1
 camera: {width: 64, height: 48}
 time: {duration: 0.2, label_rate: 20}
 scene: {kind: random, objects: {count: 3}, pool: {}}
-labels: {flow: [forward], images: true}
+labels: {flow: [forward], images: true, depth: true}
 output: {name: mine, sequences: 2}
 """
 
@@ -46,6 +46,9 @@ def place(tmp_path_factory):
     (folder / "frames").mkdir()
     for k, frame in enumerate(frames):
         iio.imwrite(folder / "frames" / f"{k:04d}.png", frame)
+    for kind in ("cat", "dog"):
+        (folder / "pictures" / kind).mkdir(parents=True)
+        iio.imwrite(folder / "pictures" / kind / "1.png", frames[0])
     (folder / "times.txt").write_text("".join(f"{0.02 * k:.3f}\n" for k in range(10)))
     trimesh.creation.box((0.5, 0.5, 0.5)).export(folder / "part.glb")
     return folder

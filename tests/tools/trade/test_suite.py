@@ -162,7 +162,7 @@ OF_ALL = 0.75
 BEATEN_BY = 0.1
 NOISE = 0.05
 """Settings that draw the same frames differ by that and more in processor time, on the machine that measured."""
-MISSED = {("balanced", "slabs"), ("accurate", "thin")}
+MISSED = {("accurate", "thin")}
 """What does not hold, and stands in docs/trade.md."""
 SHORT: set[str] = set()
 """Presets that are beaten in more than a quarter of the scenes."""
@@ -200,7 +200,9 @@ def test_each_preset_is_dearer_and_better_than_the_one_before():
     for cheap, dear in itertools.pairwise(measured_of_presets()["presets"].values()):
         before, after = recorded_rows(cheap), recorded_rows(dear)
         for scene in before.keys() & after.keys():
-            assert before[scene][0]["cpu_s"] < after[scene][0]["cpu_s"], scene
+            # Where motion is so slow that both draw the same frames, only the noise differs.
+            assert before[scene][0]["cpu_s"] < (1 + NOISE) * after[scene][0]["cpu_s"], scene
+            assert after[scene][0]["voxel"] <= 1.001 * before[scene][0]["voxel"], (scene, cheap, dear)
 
 
 def test_fast_is_nowhere_worse_by_a_tenth_than_two_pixels_without_a_filter():

@@ -198,7 +198,7 @@ class EventCamera:
     emulator : the :class:`Emulator` itself.
     truth : finds the surface of each event, for frames with ``surfaces``; None: not requested.
     make : makes the emulator, on the CPU or on the requested device (``tensors/choice.py``).
-    Raises EventDataError: a size out of range."""
+    Raises EventDataError: a size out of range, a region of interest outside the picture."""
 
     def __init__(
         self,
@@ -226,6 +226,13 @@ class EventCamera:
                 self._unheard = config.emulator
             elif readout.light_noise is not None:
                 self._noise = LightNoise(readout.light_noise, height, width, seed, self.emulator.causes)
+            if readout.roi is not None and (readout.roi[0] >= width or readout.roi[1] >= height):
+                raise EventDataError(
+                    "the region of interest lies outside the picture",
+                    where="readout.roi",
+                    value=list(readout.roi),
+                    accepted=f"[x, y, width, height] that meets {width}x{height} px",
+                )
             self._readout = Readout(readout)
 
     @property

@@ -141,7 +141,7 @@ class Moment:
     def over(self, begin_ns: int, end_ns: int) -> Moment:
         """Return the same instant in the mean light of a span."""
         other = copy.copy(self)
-        other.exposed_ns = begin_ns, end_ns
+        other.exposed_ns = begin_ns, max(end_ns, begin_ns + 1)  # a cell may be shorter than a nanosecond
         return other
 
     def factor(self, wave: Waveform | None) -> float:

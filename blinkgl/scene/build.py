@@ -54,7 +54,6 @@ def build_scene(
         scene = explicit_scene(config, camera.model, t0_ns, t1_ns, base)
     else:
         scene = scene_from_file(config, camera.model, t0_ns, t1_ns, base)
-    _refuse_too_many_changes(scene)
     return in_fog(scene, config)
 
 
@@ -96,6 +95,7 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
 
 def equipped(scene: Scene, config: SequenceConfig) -> Scene:
     """Return the scene with the sensors of the configuration, and a note on what its times leave out."""
+    _refuse_too_many_changes(scene)
     scene = replace(scene, omissions=scene.omissions + config.time.cut)
     if config.sensors is None:
         return scene

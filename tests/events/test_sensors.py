@@ -13,7 +13,7 @@ from shared_data import shared
 from blinkgl.config.events import EmulatorConfig, V2eConfig
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
-from blinkgl.errors import ConfigError
+from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame, Readout
 from blinkgl.recordings.clip import read_recording
@@ -236,6 +236,8 @@ def test_a_region_of_interest_switches_the_other_pixels_off():
     assert len(kept) == inside.sum() > 0 and set(kept.x) == set(events.x[inside])
     with pytest.raises(ValueError, match="a region without pixels"):
         ReadoutConfig(roi=(10, 5, 0, 4))
+    with pytest.raises(EventDataError, match="outside the picture"):
+        EventCamera(EmulatorConfig.members["esim"](), ReadoutConfig(roi=(40, 0, 4, 4)), 30, 40, 0)
 
 
 def test_the_state_of_a_rate_controller_is_saved_with_the_read_out():

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from blinkgl import Camera, Light, Pose, Primitive, Scene, record
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
@@ -174,6 +175,15 @@ def test_a_lamp_moves_on_a_path_of_its_own():
     with create_context() as gl, Renderer(gl, scene, RenderConfig()) as renderer:
         columns = [int(renderer.luminance(t).read()[4].argmax()) for t in (10_000_000, 50_000_000, 90_000_000)]
     assert columns[0] > 17 and columns[1] in (15, 16) and columns[2] < 14  # y is to the left
+
+
+def test_a_scene_in_python_has_the_same_limit():
+    wave = {"kind": "pwm", "frequency": 1e8}
+    scene = Scene(
+        Camera(16, 12, pose=Pose((-3, 0, 0))), light=Light(0, 0.3, over_time=wave), duration=0.1, label_rate=20
+    )
+    with pytest.raises(ConfigError, match="the light changes too often"):
+        record(scene + Primitive("cuboid"), labels=[])
 
 
 @pytest.mark.parametrize(

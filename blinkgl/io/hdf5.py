@@ -28,6 +28,8 @@ from blinkgl.machine.closing import Closing
 
 _MAX_CHUNK_BYTES = 1 << 28
 """HDF5 unpacks a whole chunk, even for a small part of it."""
+_MAX_FILLED_BYTES = 1 << 28
+"""Of a data set whose file states a value for what it does not store."""
 
 _LEVEL, SHUFFLE, _BIT_SHUFFLE = 1, 1, 2
 """Blosc's numbers, which hdf5plugin has, too; that is imported only where a filter of its is used."""
@@ -261,6 +263,9 @@ def _check_storage(data: h5py.Dataset, name: str, path: Path) -> None:
         if data.chunks
         else layout.get_layout() != h5py.h5d.COMPACT and data.id.get_storage_size() < data.nbytes
     )
+    # A value that the file itself states for what it leaves out is read, up to what a few kilobytes may claim.
+    if layout.fill_value_defined() == h5py.h5d.FILL_VALUE_USER_DEFINED and data.nbytes <= _MAX_FILLED_BYTES:
+        missing = False
     packs = "the camera's .raw" if _ECF in codes else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)"
     problems: list[tuple[Any, str, Any, str]] = [
         (not _plain(data.dtype), f"{name} holds neither numbers nor text", str(data.dtype), "numbers or text"),

@@ -359,7 +359,9 @@ def _by_pixel(crossings, places, width, counts, pixels, out):
     begins = np.zeros(_BUSIEST + 1, np.int64)
     for k in range(filled):
         begins[min(counts[pixels[k, 2]], _BUSIEST)] += 1
-    begins[:] = np.cumsum(begins) - begins
+    before = 0
+    for at in range(len(begins)):
+        begins[at], before = before, before + begins[at]
     for k in range(filled):
         place = pixels[k, 2]
         at = min(counts[place], _BUSIEST)

@@ -1,7 +1,8 @@
 """Speeds of triangles in a picture, compiled: what :mod:`~blinkgl.render.motion` computes them with.
 
 Triangles are moved to camera axes, cut at the edges of the view, and summed by the speed of their fastest corner; the
-velocity of a rigid triangle's points is between those of its corners but for perspective.
+velocity of a rigid triangle's points is between those of its corners but for perspective. Rows are copied value by
+value: an assignment of arrays makes numba compile the words of its own errors, seconds of a first run.
 """
 
 from __future__ import annotations
@@ -66,7 +67,9 @@ def _patterns(polygon, count, area, light, lens):
         for i in range(n + 1):
             for j in range(n + 1 - i):
                 s, t = i / n, j / n
-                x, y, z = a[:3] + s * (b[:3] - a[:3]) + t * (c[:3] - a[:3])
+                x = a[0] + s * (b[0] - a[0]) + t * (c[0] - a[0])
+                y = a[1] + s * (b[1] - a[1]) + t * (c[1] - a[1])
+                z = a[2] + s * (b[2] - a[2]) + t * (c[2] - a[2])
                 most = max(most, _pattern(x, y, z, light, lens))
     return most
 
@@ -81,7 +84,8 @@ def _cut(polygon, count, out, nx, ny, nz, d):
         a = nx * p[0] + ny * p[1] + nz * p[2] - d
         b = nx * q[0] + ny * q[1] + nz * q[2] - d
         if a >= 0.0:
-            out[m] = p
+            for r in range(6):
+                out[m, r] = p[r]
             m += 1
         if (a >= 0.0) != (b >= 0.0):
             s = a / (a - b)
@@ -187,7 +191,8 @@ def _clipped(corners3, codes, polygon, other, view, row, corners, total):
     """Cut a triangle at the edges of the view and add its corners to the sums over its polygon and its item; return
     (the array that holds the rest, its number of corners, twice its area at distance 1)."""
     planes, near, lens = view
-    polygon[0], polygon[1], polygon[2] = corners3
+    for r in range(9):
+        polygon[0, r], polygon[1, r], polygon[2, r] = corners3[0][r], corners3[1][r], corners3[2][r]
     rest, count, area = polygon, 3, 0.0
     if codes[0] | codes[1] | codes[2]:
         rest, count = _in_view(polygon, other, planes, near, codes[0] & codes[1] & codes[2], row)
@@ -242,7 +247,8 @@ def look(
             a, b, c = moved[ka], moved[kb], moved[kc]
             if sides[i] * _behind(a, b, c) > 0.0:
                 continue
-            corners[:] = 0.0
+            for r in range(4):
+                corners[r] = 0.0
             rest, codes = polygon, (outside[ka], outside[kb], outside[kc])
             if not codes[0] | codes[1] | codes[2] and not lit:
                 area, count = _twice_area(a, b) + _twice_area(b, c) + _twice_area(c, a), 3

@@ -195,13 +195,15 @@ class RenderedSequence(SensorSimulation):
         return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:
-        """Return t_ns (M,) int64, the start and every label's time (label k has index k + 1); T_world_cam (M, 4, 4)
-        float64; T_world_obj (n, M, 4, 4) float64 in the order of object_ids (n,) and object_names (n,); K (3, 3);
-        resolution (width, height); near; for a camera with distortion lens, its kind, and distortion (k,)."""
+        """Return t_ns (M,) int64, the start and every label's time (label k has index k + 1); first_label, the index
+        of the first label, 1; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4) float64 in the order of
+        object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near; for a camera with distortion
+        lens, its kind, and distortion (k,)."""
         scene, times = self.scene, [self.config.time.t0_ns, *self.config.time.label_times_ns]
         T_world_cam, T_world_obj = poses_at(scene, times)
         return {
             "t_ns": np.asarray(times, np.int64),
+            "first_label": np.array(1),
             "T_world_cam": T_world_cam,
             "T_world_obj": T_world_obj,
             "object_ids": np.array([o.instance_id for o in scene.objects], np.int64),

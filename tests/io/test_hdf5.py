@@ -108,6 +108,7 @@ def test_claims_without_data(tmp_path):
         file.create_dataset("chunked", (10**12,), "u8", chunks=(1 << 17,), compression="gzip")
         file.create_dataset("plain", (10**12,), "u8")
         file.create_dataset("chunk", (1 << 29,), "u8", chunks=(1 << 26,), compression="gzip")
+        file.create_dataset("filled", (10**9,), "u8", chunks=(1 << 17,), fillvalue=7)
         file.create_dataset("none", (0,), "u8", maxshape=(None,))
         file["one"] = np.uint64(5)
     with open_hdf5(tmp_path / "a.h5") as file:
@@ -115,6 +116,7 @@ def test_claims_without_data(tmp_path):
             ("chunked", "declares 1000000000000 values, but stores fewer"),
             ("plain", "but stores fewer"),
             ("chunk", "chunks that are too large"),
+            ("filled", "but stores fewer"),
         ):
             with pytest.raises(AssetError, match=message):
                 dataset(file, name, tmp_path / "a.h5", shape=(None,))
@@ -122,6 +124,14 @@ def test_claims_without_data(tmp_path):
             len(dataset(file, "none", tmp_path / "a.h5", shape=(None,))) == 0
             and dataset(file, "one", tmp_path / "a.h5", shape=())[()] == 5
         )
+
+
+@pytest.mark.parametrize("chunks", [None, (2, 2)])
+def test_a_value_that_the_file_states_for_what_it_does_not_store_is_read(tmp_path, chunks):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("flow", (3, 4), "i8", fillvalue=-2, chunks=chunks)
+    with open_hdf5(tmp_path / "a.h5") as file:
+        assert (dataset(file, "flow", tmp_path / "a.h5", shape=(3, 4))[:] == -2).all()
 
 
 def test_a_filter_that_is_not_installed_is_named(tmp_path):

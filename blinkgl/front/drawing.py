@@ -18,6 +18,8 @@ from blinkgl.front.sections import OF_EVENTS, label_names, labels_tree
 from blinkgl.gl import create_context
 from blinkgl.labels import LABELS, LabelFrame, asked_for
 from blinkgl.machine.closing import Closing
+from blinkgl.render.frames import Frame
+from blinkgl.render.passes import Pass
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.srgb import to_srgb8
 
@@ -89,6 +91,20 @@ class Renderer(Closing):
             t_ns + interval if to is None else _ns(to, "to"),
             t_ns - interval if back_to is None else _ns(back_to, "back_to"),
         )
+
+    def draw(self, pass_: Pass, t_ns: int) -> Frame:
+        """Return the :class:`~blinkgl.render.frames.Frame` of any pass, also one of your own, at a time in whole
+        nanoseconds: ``renderer.draw(pass_, 100_000_000).read()`` is its first output, (H, W) or (H, W, C). The passes
+        that it reads are drawn first. A lens with distortion gets the flat picture that it looks at.
+
+        Raises ConfigError for another value than a pass and a whole number; GLError, with file and line, for a program
+        that does not compile. After the pass's next picture the frame of this one raises GLError."""
+        if not isinstance(pass_, Pass):
+            raise ConfigError(
+                "not a pass", where="pass_", value=pass_, accepted="an instance of ScreenPass or ScenePass"
+            )
+        most = int(_LATEST_S * 1e9)
+        return self._renderer.draw(pass_, check.whole(t_ns, "t_ns", -most, most))
 
 
 class _Closed:

@@ -17,9 +17,10 @@ from blinkgl.gl.shader import GEOMETRY, STAGES, ShaderError, ShaderSource, expan
 from blinkgl.render.draw_items import MORE, Kind
 from blinkgl.render.lighting import EXAMPLES
 from blinkgl.render.passes import PASSES, Pass, ScenePass
+from blinkgl.render.passes.own import own_passes, own_programs
 from blinkgl.scene.shapes.table import DEFORMERS, define_of
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.session import LOOKUPS, Inspection, files_of, open_folder
+from blinkgl.tools.shader_debugger.session import DEBUG_PROGRAM, LOOKUPS, Inspection, files_of, open_folder
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Every program in every variant that a pass uses for some configuration and scene.
@@ -53,7 +54,7 @@ def lookups(program: str) -> list[dict[str, Any]]:
 def variants(program: str) -> list[dict[str, Any]] | None:
     """Return the defines of every variant of a program file, without :func:`lookups`; None for a file that no pass
     uses."""
-    return _variant_defines(program, (*PASSES, Inspection)) or None
+    return _variant_defines(program, dict.fromkeys((*PASSES, Inspection, *own_passes()))) or None
 
 
 def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
@@ -162,17 +163,22 @@ def check_program(ctx: moderngl.Context, folder: Any, name: str, result: Result)
 def _programs(files: list[str], shaders: str | None):
     """Return the folder, and the program files to compile."""
     folder = open_folder(shaders)
+    of_plugins = {str(path.resolve()): str(path) for path in own_programs()}
+    if not files:
+        return folder, [*(path.name for path in files_of(folder) if path.parent == folder), *of_plugins.values()]
+    chosen = [of_plugins[full] for text in files if (full := str(Path(text).resolve())) in of_plugins]
+    files = [text for text in files if str(Path(text).resolve()) not in of_plugins]
     if files and shaders is None:  # files of another folder select that folder
         first = Path(files[0]).resolve()
         # An include is below include/, at any depth; a program is in the folder itself.
         home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
         if first.is_file() and home != folder.resolve():
+            if not (home / DEBUG_PROGRAM).is_file():
+                accepted = "a file of a shaders/ folder, or one of a pass that --plugin FILE.py registers"
+                raise ConfigError("no pass uses it", where="check", value=files[0], accepted=accepted)
             folder = open_folder(str(home))
     known = files_of(folder)
     programs = [path.name for path in known if path.parent == folder]
-    if not files:
-        return folder, programs
-    chosen: list[str] = []
     for text in files:
         path = next(
             (

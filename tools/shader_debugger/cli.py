@@ -26,6 +26,25 @@ Shaders = Annotated[str | None, typer.Option("--shaders", help="Use an edited co
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
+
+
+def _load(files: list[str] | None) -> list[str] | None:
+    from blinkgl.machine.plugins import load_plugins
+
+    load_plugins(files or ())
+    return files
+
+
+Plugin = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        callback=_load,
+        is_eager=True,
+        metavar="FILE",
+        help="Python file with passes or labels of your own (docs/extending.md); may be repeated.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 DIFFERENT = 1  # exit status of `diff` above the tolerance, and of `check` with an error
 
@@ -46,6 +65,7 @@ def passes(
     sequence: Sequence = None,
     time: Time = None,
     shaders: Shaders = None,
+    plugin: Plugin = None,
     overrides: Overrides = None,
     names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
 ) -> None:
@@ -65,6 +85,7 @@ def probe(
     seed: Seed = None,
     sequence: Sequence = None,
     shaders: Shaders = None,
+    plugin: Plugin = None,
     overrides: Overrides = None,
     json: Json = False,
 ) -> None:
@@ -83,6 +104,7 @@ def diff(
     seed: Seed = None,
     sequence: Sequence = None,
     shaders: Shaders = None,
+    plugin: Plugin = None,
     overrides: Overrides = None,
     names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
     tolerance: Annotated[
@@ -114,6 +136,7 @@ def check(
         typer.Argument(help="Shader files; an include means all files that include it (default: all)."),
     ] = None,
     shaders: Shaders = None,
+    plugin: Plugin = None,
     backend: Annotated[str, typer.Option(help="OpenGL backend: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device.")] = 0,
     json: Json = False,
@@ -137,6 +160,7 @@ def show(
     stage: Annotated[str, typer.Option(help="vertex, geometry, fragment, or both for all.")] = "both",
     numbers: Annotated[bool, typer.Option("--numbers", help="Print file and line before each line.")] = False,
     shaders: Shaders = None,
+    plugin: Plugin = None,
 ) -> None:
     """Print a program's source as the compiler reads it. Includes and defines are expanded."""
     from blinkgl.tools.shader_debugger.check import show_source
@@ -155,6 +179,7 @@ def serve(
     seed: Seed = None,
     sequence: Sequence = None,
     shaders: Shaders = None,
+    plugin: Plugin = None,
     overrides: Overrides = None,
 ) -> None:
     """Serve a local page on which passes are inspected. It has a time slider, probing by click, differences, and

@@ -11,6 +11,7 @@ from blinkgl.errors import OutputError
 from blinkgl.io import pictures
 from blinkgl.io.atomic import output_errors, write_whole
 from blinkgl.io.images import encode_npy
+from blinkgl.render.passes.own import OWN
 from blinkgl.tools.shader_debugger.compare import (
     BufferReport,
     Comparison,
@@ -70,7 +71,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name] > 0
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    everywhere = info.name in ("luminance", *FILTERED)  # the background has values, too
+    everywhere = info.name in ("luminance", *FILTERED, *OWN)  # the background has values, too
     if lookup_of(info.name)[1] in ("uv", "level"):
         return (
             moment["texture_size"][..., 0] > 1

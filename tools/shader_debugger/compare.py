@@ -29,6 +29,7 @@ import numpy as np
 from blinkgl.errors import ConfigError
 from blinkgl.render import casting
 from blinkgl.render.colour import LUMA
+from blinkgl.render.passes.own import OWN
 from blinkgl.scene.lights import lamps_of, shadowing
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger import appearance, reference
@@ -227,7 +228,9 @@ class Comparison:
     @cached_property
     def _there(self) -> list[str]:
         there = buffers_of(self.ref.seen, self.gpu.renderer.filtered)
-        return [name for name in QUANTITIES if name in there]
+        # A pass that reads its neighbours has others in the flat picture that a lens looks at.
+        flat = self.ref.scene is self.ref.seen
+        return [name for name in QUANTITIES if name in there and (flat or name not in OWN)]
 
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (GPU, the values to grade it against); equal shapes."""
@@ -247,7 +250,7 @@ class Comparison:
         if name in ("luminance", "colour"):
             return gpu[name], self._shaded(name)
         if np.shape(gpu[name]) != np.shape(ref[name]):
-            raise TypeError(f"label '{name}': `reference` gives {np.shape(ref[name])} and not {np.shape(gpu[name])}")
+            raise TypeError(f"'{name}': `reference` gives {np.shape(ref[name])} and not {np.shape(gpu[name])}")
         return gpu[name], ref[name]
 
     def _shaded(self, name: str) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from blinkgl.gl.shader import ShaderError, ShaderSource, made_includes, messages
@@ -119,7 +120,8 @@ def _declaration(source: ShaderSource, name: str) -> tuple[str, int, int] | None
 def excerpt(folder: Any, file: str, line: int, column: int = 0, around: int = 2) -> str:
     """Return the lines around ``line`` of a file in the shader folder, with a caret under ``column``."""
     try:
-        lines = folder.joinpath(*file.split("/")).read_text(encoding="utf-8").split("\n")
+        path = Path(file) if Path(file).is_absolute() else folder.joinpath(*file.split("/"))
+        lines = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError):
         # Includes generated from the tables of labels and shapes are in no file.
         lines = made_includes().get(file.removeprefix("include/"), "").split("\n")

@@ -23,6 +23,7 @@ from blinkgl.gl import ShaderLoader
 from blinkgl.gl.shader import ShaderError, expand, stages_of
 from blinkgl.io import pictures
 from blinkgl.io.pictures import MAPS
+from blinkgl.render.passes.own import own_programs
 from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison, verdict
@@ -350,7 +351,7 @@ class Inspector:
     def stamps(self) -> tuple:
         """Return a value that changes whenever a shader file does. Safe in any thread."""
         out = []
-        for path in files_of(self.folder):
+        for path in [*files_of(self.folder), *own_programs()]:
             try:
                 # Editors replace a file by renaming: it may be absent for a moment, or have another inode.
                 info = path.stat()

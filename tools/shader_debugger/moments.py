@@ -16,6 +16,7 @@ from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.labels.label import Label, View
 from blinkgl.render import casting
 from blinkgl.render.colour import LUMA
+from blinkgl.render.passes.own import OWN, OwnPass
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.lights import MAX_SHADOWS, lamps_of, shadowing
 from blinkgl.scene.types import Part, Scene, SceneObject
@@ -104,14 +105,22 @@ _SHADED = (
 
 
 class OfLabels(Mapping[str, _T]):
-    """Values by the name of a buffer: one for every view of all labels that are registered now, and fixed ones.
+    """Values by the name of a buffer: one for every view of all labels and every pass of a plug-in that are registered
+    now, and fixed ones.
 
     The order is that of computation, so that a mistake shows first where it was made: where the surface is (``before``,
-    and labels of one time), its appearance (``shaded``), its motion.
-    made : returns the value for a label and one of its views.   before, shaded : the fixed values."""
+    and labels of one time), its appearance (``shaded``), its motion, and what plug-ins make of it.
+    made : returns the value for a label and one of its views.   own : the same for a pass of a plug-in, or None.
+    before, shaded : the fixed values."""
 
-    def __init__(self, made: Callable[[Label, View], _T], before: Iterable[_T], shaded: Iterable[_T]):
-        self._made, self._before, self._shaded = made, tuple(before), tuple(shaded)
+    def __init__(
+        self,
+        made: Callable[[Label, View], _T],
+        own: Callable[[OwnPass], _T | None],
+        before: Iterable[_T],
+        shaded: Iterable[_T],
+    ):
+        self._made, self._own, self._before, self._shaded = made, own, tuple(before), tuple(shaded)
 
     def _all(self) -> dict[str, _T]:
         views = [
@@ -121,7 +130,8 @@ class OfLabels(Mapping[str, _T]):
         ]
         # Motion comes last: it depends on everything before it.
         surface, motion = ([one for early, one in views if early is which] for which in (True, False))
-        return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion)}
+        own = [made for one in OWN.values() if (made := self._own(one)) is not None]
+        return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion, *own)}
 
     def __getitem__(self, name: str) -> _T:
         return self._all()[name]
@@ -143,7 +153,11 @@ def _of_label(label: Label, view: View) -> Pass:
     )
 
 
-PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
+def _of_own(own: OwnPass) -> Pass:
+    return Pass(own.name, own.title, own.unit, own.kind, own.pass_.program)
+
+
+PASSES = OfLabels(_of_label, _of_own, _BEFORE, _SHADED)
 
 
 def buffers_of(scene: Scene, filtered: tuple[str, ...] = ()) -> dict[str, Pass]:
@@ -225,6 +239,8 @@ class GpuMoment(_Lazy):
             return {name: draw.picture(name, when.t_ns)}
         if name == "velocity_pass":
             return {name: draw.velocity(when.t_ns).read()}
+        if name in OWN:
+            return {name: draw.at_pixels(draw.draw(OWN[name].pass_, when.t_ns).read(OWN[name].output))}
         # ``edges`` writes a flat picture, a lens pass the pixels of the lens.
         own = draw.at_pixels if name.partition("_")[2].startswith("edges") else np.asarray
         if name in FILTERED:
@@ -311,6 +327,8 @@ class ReferenceMoment(_Lazy):
             except Exception as error:
                 raise TypeError(f"label '{label.name}': `reference` fails: {error}") from error
         frame = self.frame
+        if name in OWN:
+            return {name: self._own(OWN[name])}
         if name.endswith("_level0"):
             return {name: getattr(frame, name.removesuffix("_level0"))}
         if name in MAPS:
@@ -331,6 +349,15 @@ class ReferenceMoment(_Lazy):
             f"next_depth_{way}": np.where(self.labels.hit, getattr(self.labels, way).depth, 0.0)
             for way in ("forward", "backward")
         }
+
+    def _own(self, own: OwnPass) -> np.ndarray:
+        if own.reference is None:
+            accepted = "register(…, reference=…)"
+            raise ConfigError("the plug-in gives no reference", where=f"pass {own.name}", accepted=accepted)
+        try:
+            return np.asarray(own.reference(self.scene, self.frame))
+        except Exception as error:
+            raise ConfigError(f"its reference fails: {error}", where=f"pass {own.name}") from error
 
     def _velocity_drawn(self) -> np.ndarray:
         """Return velocity (H, W, 2), px/s in pixels of the lens, at the pixel centres of the flat picture."""

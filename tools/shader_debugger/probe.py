@@ -9,6 +9,7 @@ import numpy as np
 from trimesh.triangles import points_to_barycentric
 
 from blinkgl.render import casting
+from blinkgl.render.passes.own import OWN
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger import reference
@@ -98,10 +99,15 @@ def _plain(values):
 
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
-    g, r = (side[y, x] for side in (comparison.pair(name) if name in FILTERED else (gpu[name], ref[name])))
+    unknown = name in OWN and OWN[name].reference is None
+    if unknown:
+        g = gpu[name][y, x]
+        r = np.full_like(g, np.nan, np.float64)
+    else:
+        g, r = (side[y, x] for side in (comparison.pair(name) if name in FILTERED else (gpu[name], ref[name])))
     info = PASSES[name]
     exact = info.kind in ("mask", "ids")
-    apart = None if exact else ulps(g, r)
+    apart = None if exact or unknown else ulps(g, r)
     distance = float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if apart else 0.0
     row: dict[str, object] = {
         "name": name,
@@ -109,11 +115,11 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
         "unit": info.unit,
         "gpu": g.tolist(),
         "reference": r.tolist(),
-        "error": float(g != r) if exact else distance,
+        "error": 0.0 if unknown else float(g != r) if exact else distance,
         "error_unit": "mismatch" if exact else info.unit,
         "ulps": apart,
         "ok": None,
-        "note": "",
+        "note": "the plug-in gives no reference" if unknown else "",
     }
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]

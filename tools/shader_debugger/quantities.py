@@ -12,6 +12,7 @@ from trimesh.triangles import points_to_barycentric
 from blinkgl.labels.grading import length, motion_per_interval
 from blinkgl.labels.label import Label, View
 from blinkgl.render import casting
+from blinkgl.render.passes.own import OwnPass
 from blinkgl.tools.shader_debugger.filters import EDGED, LENSED
 from blinkgl.tools.shader_debugger.mipmaps import MISPLACED
 from blinkgl.tools.shader_debugger.moments import MAPS, PASSES, OfLabels
@@ -186,5 +187,12 @@ def _of_label(label: Label, view: View) -> Quantity:
     )
 
 
-QUANTITIES = OfLabels(_of_label, _BEFORE, _SHADED)
+def _of_own(own: OwnPass) -> Quantity | None:
+    if own.reference is None:
+        return None
+    note = "a pass of a plug-in, against its own reference"
+    return Quantity(own.name, own.unit, own.tolerance, _absolute, same_triangle=False, note=note)
+
+
+QUANTITIES = OfLabels(_of_label, _of_own, _BEFORE, _SHADED)
 """In the order in which a pass computes them: the first wrong one is the place of the fault."""

@@ -12,11 +12,12 @@ from typing import Annotated
 
 import typer
 
+from blinkgl.cli_examples import BLINKGL
 from blinkgl.cli_recordings import calibrate, compare, convert, import_, saccade, simulate
 from blinkgl.machine.command_line import new_app, run_app, safe_main
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
-app = new_app("blinkgl", "Event-camera and optical-flow data sets by rasterisation.")
+app = new_app("blinkgl", "Event-camera and optical-flow data sets by rasterisation.", BLINKGL)
 app.add_typer(shader_app)
 
 

@@ -52,7 +52,12 @@ def simulate(
         ),
     ],
     out: Annotated[
-        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .txt, .csv, .npz, .npy.")
+        str,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy, .bin (N-MNIST).",
+        ),
     ],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
     sensor: Annotated[

@@ -38,9 +38,10 @@ from eflow.cli_arguments import (
     rendered,
     windows_of,
 )
+from eflow.cli_examples import EFLOW
 from eflow.methods.table import METHODS
 
-app = new_app("eflow", "Train, evaluate and run event-flow networks.")
+app = new_app("eflow", "Train, evaluate and run event-flow networks.", EFLOW)
 
 
 @app.command()

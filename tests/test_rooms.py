@@ -56,7 +56,7 @@ FLOORS = (
     "layouts online report",
     "trade front eflow viewer",
     "show shader_debugger",
-    "cli cli_recordings __main__ tools",
+    "cli cli_examples cli_recordings __main__ tools",
 )
 """From the ground up. ``import blinkgl`` itself fetches its names when they are first used."""
 

@@ -15,6 +15,8 @@ from importlib.metadata import distribution
 
 import typer
 
+from blinkgl.machine.help import EXAMPLES
+
 HEADER = """# Commands
 
 Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `-h` prints the same.
@@ -56,24 +58,25 @@ def _commands(name: str, command) -> Iterator[tuple[str, object]]:
 def _rows(name: str, command) -> list[str]:
     """The rows of a command's table, an argument or an option each."""
     context = typer.Context(command, info_name=name)
-    return [_row(*record) for parameter in command.params if (record := parameter.get_help_record(context))]
+    parameters = [parameter for parameter in command.get_params(context) if parameter.name != "help"]
+    return [_row(*record) for parameter in parameters if (record := parameter.get_help_record(context))]
 
 
 def _section(name: str, command, rows: list[str], shared: list[str]) -> str:
     context = typer.Context(command, info_name=name)
     usage = " ".join([name, *(piece.strip("{}") for piece in command.collect_usage_pieces(context))])
     own = [row for row in rows if row not in shared]
-    also = ", ".join(re.sub(r" <\w+>", "", row.split("|")[1]) for row in rows if row in shared)
+    also = ", ".join(re.sub(r" [^-` ]+`$", "`", row.split("|")[1]) for row in rows if row in shared)
     table = f"\n{HEAD}{''.join(own)}" if own else ""
     return (
         f"\n## {name}\n\n{' '.join((command.help or '').split())}\n\n```\n{usage}\n```\n{table}"
         f"{f'{chr(10)}Also: {also}.{chr(10)}' if also else ''}"
+        + "".join(("\nExamples:\n\n```\n", *(f"{line}\n" for line in EXAMPLES[name]), "```\n"))
     )
 
 
 def _row(names: str, meaning: str) -> str:
     remarks = REMARKS.search(meaning)
-    names = names.replace(" range>", ">")
     limits = _cell(remarks[1]).replace("default: ", "") if remarks else ""
     return f"|`{names}`|{_cell(REMARKS.sub('', meaning))}|{limits}|\n"
 

@@ -16,6 +16,7 @@ import typer
 from blinkgl.errors import BlinkGLError, ConfigError, printable
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.machine.help import App
 from blinkgl.machine.interrupts import STOPS, Stop, interruptible
 from blinkgl.machine.plugins import load_plugins
 from blinkgl.machine.terminal import never_fail_to_print
@@ -45,11 +46,12 @@ def _global_options(
     load_plugins(plugin or ())
 
 
-def new_app(name: str, about: str) -> typer.Typer:
-    """Return a command without commands, with the options that every command line has. about : its help."""
-    app = typer.Typer(
+def new_app(name: str, about: str, examples: Mapping[str, tuple[str, ...]] | None = None) -> App:
+    """Return a command without commands, with the options that every command line has. about : its help.   examples :
+    as of :meth:`~blinkgl.machine.help.App.add_examples`."""
+    app = App(
         name=name,
-        add_completion=False,
+        add_completion=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -58,6 +60,7 @@ def new_app(name: str, about: str) -> typer.Typer:
         help=about,
         epilog=f"\b\ndocs/tasks.md: forty tasks, a few lines each.\ndocs/… in a message is a page below\n{pages()}",
     )(_global_options)
+    app.add_examples(name, examples or {})
     return app
 
 

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(
+from blinkgl.machine.help import App
+
+app = App(
     name="shader",
     no_args_is_help=True,
     rich_markup_mode=None,

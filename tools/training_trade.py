@@ -82,15 +82,17 @@ def make_data(work: Path, arms: list[str], minutes: float) -> dict[str, dict[str
     kept = work / "data.json"
     facts: dict[str, dict[str, float]] = json.loads(kept.read_text()) if kept.is_file() else {}
     for arm in arms:
-        if "sequences" in facts.get(arm, {}):
-            continue
-        words = ["generate", RECIPE, "--out", str(work / arm / "data"), "-q", *overrides(ARMS[arm])]
-        pilot = run("blinkgl", *words, "--num", str(PILOT), "--resume")
-        count = max(PILOT, round(PILOT * 60 * minutes / pilot))
-        rest = run("blinkgl", *words, "--num", str(count), "--resume")
-        facts[arm] = {"sequences": count, "seconds": pilot + rest}
-        kept.write_text(json.dumps(facts, indent=1))
-        print(f"{arm}: {count} sequences, {pilot + rest:.0f} s of processor", file=sys.stderr)
+        words = ["generate", RECIPE, "--out", str(work / arm / "data"), "-q", "--resume", *overrides(ARMS[arm])]
+        count, spent = facts.get(arm, {}).get("sequences", 0), facts.get(arm, {}).get("seconds", 0.0)
+        pace = spent / count if count else 60 * minutes / PILOT
+        # Starting and compiling count, too; so the pace of what came last says how many more there will be.
+        while (more := int((60 * minutes - spent) / pace)) > 0:
+            more = min(more, max(PILOT, 2 * count))
+            seconds = run("blinkgl", *words, "--num", str(count + more))
+            spent, count, pace = spent + seconds, count + more, seconds / more
+            facts[arm] = {"sequences": count, "seconds": spent}
+            kept.write_text(json.dumps(facts, indent=1))
+        print(f"{arm}: {count} sequences, {spent:.0f} s of processor", file=sys.stderr)
     return facts
 
 

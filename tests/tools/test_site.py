@@ -33,6 +33,13 @@ def test_every_link_of_every_page_leads_somewhere(built):
     assert site.problems(built) == []
 
 
+def test_the_index_leads_to_every_page():
+    """The site has the README in its place; on a code host it is what opens docs/."""
+    text = (REPOSITORY / "docs/index.md").read_text(encoding="utf-8")
+    linked = set(re.findall(r"\]\((\w+\.md)\)", text))
+    assert linked == {path.name for path in (REPOSITORY / "docs").glob("*.md")} - {"index.md"}
+
+
 def test_every_link_of_the_readme_leads_to_a_file():
     assert site.markdown_problems(REPOSITORY / "README.md") == []
 

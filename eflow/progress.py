@@ -19,6 +19,7 @@ from torch import Tensor
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.atomic import output_errors, write_whole
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.interrupts import STOPS, Stop
 from blinkgl.machine.terminal import plain_column, plain_console
 from eflow.types import Picture
@@ -98,6 +99,7 @@ class TrainProgress:
         )
 
     def _print(self, line: str) -> None:
+        heartbeat.heard()
         print(line, file=sys.stderr, flush=True)  # noqa: T201
 
     def say(self, line: str) -> None:

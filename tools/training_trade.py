@@ -99,7 +99,7 @@ def make_data(work: Path, arms: list[str], minutes: float) -> dict[str, dict[str
 def make_tests(work: Path, count: int) -> None:
     """Generate the test sets."""
     for name, events in TESTS.items():
-        changes = {"output.split": "test", "quality": "reference", "seed": 81, "events": events}
+        changes: dict[str, object] = {"output.split": "test", "quality": "reference", "seed": 81, "events": events}
         words = ["--out", str(work / "test" / name), "-q", "--num", str(count), "--resume"]
         run("blinkgl", "generate", RECIPE, *words, *overrides(changes))
 
@@ -168,7 +168,7 @@ def main() -> None:
         return
     runs = [(arm, seed) for seed in range(given.seeds) for arm in given.arms]
     with ThreadPoolExecutor(given.jobs) as pool:
-        for _ in pool.map(lambda one: train_one(given.work, *one, given.steps), runs):
+        for _ in pool.map(lambda one: train_one(given.work, one[0], one[1], given.steps), runs):
             pass
     judged = {a: [judge(given.work, a, s, given.recordings) for s in range(given.seeds)] for a in given.arms}
     chosen = f"--minutes {given.minutes:g} --steps {given.steps} --seeds {given.seeds} --tests {given.tests}"

@@ -37,6 +37,7 @@ from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.sequence_files.index import sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest, whole
 from blinkgl.types.events import TOLD, Events
@@ -64,7 +65,8 @@ def export_shards(
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
     labels: dict[str, list[tuple[Path, int]]] = {}
-    for folder in sequence_folders(root):
+    for number, folder in enumerate(sequence_folders(root), 1):
+        heartbeat.at(f"sequence {number:,}")
         manifest = whole(folder)
         count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
         labels.setdefault(manifest.get("split") or "all", []).extend((folder, k) for k in range(count))

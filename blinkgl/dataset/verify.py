@@ -38,6 +38,7 @@ from blinkgl.io.lights import LIGHTS
 from blinkgl.io.records import shown
 from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS, asked_for
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.plugins import missing_plugins
 from blinkgl.sequence_files.index import made_folders, sequence_folders
 from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
@@ -249,6 +250,7 @@ def verify_dataset(
     known: dict[str, Known] = {}
     for number, folder in enumerate(folders):
         name = folder.relative_to(root).as_posix()
+        heartbeat.at(f"sequence {number + 1:,} of {len(folders):,}")
         if progress:
             progress(number, shown(name))
         problems, sequences = look(folder, name)

@@ -22,6 +22,7 @@ from blinkgl.layouts.planned import Planned
 from blinkgl.layouts.rosbag import RosBag
 from blinkgl.layouts.source import Source, sources_of
 from blinkgl.layouts.tapvid import TapVid
+from blinkgl.machine.heartbeat import heartbeat
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The available layouts.
@@ -84,7 +85,8 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
     places = _places(row, sources)
     lines = _size(row, sources)
     with atomic_folder(out) as folder:
-        for source, place in zip(sources, places):
+        for number, (source, place) in enumerate(zip(sources, places), 1):
+            heartbeat.at(f"sequence {number:,} of {len(sources):,}")
             (folder / place).mkdir(parents=True, exist_ok=True)
             lines += row.write(source, folder / place)
         for split in row.splits:

@@ -16,6 +16,7 @@ import typer
 from blinkgl.errors import BlinkGLError, ConfigError, printable
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.help import App
 from blinkgl.machine.interrupts import STOPS, Stop, interruptible
 from blinkgl.machine.plugins import load_plugins
@@ -89,7 +90,12 @@ def run_app(
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
         # Not standalone: typer then raises errors instead of printing its own boxes.
-        with interruptible(*STOPS), announced_compiling(lambda text: print(text, file=sys.stderr)):
+        quiet = bool({"-q", "--quiet"} & {*arguments})
+        with (
+            interruptible(*STOPS),
+            announced_compiling(lambda text: print(text, file=sys.stderr)),
+            heartbeat.beating(quiet),
+        ):
             status = app(arguments, prog_name=program, standalone_mode=False)
         # typer turns KeyboardInterrupt into this status, earlier versions into Abort.
         if status != _CTRL_C:

@@ -15,6 +15,7 @@ from rich.progress import TextColumn
 from rich.text import Text
 
 from blinkgl.errors import printable
+from blinkgl.machine.heartbeat import heartbeat
 
 _NO_END = 10_000
 """Columns of a file."""
@@ -40,6 +41,7 @@ def plain_console(**options: Any) -> Console:
 
 def say(console: Console, text: str) -> None:
     """Print one line unchanged: no colours for numbers, no line breaks of Rich's."""
+    heartbeat.heard()
     console.print(text, highlight=False, soft_wrap=True, markup=False)
 
 

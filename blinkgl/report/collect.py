@@ -24,6 +24,7 @@ from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
 from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.sequence_files.index import entry, sequence_folders, task_of
 from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 
@@ -87,7 +88,8 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
     sequences, unreadable, damaged = [], [], set()
-    for folder in sequence_folders(root):
+    for number, folder in enumerate(sequence_folders(root), 1):
+        heartbeat.at(f"sequence {number:,}")
         try:
             sequences.append(entry(root, folder))
         except BlinkGLError as error:

@@ -64,7 +64,7 @@ class CameraImage:
 
     @property
     def image(self) -> np.ndarray:
-        """Return the camera's output."""
+        """Return the picture that the camera writes, with all of its effects."""
         return self.pictures["images"]
 
 

@@ -357,7 +357,7 @@ class Tiles:
         self.share = len(chosen) * TILE_PX**2 / (size[0] * size[1])
 
     def cut(self, image: np.ndarray) -> np.ndarray:
-        """Return the used part of (..., height, width)."""
+        """Return the tiles that are judged, of (..., height, width), side by side; all of it where there are none."""
         if not self._corners:
             return image
         return np.concatenate([image[..., y : y + TILE_PX, x : x + TILE_PX] for y, x in self._corners], axis=-2)

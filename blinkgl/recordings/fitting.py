@@ -17,7 +17,7 @@ class Fitting:
 
     @property
     def part(self) -> tuple[int, int]:
-        """Return (height, width) of the used part of a frame: its middle, of the wanted shape."""
+        """Return (height, width) of the part of a frame that is kept: its middle, cut to the wanted shape."""
         (height, width), (wanted_height, wanted_width) = self.given, self.wanted
         scale = min(height / wanted_height, width / wanted_width)
         return max(1, round(wanted_height * scale)), max(1, round(wanted_width * scale))

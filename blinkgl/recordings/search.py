@@ -171,7 +171,7 @@ class Search:
         t = self.target
         weights = self._robust()
         count = len(t.values)
-        # Without the rows behind the numbers, which are the prior's.
+        # The rows after the first `count` belong to the prior, which does not depend on the recording.
         j = (self._jacobian * weights[:, None])[:count]
         # pull: the change of the parameters for a change of each number, as a Gauss-Newton step gives it.
         pull = np.linalg.solve(j.T @ j + self._prior(), j.T * weights[:count])

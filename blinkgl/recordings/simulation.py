@@ -209,7 +209,8 @@ def simulated_steps(
     readout: ReadoutConfig | None = None,
     fitting: Fitting | None = None,
 ) -> Iterator[Step]:
-    """Yield every step of :func:`frames_to_events`. fitting : of frames to the sensor's size; None: they have it."""
+    """Yield every step of :func:`frames_to_events`. fitting : conversion of frames to the sensor's size; None: they
+    have that size."""
     config = emulator_config(emulator)
     if use.interpolate not in INTERPOLATIONS:
         raise ConfigError(

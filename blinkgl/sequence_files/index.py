@@ -85,7 +85,7 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
 
 
 def task_of(line: dict[str, Any]) -> str:
-    """Return the folder of the task that made a line of the index: the rig's folder for one of its cameras."""
+    """Return the folder that the task behind a line of the index wrote; for a camera of a rig, the rig's folder."""
     path = PurePosixPath(line["path"])
     return str(path.parent if "sensor" in line else path)
 

@@ -79,7 +79,7 @@ def explicit_scene(
     ]
     bodies = {obj.name: item.physics for obj, item in zip(objects, config.objects) if item.physics is not None}
     if config.collisions:
-        # Nothing stops falling objects: the engine knows the others' final paths.
+        # Falling objects are not stopped here: the physics engine lets them bounce off the others' final paths.
         falling = {name for name, body in bodies.items() if body.kind == "dynamic"}
         others = [obj for obj in objects if obj.name not in falling]
         result = resolve_collisions(others, path, 1.01 * camera.near_corner, t0_ns, t1_ns)

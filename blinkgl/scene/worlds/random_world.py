@@ -176,7 +176,7 @@ def _object_path(config: RandomSceneConfig, one: _Placed, space: FreeSpace, rng,
 def _resolved(objects, falling: set[str], camera_paths: Iterable[PosePath], clearance, t0_ns, t1_ns, log):
     """Return (the objects, stopped at collisions, without those that collide at the start; the camera's path).
     camera_paths : drawn one by one until one is not stopped: a stopped camera would see a still world from then on."""
-    # Nothing stops falling objects: the engine knows the others' final paths.
+    # Falling objects are not stopped here: the physics engine lets them bounce off the others' final paths.
     others = tuple(o for o in objects if o.name not in falling)
     for path in camera_paths:
         result = resolve_collisions(others, path, clearance, t0_ns, t1_ns)

@@ -69,7 +69,8 @@ class Camera(Piece):
         if calibration is None:
             table = {"width": 346, "height": 260, **table}
         else:
-            table = calibrated({"calibration_name": None, **table, "calibration": os.fspath(calibration)}, Path.cwd())
+            file = str(check.path(calibration, "calibration"))
+            table = calibrated({"calibration_name": None, **table, "calibration": file}, Path.cwd())
         self.tree = self._checked(CameraConfig, table)
         self.motion = motion_tree(pose, "Camera.pose")
 

@@ -8,11 +8,12 @@ state, so a refused frame leaves every environment unchanged.
 
 from __future__ import annotations
 
+import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -146,6 +147,16 @@ def _there(device: Any) -> torch.device:
         ) from None
 
 
+Made = TypeVar("Made")
+
+
+def configured(config: Any, kind: type[Made]) -> Made:
+    """Return the configuration of an emulator, None for its defaults. Raises EventDataError: it is another's."""
+    if config is not None and not isinstance(config, kind):
+        raise EventDataError("not its configuration", where="config", value=config, accepted=kind.__name__)
+    return kind() if config is None else config
+
+
 class Batch(ABC):
     """Emulators of ``envs`` environments of one size and configuration; environment k draws from ``seed + k``.
 
@@ -160,6 +171,9 @@ class Batch(ABC):
         return self.device.type == "cpu"
 
     def __init__(self, height: int, width: int, envs: int, device: Any, seed: int):
+        for where, value in (("height", height), ("width", width), ("envs", envs), ("seed", seed)):
+            if not isinstance(value, numbers.Integral) or isinstance(value, bool):
+                raise EventDataError("not a whole number", where=where, value=value, accepted="a whole number")
         if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and envs >= 1 and envs * height * width < 2**31):
             raise EventDataError(
                 "frame size or number of environments out of range",

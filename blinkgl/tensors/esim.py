@@ -21,7 +21,7 @@ from blinkgl.events.emulator import BLOCK, NEVER_NS
 from blinkgl.events.esim import MIN_THRESHOLD, draw_thresholds, to_q25
 from blinkgl.events.philox import Stream
 from blinkgl.tensors.arith import log_q25_, normal2
-from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, places
+from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, configured, places
 
 _ASLEEP = 2**30 + 2**28
 """A level that no signal reaches, and whose distance from any signal fits 32 bits: for pixels without a first frame."""
@@ -98,7 +98,7 @@ class TensorEsim(Batch):
         seed: int = 0,
     ):
         super().__init__(height, width, envs, device, seed)
-        self.config = config = config or EsimConfig()
+        self.config = config = configured(config, EsimConfig)
         total = self.envs * self._pixels
         zeros = lambda dtype, wanted=True: torch.zeros(total if wanted else 0, dtype=dtype, device=self.device)
         on, off = config.thresholds

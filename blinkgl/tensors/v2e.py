@@ -28,7 +28,7 @@ from blinkgl.events.packing import MAX_CAUSE_ROWS
 from blinkgl.events.philox import Stream
 from blinkgl.events.v2e import V2e
 from blinkgl.tensors.arith import exp_f32, horner, log_f32, log_f64, normal2, sqrt, uniform2
-from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, places, stable_order
+from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, configured, places, stable_order
 from blinkgl.tensors.waves import Parts, Rows, Shots, Step, add_curves, wake, waves
 
 # Constants of the numba functions, so that there is one copy of each.
@@ -108,7 +108,7 @@ class TensorV2e(Batch):
         seed: int = 0,
     ):
         super().__init__(height, width, envs, device, seed)
-        self.config = config = config or V2eConfig()
+        self.config = config = configured(config, V2eConfig)
         if config.causes and height > MAX_CAUSE_ROWS:
             raise EventDataError("too many rows", where="causes", value=height, accepted=f"at most {MAX_CAUSE_ROWS}")
         self._has = Parts(

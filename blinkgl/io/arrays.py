@@ -3,6 +3,7 @@ reads MATLAB's .mat with such variables. Unlike the other formats, whole recordi
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import zlib
@@ -26,6 +27,7 @@ from blinkgl.io.tables import (
     TableReader,
     choose,
     named_columns,
+    not_read,
     table_of_columns,
     table_of_records,
     table_of_rows,
@@ -121,7 +123,9 @@ DTYPE = np.dtype([(("us", "t"), "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")]
 
 _EVIMO = {"index", "discretization", "K", "D", "meta"}
 """Arrays beside the events of EV-IMO's files: ``events`` and two of these mark the layout, t x y p in seconds."""
-_KNOWN = ("height", "width", "time_unit", "cause")
+_KNOWN = ("height", "width", "time_unit", "t_offset", "cause")
+_FEW = 16
+"""Values of an array that may state something about the others."""
 _LAYOUTS = (
     ("vid2e's arrays: ns", {"x": "i2", "y": "i2", "t": "i8", "p": "i1"}, "ns"),
     ("Metavision's records of events: µs", {"x": "u2", "y": "u2", "p": "i2", "t": "i8"}, "us"),
@@ -200,6 +204,10 @@ def _candidates(
     beside = {name: load(name) for name in _KNOWN if name in shapes and name != "cause"}
     sides = [_declared(beside[side], side, where) for side in ("height", "width") if side in beside]
     known: dict[str, Any] = {"size": (sides[0], sides[1]) if len(sides) == 2 else None}
+    if "t_offset" in beside and beside["t_offset"].size == 1 and beside["t_offset"].dtype.kind in "iuf":
+        known["offset"] = beside["t_offset"].item()
+    small = [name for name, (shape, _) in shapes.items() if math.prod(shape) <= _FEW]
+    known["notes"] = not_read([*small, *others], [k for k in _KNOWN if k != "t_offset" or "offset" in known])
     if "time_unit" in beside:
         known["unit"] = named_unit(f"[{beside['time_unit']}]")
 

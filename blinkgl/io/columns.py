@@ -269,7 +269,11 @@ _SIGNED = "0 or 1, -1 or 1"
 def proposed_polarity(p: np.ndarray) -> str:
     """Return the option to paste for two numbers of OFF and ON, where there are two."""
     values = np.unique(p[np.isfinite(p)]) if p.dtype.kind in "iuf" else p[:0]
-    return f"--polarity {values[0]:.17g}/{values[1]:.17g}" if len(values) == 2 else "--polarity OFF/ON"
+    return (
+        f"--polarity {values[0]:.17g}/{values[1]:.17g}"
+        if len(values) == 2
+        else "--polarity with the numbers of OFF and ON"
+    )
 
 
 def _refuse(column: np.ndarray, good: np.ndarray, name: str, accepted: str, where: str, first: int) -> None:

@@ -33,7 +33,7 @@ class Undeclared(EventDataError):
     """A list of times whose unit is neither stated nor declared."""
 
 
-_SECONDS = re.compile(r"[-+]?\d+\.(\d+)([eE][-+]?\d+)?")
+SECONDS = re.compile(r"[-+]?\d+\.(\d+)([eE][-+]?\d+)?")
 _PLACES = 6
 """The Event Camera Dataset's and TUM's lists: seconds with a point, of which some have six places or more, or names."""
 
@@ -81,7 +81,7 @@ def read_timestamps(
     stated = unit or _stated(titles, columns, heading, path) or usual
     if stated is not None:
         return Stamps(nanoseconds(times, stated), names)
-    points = [_SECONDS.fullmatch(text) for text in texts]
+    points = [SECONDS.fullmatch(text) for text in texts]
     places = max(len(point[1]) for point in points if point) if None not in points else 0
     if places and (names is not None or places >= _PLACES) and len(columns) == 1:
         note = f"{path.name}: read as the Event Camera Dataset's and TUM's lists: seconds with a point"

@@ -33,7 +33,7 @@ RANGES = ("full", "limited")
 _STAMP_FILES = ("timestamps.txt", "timestamp.txt", "images.txt", "timestamps.csv", "data.csv")
 _OURS = ("exposures.csv", "manifest.json")
 """Beside a folder of images of a sequence that BlinkGL wrote: its list of times is in µs."""
-_CALLED = ("frames", "images", "video", "luminance")
+CALLED = ("frames", "images", "video", "luminance")
 """Names of arrays of frames."""
 _LOOKED_AT = 16
 """Frames, spread over the clip, that are looked at for 16-bit codes which leave the upper two bits empty."""
@@ -439,7 +439,7 @@ def _array(path: Path, declared: Declared) -> FrameSource:
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
             with NpzReader(path) as data:
-                held = [k for k in _CALLED if k in data]
+                held = [k for k in CALLED if k in data]
                 if declared.stream is not None and declared.stream in data:
                     held = [declared.stream]
                 if not held:

@@ -113,8 +113,8 @@ class Table:
     """Four columns in a file.   read : rows of a slice, "x", "y", "t", "p" and perhaps "cause" -> (N,) numbers.
     count : rows.   heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to
     t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   layout :
-    the name of the layout by which its unit is known; "": the file states it, or nothing does.   notes : lines for the
-    user."""
+    the name of the layout by which its unit is known; "": the file states it, or nothing does.   per_px : steps of x
+    and y in a pixel.   notes : lines for the user."""
 
     read: Callable[[slice], dict[str, np.ndarray]]
     count: int
@@ -124,6 +124,7 @@ class Table:
     size: tuple[int, int] | None = None
     place: str = ""
     layout: str = ""
+    per_px: int = 1
     notes: Sequence[str] = ()
 
 
@@ -228,7 +229,8 @@ class TableReader:
             if self._keep:
                 columns = self._whole(columns)
             t = microseconds(columns["t"], where, first, unit)
-            x, y, p, cause = columns["x"], columns["y"], columns["p"], columns.get("cause")
+            x, y = (columns[side] if self._table.per_px == 1 else columns[side] / self._table.per_px for side in "xy")
+            p, cause = columns["p"], columns.get("cause")
             polarity = self._polarity
             if polarity is None and len(p) and p.dtype.kind in "if":
                 # OFF is 0 or -1; the second of them in a file is another code.

@@ -58,6 +58,7 @@ from blinkgl.layouts import export_layout
 from blinkgl.report.page import write_report
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.scene.reading import reading
 from blinkgl.scene.worlds.from_file import from_document
 from blinkgl.sequence_files.sequence_dir import digest_of
 from blinkgl.tools import fuzz_configurations, fuzz_files
@@ -134,7 +135,8 @@ def _camera(path: Path) -> None:
 
 
 def _scene(path: Path) -> None:
-    made = from_document(gltf.read(path), CameraConfig(width=64, height=48).model, 0, 10**9, intrinsics="file")
+    with reading("scene", str(path)):
+        made = from_document(gltf.read(path), CameraConfig(width=64, height=48).model, 0, 10**9, intrinsics="file")
     assert all(np.isfinite(body.path.pose(5 * 10**8)).all() for body in made.objects), "poses that are not finite"
 
 

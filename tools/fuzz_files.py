@@ -158,7 +158,7 @@ def spring(path: Path) -> None:
         file.create_dataset("flow", data=double, chunks=(24, 32, 2), compression="gzip")
 
 
-POSES = "".join(f"{k / 10} {k / 9} 1 0 0 0 0 1\n" for k in range(30))
+POSES = "".join(f"{k / 10:.6f} {k / 9} 1 0 0 0 0 1\n" for k in range(30))
 EUROC = "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n" + "".join(
     f"{1403636579763555584 + k * 10**7},{k / 9},1,0,1,0,0,0\n" for k in range(30)
 )

@@ -182,10 +182,10 @@ class NpzFolderReader:
 
     def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
         self.path, self._reading, self.unread = Path(path), reading, 0
-        found = series(self.path, FOLDED)
-        self._files, first = found.files, ArrayReader(found.files[0], reading)
+        numbered = series(self.path, FOLDED)
+        self._files, first = numbered.files, ArrayReader(numbered.files[0], reading)
         self.height, self.width, self.unit, self.causes = first.height, first.width, first.unit, first.causes
-        self.notes = [*first.notes, *found.notes, f"read as one recording: {len(found.files)} files"]
+        self.notes = [*first.notes, *numbered.notes, f"read as one recording: {len(self._files)} files"]
 
     def chunks(self) -> Iterator[Events]:
         """Yield the events of all files."""

@@ -236,7 +236,7 @@ class TableReader:
                 # OFF is 0 or -1; the second of them in a file is another code.
                 off |= {-1, 0} if p.min() < 0 and (p == 0).any() else {min(int(p.min()), 1)}
                 if off >= {-1, 0}:
-                    accepted = f"0 and 1, or -1 and 1; or {proposed_polarity(p)}"
+                    accepted = f"0 and 1, or -1 and 1{proposed_polarity(p)}"
                     raise EventDataError("polarities -1 and 0 in one file", where=where, accepted=accepted)
             yield events_of(x, y, t, p, where, first, cause=cause, offset=offset, signed=True, polarity=polarity)
         if self.count and self.unread == self.count:

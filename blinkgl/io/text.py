@@ -225,7 +225,7 @@ class TextReader:
         order = " ".join(self._order)
         problem, accepted = {
             _NOT_A_ROW: ("is not an event", f"{order} (--columns)"),
-            _POLARITY: ("has a polarity that is not known", f"0/1, -1/1 or True/False as {order}; or {codes}"),
+            _POLARITY: ("has a polarity that is not known", f"0/1, -1/1 or True/False as {order}{codes}"),
             _LAYOUT: (
                 "is not as the lines before it, the Event Camera Dataset's: seconds with a point, x, y, 0 or 1",
                 "try --columns and --time-unit",

@@ -189,7 +189,7 @@ def test_off_has_one_code(tmp_path, codes, where):
         rows = zip(E.t.tolist(), E.x.tolist(), E.y.tolist(), p.tolist())
         path.write_text("t_us,x,y,p\n" + "".join(f"{t},{x},{y},{q}\n" for t, x, y, q in rows))
     if {-1, 0} <= set(codes):
-        proposed = "--polarity -1/0" if len(codes) == 2 else "--polarity with the numbers"
+        proposed = "--polarity -1/0" if len(codes) == 2 else "--polarity, the numbers"
         one_line(lambda: open_events(path).read(), proposed)
     else:
         assert np.array_equal(open_events(path).read().p, p == 1)

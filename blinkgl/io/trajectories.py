@@ -30,7 +30,7 @@ from blinkgl.io.clock import checked_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
 from blinkgl.io.rows import read_rows, titles_of
-from blinkgl.io.stamps import SECONDS, read_timestamps
+from blinkgl.io.stamps import PLACES, places_of, read_timestamps
 from blinkgl.types.numbers import exact, is_number
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
@@ -56,7 +56,6 @@ _HEADINGS = {
 }  # fmt: skip
 """Beginnings of headings that state no unit -> whose they are, and their unit. Of "s" every time has a point, of "ns"
 none."""
-_PLACES = 6
 _FASTEST = 60.0
 """units/s of a camera from which on a note asks for the unit."""
 
@@ -173,7 +172,7 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
         return _Table(None, np.empty((0, 3)), Rotation.identity(), [])
     if not roles:
         roles = _COLUMNS["tum"].split()
-        if len(rows[0][1]) >= 8 and _places([fields[0] for _, fields in rows]) < _PLACES:
+        if len(rows[0][1]) >= 8 and places_of([fields[0] for _, fields in rows]) < PLACES:
             raise AssetError(
                 "no heading names the columns of poses",
                 where=str(path),
@@ -197,19 +196,13 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     return _Table(times, numbers[:, :3], _rotations(numbers[:, 3:], lines, path), lines, unit, notes)
 
 
-def _places(times: Sequence[str]) -> int:
-    """Return the most places that seconds with a point have; 0: some time has no point, or is no number."""
-    points = [SECONDS.fullmatch(text) for text in times]
-    return max(len(point[1]) for point in points if point) if None not in points and points else 0
-
-
 def _known_layout(heading: str, times: Sequence[str]) -> tuple[str, str] | None:
     """Return whose layout a heading or the times show, and its unit; None: none that is known."""
-    bare, places = re.sub(r"\s*([,\[\]])\s*", r"\1", heading.strip("# \t").lower()), _places(times)
+    bare, places = re.sub(r"\s*([,\[\]])\s*", r"\1", heading.strip("# \t").lower()), places_of(times)
     for begin, known in _HEADINGS.items():
         if bare.startswith(begin) and (places > 0 if known[1] == "s" else all(map(str.isdigit, times))):
             return known
-    return ("TUM's or the Event Camera Dataset's", "s") if places >= _PLACES else None
+    return ("TUM's or the Event Camera Dataset's", "s") if places >= PLACES else None
 
 
 def _roles(titles: Sequence[str]) -> list[str]:

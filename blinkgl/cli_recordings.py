@@ -31,7 +31,7 @@ Curve = Annotated[
 WhiteLevel = Annotated[
     float | None,
     typer.Option("--white-level", help="Code of white: 4095 of 12 bits in 16 (default: what the file states, else "
-                 "from the clip's codes)."),
+                 "the type's largest; asked for where 16-bit codes leave the upper two bits empty)."),
 ]  # fmt: skip
 Range = Annotated[
     str | None,

@@ -90,7 +90,7 @@ def assets(folder: Path) -> None:
     cv2.imwrite(str(folder / "mask.png"), np.where((x // 8 + y // 8) % 3 == 0, 0, 255).astype(np.uint8))
     sky = np.repeat((1 + np.sin(x / 3) * np.cos(y / 3))[:24, :, None], 3, axis=2)
     cv2.imwrite(str(folder / "sky.hdr"), sky.astype(np.float32))
-    poses = [f"{t / 10} {-3 + t / 40} {t / 20} 1 -0.5 0.5 -0.5 0.5" for t in range(-2, 5)]
+    poses = [f"{t / 10:.6f} {-3 + t / 40} {t / 20} 1 -0.5 0.5 -0.5 0.5" for t in range(-2, 5)]
     (folder / "path.txt").write_text("\n".join(poses) + "\n", encoding="utf-8")
     shutil.copy(HERE / "arm.glb", folder)
     (folder / "configs").mkdir()

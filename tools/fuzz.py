@@ -41,6 +41,7 @@ import numpy as np
 import trimesh
 
 from blinkgl.config.camchain import read_camchain
+from blinkgl.config.camera import CameraConfig
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
@@ -55,11 +56,16 @@ from blinkgl.io.stamps import read_timestamps
 from blinkgl.io.trajectories import PoseFile, read_trajectory
 from blinkgl.layouts import export_layout
 from blinkgl.report.page import write_report
+from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.scene.reading import reading
+from blinkgl.scene.worlds.from_file import from_document
 from blinkgl.sequence_files.sequence_dir import digest_of
 from blinkgl.tools import fuzz_configurations, fuzz_files
 from blinkgl.viewer.views import SequenceView, sequences_in
+from eflow.checkpoint import read_tensors
 from eflow.data.sources import open_source
+from eflow.published import read_published
 
 CPU_S, WALL_S, MEMORY_MB = 10, 60.0, 2048
 READ, REFUSED = "read", "refused"
@@ -126,6 +132,12 @@ def _poses(path: Path) -> None:
 def _camera(path: Path) -> None:
     for one in read_camchain(path).values():
         assert np.isfinite(one.camera.project(np.array([[0.0, 0.0, 1.0]]))).all(), "a camera that sees nothing"
+
+
+def _scene(path: Path) -> None:
+    with reading("scene", str(path)):
+        made = from_document(gltf.read(path), CameraConfig(width=64, height=48).model, 0, 10**9, intrinsics="file")
+    assert all(np.isfinite(body.path.pose(5 * 10**8)).all() for body in made.objects), "poses that are not finite"
 
 
 def _below(path: Path) -> list[Path]:
@@ -298,6 +310,9 @@ FORMATS = {
         lambda path: fuzz_files.bag2("MCAP")(path, fuzz_files.events()), lambda path: open_events(path).read(), _below
     ),
     **{f"export {layout}": _exported(layout) for layout in ("dsec", "blinkflow", "mvsec")},
+    "scene.glb": Format(fuzz_files.scene, _scene),
+    **{f"{name}.pt": Format(fuzz_files.tensors, read_published) for name in ("zip", "old")},
+    "weights.safetensors": Format(fuzz_files.tensors, read_tensors),
     **{f"mesh.{ending}": MESH for ending in ("obj", "ply", "stl", "glb")},
     "camera": _set_of(("dsec", "blinkflow", "mvsec", "tapvid"), "tracks={points: 20}"),
     "exposures": _set_of(("dsec", "blinkflow"), "images={exposure_us: 5000}"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,12 @@ import cv2
 import h5py
 import numpy as np
 import tifffile
+import torch
+import trimesh
 from PIL import Image
+from safetensors.torch import save_file
 from scipy.io import savemat
+from trimesh.visual import TextureVisuals
 
 from blinkgl.types.events import Events
 
@@ -153,7 +158,7 @@ def spring(path: Path) -> None:
         file.create_dataset("flow", data=double, chunks=(24, 32, 2), compression="gzip")
 
 
-POSES = "".join(f"{k / 10} {k / 9} 1 0 0 0 0 1\n" for k in range(30))
+POSES = "".join(f"{k / 10:.6f} {k / 9} 1 0 0 0 0 1\n" for k in range(30))
 EUROC = "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n" + "".join(
     f"{1403636579763555584 + k * 10**7},{k / 9},1,0,1,0,0,0\n" for k in range(30)
 )
@@ -207,3 +212,41 @@ def bag2(plugin: str) -> Make:
             bag.write(topic, 1, head + first + rows[1:].tobytes())
 
     return make
+
+
+def scene(path: Path) -> None:
+    """A GLB with what `blinkgl import` writes: two bodies with materials and a picture, a camera, a lamp, a motion."""
+    boxes = [trimesh.creation.box() for _ in range(2)]
+    boxes[0].visual = TextureVisuals(np.zeros((len(boxes[0].vertices), 2)), image=Image.fromarray(picture()))
+    data = cast(bytes, trimesh.Scene(boxes).export(file_type="glb"))
+    length = int.from_bytes(data[12:16], "little")
+    tree, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    binary += b"\0" * (-len(binary) % 4)
+    for values, kind in ((np.arange(2, dtype="f4"), "SCALAR"), (np.eye(2, 3, dtype="f4"), "VEC3")):
+        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes})
+        view = len(tree["bufferViews"]) - 1
+        tree["accessors"].append({"bufferView": view, "componentType": 5126, "count": 2, "type": kind})
+        binary += values.tobytes()
+    last, moved = len(tree["accessors"]) - 1, next(k for k, node in enumerate(tree["nodes"]) if "mesh" in node)
+    channel = {"sampler": 0, "target": {"node": moved, "path": "translation"}}
+    tree["animations"] = [{"samplers": [{"input": last - 1, "output": last}], "channels": [channel]}]
+    tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.02}}]
+    lamp = {"type": "spot", "intensity": 9, "spot": {"innerConeAngle": 0.1, "outerConeAngle": 0.4}}
+    tree |= {"extensions": {"KHR_lights_punctual": {"lights": [lamp]}}, "extensionsUsed": ["KHR_lights_punctual"]}
+    tree["nodes"] += [{"camera": 0}, {"extensions": {"KHR_lights_punctual": {"light": 0}}}]
+    tree["scenes"][0]["nodes"] += [len(tree["nodes"]) - 2, len(tree["nodes"]) - 1]
+    tree["buffers"][0]["byteLength"] = len(binary)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    path.write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(body)) + body)
+
+
+def tensors(path: Path) -> None:
+    """A checkpoint of torch, of either age, or of safetensors."""
+    held = {f"fnet.{k}.weight": torch.full((4, 3), float(k)) for k in range(3)}
+    if path.suffix == ".safetensors":
+        save_file(held, path, {"model": "{}"})
+    else:
+        tree = {"model": held, "epoch": np.float64(3), "step": 7}
+        torch.save(tree, path, _use_new_zipfile_serialization=path.stem != "old")

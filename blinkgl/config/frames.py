@@ -60,7 +60,8 @@ class FramesConfig(Config):
         None,
         gt=0,
         le=1e9,
-        description="code of white, 4095 of 12 bits in 16; null: what the files state, or the type's",
+        description="code of white, 4095 of 12 bits in 16; null: what the files state, else "
+        "the type's; asked for where 16-bit codes leave the upper two bits empty",
     )
     range: Literal["full", "limited"] | None = Field(
         None, description="of the codes: limited is 16 to 235 of 8 bits; null: full"

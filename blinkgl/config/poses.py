@@ -93,11 +93,12 @@ class TrajectoryConfig(Config):
 
     file: str = Field(description="a table of poses (TUM, EuRoC, ESIM …), KITTI's, COLMAP's images.txt, NeRF's JSON")
     form: Literal["auto", "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"] = Field(
-        "auto", description="auto: by the heading, else by the content; a guess is logged"
+        "auto", description="auto: by the heading, else by a layout that is known by name, which is logged"
     )
     columns: str | None = Field(None, description="names of the columns, such as `t x y z qw qx qy qz`; `-`: left out")
     time_unit: Literal["s", "ms", "us", "ns"] | None = Field(
-        None, description="of the file's times; null: as its heading says, else the form's, else guessed from all"
+        None,
+        description="of the file's times; null: as its heading says, else the form's; asked for where neither says it",
     )
     maps_from: Literal["camera", "world"] | None = Field(
         None, description="world: poses map the world to the camera; null: the form's (colmap: world)"

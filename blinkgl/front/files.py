@@ -75,10 +75,13 @@ def read_trajectory(
     form : "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"; None: by heading and content.
     columns : names, such as "t x y z qw qx qy qz".   time_unit : "s", "ms", "us", "ns".   maps_from : "camera" or
     "world".   axes : of the camera, "opencv", "opengl", "ned".   rate : poses per second, or times : a file of times,
-    for a file without them.   notes : gets what was guessed, a line each.
+    for a file without them.   notes : gets what was recognised, a line each.
     Raises AssetError with the line: invalid pose, times that do not increase, a gap; ConfigError."""
     from blinkgl.io import trajectories
 
+    words = {"form": form, "columns": columns, "time_unit": time_unit, "maps_from": maps_from, "axes": axes}
+    for where, word in words.items():
+        check.one_of(word, where, (str, type(None)), "text, or None")
     per_second = None if rate is None else check.number(rate, "rate", above=0, most=1e9)
     stamps = None if times is None else check.path(times, "times")
     declared = trajectories.PoseFile(

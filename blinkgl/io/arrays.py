@@ -3,6 +3,7 @@ reads MATLAB's .mat with such variables. Unlike the other formats, whole recordi
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import zlib
@@ -18,6 +19,7 @@ from blinkgl.io.atomic import output_errors
 from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_npy
+from blinkgl.io.names import series
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.sizes import check_claim
 from blinkgl.io.tables import (
@@ -26,6 +28,7 @@ from blinkgl.io.tables import (
     TableReader,
     choose,
     named_columns,
+    not_read,
     table_of_columns,
     table_of_records,
     table_of_rows,
@@ -121,11 +124,14 @@ DTYPE = np.dtype([(("us", "t"), "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")]
 
 _EVIMO = {"index", "discretization", "K", "D", "meta"}
 """Arrays beside the events of EV-IMO's files: ``events`` and two of these mark the layout, t x y p in seconds."""
-_KNOWN = ("height", "width", "time_unit", "cause")
+_KNOWN = ("height", "width", "time_unit", "t_offset", "cause")
+_FEW = 16
+"""Values of an array that may state something about the others."""
 _LAYOUTS = (
-    ("vid2e's arrays: ns", {"x": "i2", "y": "i2", "t": "i8", "p": "i1"}, "ns"),
-    ("Metavision's records of events: µs", {"x": "u2", "y": "u2", "p": "i2", "t": "i8"}, "us"),
-    ("eventVision's variables: µs", {"x": "u1", "y": "u1", "ts": "u4", "pol": "u1"}, "us"),
+    ("vid2e's arrays: ns", {"x": "i2", "y": "i2", "t": "i8", "p": "i1"}, "ns", 1),
+    ("Metavision's records of events: µs", {"x": "u2", "y": "u2", "p": "i2", "t": "i8"}, "us", 1),
+    ("eventVision's variables: µs", {"x": "u1", "y": "u1", "ts": "u4", "pol": "u1"}, "us", 1),
+    ("BS-ERGB's arrays: µs, 32nds of a pixel", {"x": "u4", "y": "u4", "timestamp": "f8", "polarity": "u1"}, "us", 32),
 )
 """Layouts of columns that state no unit, by the names and types that no other known writer has."""
 
@@ -149,6 +155,8 @@ class ArrayReader(TableReader):
         self.notes += [f"left out: {', '.join(skipped)}, which would have to be unpickled"] if skipped else []
 
 
+FOLDED = (".npz",)
+"""Endings of files that are one recording where they fill a folder."""
 EVIMO2 = tuple(f"dataset_events_{part}.npy" for part in ("t", "xy", "p"))
 """Arrays of the events of an EVIMO2v2 sequence, files of one folder: seconds, (N, 2) px, 0 or 1."""
 
@@ -165,6 +173,42 @@ class Evimo2Reader(TableReader):
         known = {"unit": "s", "layout": "EVIMO2's three arrays: seconds"} if t.dtype.kind == "f" else {}
         columns = {"t": t, "x": xy[:, 0], "y": xy[:, 1], "p": p}
         super().__init__(folder, reading, table_of_columns(columns, str(folder), **known))
+
+
+class NpzFolderReader:
+    """Reads the ``.npz`` of a folder, in the order of their numbers, as one recording: BS-ERGB's, EventScape's and
+    vid2e's. Raises AssetError, naming the file, as :class:`ArrayReader`; files of different sensors, or whose clocks
+    begin again."""
+
+    def __init__(self, path: str | os.PathLike, reading: EventReading = AS_FILE):
+        self.path, self._reading, self.unread = Path(path), reading, 0
+        numbered = series(self.path, FOLDED)
+        self._files, first = numbered.files, ArrayReader(numbered.files[0], reading)
+        self.height, self.width, self.unit, self.causes = first.height, first.width, first.unit, first.causes
+        self.notes = [*first.notes, *numbered.notes, f"read as one recording: {len(self._files)} files"]
+
+    def chunks(self) -> Iterator[Events]:
+        """Yield the events of all files."""
+        begun, last, self.unread = 0, 0, 0
+        for path in self._files:
+            one, count = ArrayReader(path, self._reading), 0
+            if (one.height, one.width) != (self.height, self.width):
+                size = f"{one.width}x{one.height}"
+                raise AssetError("another sensor than in the file before", where=str(path), value=size)
+            for events in one.chunks():
+                if not count and len(events):
+                    if events.t[0] <= begun < last:
+                        raise AssetError(
+                            "the times begin again in this file",
+                            where=str(path),
+                            value=int(events.t[0]),
+                            accepted=f"one clock: {begun} µs or later; or each file by itself",
+                        )
+                    begun = int(events.t[0])
+                count += len(events)
+                last = int(events.t[-1]) if len(events) else last
+                yield events
+            self.unread += one.unread
 
 
 def _mapped(path: Path) -> np.ndarray:
@@ -200,6 +244,10 @@ def _candidates(
     beside = {name: load(name) for name in _KNOWN if name in shapes and name != "cause"}
     sides = [_declared(beside[side], side, where) for side in ("height", "width") if side in beside]
     known: dict[str, Any] = {"size": (sides[0], sides[1]) if len(sides) == 2 else None}
+    if "t_offset" in beside and beside["t_offset"].size == 1 and beside["t_offset"].dtype.kind in "iuf":
+        known["offset"] = beside["t_offset"].item()
+    small = [name for name, (shape, _) in shapes.items() if math.prod(shape) <= _FEW]
+    known["notes"] = not_read([*small, *others], [k for k in _KNOWN if k != "t_offset" or "offset" in known])
     if "time_unit" in beside:
         known["unit"] = named_unit(f"[{beside['time_unit']}]")
 
@@ -213,9 +261,9 @@ def _candidates(
         order = ("t", "x", "y", "p") if evimo else reading.columns
         return table_of_rows(array, where, order, place=name, **{**known, **layout})
 
-    for layout, types, unit in _LAYOUTS:
+    for layout, types, unit, per_px in _LAYOUTS:
         if set(columns.values()) == types.keys() and all(shapes[k][1] == np.dtype(kind) for k, kind in types.items()):
-            known = {"unit": unit, "layout": layout, **known}
+            known = {"unit": unit, "layout": layout, "per_px": per_px, **known}
     if set("txyp") <= columns.keys() and reading.stream not in shapes:
         used = [*columns.values(), *(["cause"] if "cause" in shapes else [])]
         arrays = {name: load(name) for name in used}

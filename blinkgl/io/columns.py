@@ -267,16 +267,18 @@ _SIGNED = "0 or 1, -1 or 1"
 
 
 def proposed_polarity(p: np.ndarray) -> str:
-    """Return the option to paste for two numbers of OFF and ON, where there are two."""
+    """Return the option to paste for the numbers of OFF and ON, as the end of a message; "": there are no numbers."""
     values = np.unique(p[np.isfinite(p)]) if p.dtype.kind in "iuf" else p[:0]
-    return f"--polarity {values[0]:.17g}/{values[1]:.17g}" if len(values) == 2 else "--polarity OFF/ON"
+    if len(values) == 2:
+        return f"; or --polarity {values[0]:.17g}/{values[1]:.17g}"
+    return "; or --polarity, the numbers of OFF and ON" if len(values) else ""
 
 
 def _refuse(column: np.ndarray, good: np.ndarray, name: str, accepted: str, where: str, first: int) -> None:
     i = int(np.argmin(good))
     value = column[i].item()
     if accepted == _SIGNED:
-        accepted += f"; or {proposed_polarity(column)}"
+        accepted += proposed_polarity(column)
     # Codes of polarity, and places between pixels, are sound values that the reader does not know: no damage.
     sound = value == value and (name in ("p", "polarity") or accepted == "whole numbers")
     kind = EventDataError if sound else BadEvent

@@ -104,11 +104,14 @@ for _one in (
     EventFormat("npz", (".npz",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     EventFormat("npy", (".npy",), "arrays", "ArrayReader", "ArrayWriter", causes=True),
     EventFormat("evimo2", (), "arrays", "Evimo2Reader"),
+    EventFormat("npz folder", (), "arrays", "NpzFolderReader", causes=True),
 ):
     register(_one)
 _EVIMO2 = "dataset_events_*.npy"
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files without a size."""
+_BESIDE = {".npz", ".txt", ".csv", ".json", ".yaml", ""}
+"""Endings of the files of a folder of events: lists and notes beside the arrays."""
 _FOUND = ("moved", "late", "cut", "outside")
 """Lines about what salvage found, which every pass over a file finds anew."""
 _REMEDIED = (Damage, BadEvent)
@@ -336,14 +339,22 @@ def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Eve
     return file
 
 
+def kind_of_files(path: Path) -> str | None:
+    """Return the format of a recording that lies in several files, of a folder or one of them; None: no such."""
+    if path.match(_EVIMO2) or any(path.glob(_EVIMO2)):
+        return "evimo2"
+    if (path / "metadata.yaml").is_file():
+        return "rosbag"
+    endings = {file.suffix.lower() for file in path.iterdir()} if path.is_dir() else set()
+    return "npz folder" if ".npz" in endings and endings <= _BESIDE else None
+
+
 def _kind(path: Path, reading: EventReading) -> str:
     """Return the format of a file. Raises AssetError."""
     ending = ending_of(path)
     formats = [one for one in FORMATS.values() if ending in one.endings]
-    if path.is_dir() and (path / "metadata.yaml").is_file():
-        return "rosbag"
-    if any(path.glob(_EVIMO2)) or (path.match(_EVIMO2) and path.parent.is_dir()):
-        return "evimo2"
+    if several := kind_of_files(path):
+        return several
     if not formats:
         raise AssetError("unknown event file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
     if not path.is_file():

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -33,10 +33,10 @@ RANGES = ("full", "limited")
 _STAMP_FILES = ("timestamps.txt", "timestamp.txt", "images.txt", "timestamps.csv", "data.csv")
 _OURS = ("exposures.csv", "manifest.json")
 """Beside a folder of images of a sequence that BlinkGL wrote: its list of times is in µs."""
-_CALLED = ("frames", "images", "video", "luminance")
+CALLED = ("frames", "images", "video", "luminance")
 """Names of arrays of frames."""
 _LOOKED_AT = 16
-"""Frames, spread over the clip, whose largest code tells 8, 10, 12 or 14 bits in 16."""
+"""Frames, spread over the clip, that are looked at for 16-bit codes which leave the upper two bits empty."""
 _ENDINGS = tuple(f"_{unit}" for unit in NANOSECONDS)
 _BITS = (8, 10, 12, 14)
 
@@ -46,7 +46,7 @@ Frames = Iterator[tuple[np.ndarray | None, int | None, str]]
 
 @dataclass(frozen=True)
 class Declared:
-    """What a user declares of a clip of frames; None: what the file says, else a guess that is said.
+    """What a user declares of a clip of frames; None: what the file says.
 
     fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.stamps`).
     time_unit : of these, "s", "ms", "us", "ns", or "frames" of ``fps``.   zero_time : count times from the first frame.
@@ -102,9 +102,9 @@ class FrameSource:
     own_times : whether the file itself has times. fps, times_ns : what is used in their place, or None. origin :
     "camera" (a camera's own frames beside its events, proportional to light), "video" or "images". transfer : curve
     that the file states: "linear", "pq", "hlg", an exponent; None: it states none. levels : codes of black and white
-    that the file states or that were guessed, None: the ends of the type. exact : whether whoever wrote the frames says
+    that the file states, None: the ends of the type. exact : whether whoever wrote the frames says
     that they have no noise. notes : what was read that is unusual,
-    guessed or left out, a line each; more may be added while iterating.
+    or left out, a line each; more may be added while iterating.
 
     Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do
     not increase, more or fewer times than frames, a single frame.
@@ -262,17 +262,18 @@ def _folder(folder: Path, declared: Declared) -> FrameSource:
             value=" ".join(there) or "no files",
             accepted=" ".join(sorted(IMAGE)) + other,
         )
-    source = _stacks(folder, pictures, declared)
-    if (ours := camera_of(folder)) is not None:
+    ours = camera_of(folder)
+    source = _stacks(folder, pictures, declared, ours is not None)
+    if ours is not None:
         source = _of_our_camera(source, ours, folder.name)
     if stamps is not None and stamps.names is not None and source.count == len(pictures.files):
         stamps = _by_name(stamps, pictures, str(list_file))
     return source.timed(replace(declared, timestamps=None), stamps)
 
 
-def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
-    """Return the pages of all files as frames."""
-    files, background, notes = found.files, background_of(declared.background), found.notes
+def _stacks(where: Path, series_: Series, declared: Declared, ours: bool = False) -> FrameSource:
+    """Return the pages of all files as frames.   ours : what the codes mean is known."""
+    files, background, notes = series_.files, background_of(declared.background), series_.notes
     first = open_stills(files[0])
     # Only stacks and animations have pages, so that the others need not be opened before their turn.
     stacked = first.pages > 1 or {p.suffix.lower() for p in files} & STACK
@@ -285,8 +286,8 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
     if own is not None and declared.fps is None:
         shown = f"{min(delays):g}" if min(delays) == max(delays) else f"{min(delays):g} to {max(delays):g}"
         notes.append(f"each frame is shown for {shown} ms, as the file says (--fps for another rate)")
-    elif declared.fps is not None and pages == len(files) and (places := found.places()) is not None:
-        notes += found.missing()
+    elif declared.fps is not None and pages == len(files) and (places := series_.places()) is not None:
+        notes += series_.missing()
         times = [round(int(place) * 1e9 / declared.fps) for place in places]
 
     mixed = not stacked and _mixed(files)
@@ -317,12 +318,8 @@ def _stacks(where: Path, found: Series, declared: Declared) -> FrameSource:
     image = next((image for image, _, _ in frames() if image is not None), None)
     if image is None:
         raise Damage("no picture of the folder can be decoded", where=str(where))
-    levels = None if first.white is None else (0.0, first.white)
-    if image.dtype == np.uint16 and declared.white_level is None and declared.range is None:
-        chosen = [files[int(k)] for k in np.unique(np.linspace(0, len(files) - 1, _LOOKED_AT))]
-        top = max(int(one.max()) for path in chosen for one in open_stills(path).iterate(background))
-        # PNG's sBIT allows codes of the full scale, too.
-        levels = levels if levels is not None and top <= levels[1] else _white_of(top, notes)
+    declares = ours or declared.white_level is not None or declared.range is not None
+    levels = stated_levels(files, ask=image.dtype == np.uint16 and not declares)
     (height, width), has = image.shape[:2], own is not None
     return FrameSource(
         where, height, width, pages, frames, has, transfer=first.transfer, levels=levels, notes=notes, times_ns=times
@@ -335,7 +332,7 @@ def _of_our_camera(source: FrameSource, camera: ImagesConfig, pictures: str) -> 
     transfer = {"linear": "linear", "gamma": camera.gamma}.get(camera.response)
     quiet = pictures == "clean" or not (camera.photon_noise or camera.read_noise)
     words = f"{camera.response}, {camera.bits} bits" + (f", {camera.bayer} filters" if camera.bayer else "")
-    notes = [note for note in source.notes if not note.startswith("16-bit codes")]
+    notes = [*source.notes]
     notes.append(f"the sequence's frame camera: {words}, {'no noise' if quiet else 'with its noise'}")
     # No light has the black level, on the scale of light.
     levels = (camera.black * top, top) if camera.response == "linear" else (0.0, top)
@@ -355,16 +352,38 @@ def _mixed(files: list[Path]) -> bool:
 _HEADERS = {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pnm", ".pbm", ".tga", ".jp2", ".avif"}
 
 
-def _white_of(top: int, notes: list[str]) -> tuple[float, float] | None:
-    """Return the levels of 16-bit frames whose largest code, in a sample of the whole clip, is ``top``."""
-    for bits in _BITS:
-        # The largest code uses one of the upper two bits.
-        if 2 ** (bits - 2) <= top < 2**bits:
-            notes.append(
-                f"16-bit codes up to {top:,}: taken as {bits} bits, white {2**bits - 1:,} (--white-level 65535 if dark)"
-            )
-            return 0.0, float(2**bits - 1)
+def stated_levels(files: Sequence[Path], *, ask: bool) -> tuple[float, float] | None:
+    """Return the codes of black and white that pictures state; None: the ends of their type.   ask : whether the codes
+    have 16 bits, and nobody else says what is white. Raises AssetError as :func:`_ask_for_white`."""
+    white = open_stills(files[0]).white
+    levels = None if white is None else (0.0, float(white))
+    if not ask:
+        return levels
+    top = max(_largest_code(files[int(k)]) for k in np.unique(np.linspace(0, len(files) - 1, _LOOKED_AT)))
+    if levels is not None and top <= levels[1]:
+        return levels
+    # PNG's sBIT allows codes of the full scale, too.
+    _ask_for_white(top, str(files[0].parent if len(files) > 1 else files[0]))
     return None
+
+
+def _largest_code(path: Path) -> int:
+    with contextlib.suppress(Damage):  # whoever reads the frames says it
+        return max(int(image.max()) for image in open_stills(path).iterate())
+    return 0
+
+
+def _ask_for_white(top: int, where: str) -> None:
+    """Raise AssetError, with the option to paste, for 16-bit codes up to ``top`` that leave the upper two bits empty:
+    a camera's codes, or a dark film."""
+    bits = next((bits for bits in _BITS if 0 < top < 2**bits), 16)
+    if bits < 16:
+        raise AssetError(
+            "no code of white is stated for 16-bit frames",
+            where=where,
+            value=f"codes up to {top:,}",
+            accepted=f"try --white-level {2**bits - 1} of {bits} bits, or 65535 if dark (white_level in a recipe)",
+        )
 
 
 def _by_name(stamps: Stamps, found: Series, where: str) -> Stamps:
@@ -420,7 +439,7 @@ def _array(path: Path, declared: Declared) -> FrameSource:
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
             with NpzReader(path) as data:
-                held = [k for k in _CALLED if k in data]
+                held = [k for k in CALLED if k in data]
                 if declared.stream is not None and declared.stream in data:
                     held = [declared.stream]
                 if not held:
@@ -443,8 +462,8 @@ def _array(path: Path, declared: Declared) -> FrameSource:
         raise AssetError(
             "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
         )
-    guessed = frames.dtype == np.uint16 and declared.white_level is None and declared.range is None
-    levels = _white_of(int(max(frame.max() for frame in frames)), notes) if guessed else None
+    if frames.dtype == np.uint16 and declared.white_level is None and declared.range is None:
+        _ask_for_white(max(int(frame.max()) for frame in frames), str(path))
 
     def read() -> Frames:
         for i, frame in enumerate(frames):
@@ -455,7 +474,7 @@ def _array(path: Path, declared: Declared) -> FrameSource:
             yield np.asarray(frame, np.float32 if frame.dtype.kind == "f" else None), None, f"#{i}"
 
     (height, width), has = frames.shape[1:3], own is not None
-    return FrameSource(path, height, width, len(frames), read, has, levels=levels, notes=notes, times_ns=own)
+    return FrameSource(path, height, width, len(frames), read, has, notes=notes, times_ns=own)
 
 
 def _recording(path: Path, declared: Declared) -> FrameSource:

@@ -67,6 +67,10 @@ class _Held:
             raise AssetError(f"attribute '{name}' holds neither numbers nor text", where=str(self._path))
         return self._held.attrs[name]
 
+    def attributes(self) -> list[str]:
+        """Return the names of all attributes."""
+        return list(self._held.attrs)
+
 
 class Data(_Held):
     """A data set of a file that anybody may have written. What it says of itself is there at once; a value is decoded

@@ -26,6 +26,7 @@ from blinkgl.io.tables import (
     TableReader,
     choose,
     named_columns,
+    not_read,
     table_of_columns,
     table_of_records,
     table_of_rows,
@@ -127,7 +128,8 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
         columns,
         str(path),
         heading=f"t [{units}]" if isinstance(units, str) else heading,
-        offset=_number(file, "t_offset", path) or 0,
+        offset=next((n for holder in (group, file) if (n := _number(holder, "t_offset", path))), 0),
+        notes=_notes(file, group, columns["t"]),
         size=_size(file, group, path),
         place=place,
         **({} if isinstance(units, str) else layout),
@@ -143,6 +145,12 @@ def _value(holder: Any, name: str, path: Path) -> np.ndarray | None:
 
 
 _FEW = 16
+_USED = {*_SIZES, "height", "width", "t_offset", "unit", "units"}
+
+
+def _notes(file: Hdf5File, group: Group, t: Data) -> list[str]:
+    names = {*group.data(), *file.data(), *(name for held in (file, group, t) for name in held.attributes())}
+    return not_read(names, _USED)
 
 
 def _number(holder: Any, name: str, path: Path) -> Any:

@@ -20,6 +20,7 @@ import numpy as np
 from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.reading import Damage
 from blinkgl.io.records import decoding, input_errors
 from blinkgl.io.sizes import check_claim, most_unpacked
 from blinkgl.machine.closing import Closing
@@ -255,13 +256,13 @@ def read_png(path: str | os.PathLike) -> np.ndarray:
 def decode_image(data: bytes, path: str | os.PathLike) -> np.ndarray:
     """Return :func:`read_png` of bytes already read."""
     if (problem := _image_problem(data)) is not None:
-        raise AssetError(problem, where=str(path))
+        raise Damage(problem, where=str(path))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
-        raise AssetError("cannot decode image (corrupt or truncated)", where=str(path))
+        raise Damage("cannot decode image (corrupt or truncated)", where=str(path))
     return image
 
 

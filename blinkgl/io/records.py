@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
 
-from blinkgl.errors import AssetError, ConfigError
+from blinkgl.errors import AssetError, BlinkGLError
 
 MAX_RECORD_BYTES = 512 << 20
 MAX_NAME_BYTES = 1024
@@ -50,7 +50,7 @@ def decoding(path: str | os.PathLike, problem: str, kind: type[AssetError] = Ass
     line."""
     try:
         yield
-    except (AssetError, ConfigError):
+    except BlinkGLError:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:160] or type(error).__name__

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from blinkgl.io.columns import events_of, joined
 from blinkgl.io.evt import HIGH, START, UNTIMED, decode, state_lines
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen, listed
 from blinkgl.io.records import decoding
-from blinkgl.io.sizes import unpacked
+from blinkgl.io.sizes import bounded, unpacked
 from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
 
@@ -64,6 +64,11 @@ def typestore(ros2: bool) -> Any:
     return store
 
 
+_UNSUSPECTED = 1 << 26
+"""Bytes that a chunk, a message or a file of a bag may unpack to, however small it is: recorders write chunks of less
+than a megabyte."""
+
+
 @functools.cache
 def _limited() -> None:
     """Give the unpackers of rosbags a limit: they unpack as much as a chunk holds, in 5 kB the events of a gigabyte."""
@@ -73,15 +78,23 @@ def _limited() -> None:
     from rosbags.rosbag1.reader import decompressors
     from rosbags.rosbag2 import reader, storage_mcap
 
-    # Recorders write chunks of less than a megabyte.
-    limited = lambda make: lambda data, *_: unpacked(make, data, 1 << 26)
+    limited = lambda make: lambda data, *_: unpacked(make, data, _UNSUSPECTED)
     decompressors.update(bz2=limited(bz2.BZ2Decompressor), lz4=limited(LZ4FrameDecompressor))
     # Versions without it use a library that takes the size that a chunk states.
     library = getattr(reader, "zstd", None)
     zstd = {} if library is None else {"zstd": limited(library.ZstdDecompressor)}
     storage_mcap.DECOMPRESSORS.update(lz4=limited(LZ4FrameDecompressor), **zstd)
-    if library is not None:
-        reader.zstd = SimpleNamespace(decompress=zstd["zstd"], open=library.open)
+    if library is None:
+        return
+
+    @contextlib.contextmanager
+    def opened(file: BinaryIO, mode: str) -> Iterator[SimpleNamespace]:
+        # Of bags that are packed as whole files, which the library unpacks into the temporary folder.
+        with library.open(file, mode) as inner:
+            packed = os.fstat(file.fileno()).st_size
+            yield SimpleNamespace(read=bounded(inner.read, packed, _UNSUSPECTED))
+
+    reader.zstd = SimpleNamespace(decompress=zstd["zstd"], open=opened)
 
 
 class BagReader:

@@ -33,6 +33,21 @@ def unpacked(make: Callable[[], Any], data: bytes, unsuspected: int = _UNSUSPECT
     return b"".join(parts)
 
 
+def bounded(read: Callable[[int], bytes], packed: int, unsuspected: int = _UNSUSPECTED) -> Callable[[int], bytes]:
+    """Return ``read`` of what ``packed`` bytes unpack to, which raises ValueError beyond :func:`most_unpacked`."""
+    left = most_unpacked(packed, unsuspected)
+
+    def within(size: int) -> bytes:
+        nonlocal left
+        data = read(size)
+        left -= len(data)
+        if left < 0:
+            raise ValueError(f"unpacks to more than {_MOST_RATIO} times its size")
+        return data
+
+    return within
+
+
 def check_claim(size: int, where: str, packed: int | None = None) -> None:
     """Check that ``size`` bytes, as a header states them, may be allocated.   packed : bytes in the file that they are
     unpacked from; None: they lie there as they are.

@@ -34,7 +34,7 @@ class Undeclared(EventDataError):
 
 
 _SECONDS = re.compile(r"[-+]?\d+\.(\d+)([eE][-+]?\d+)?")
-_PLACES = 6
+PLACES = 6
 """The Event Camera Dataset's and TUM's lists: seconds with a point, of which some have six places or more, or names."""
 
 
@@ -81,12 +81,17 @@ def read_timestamps(
     stated = unit or _stated(titles, columns, heading, path) or usual
     if stated is not None:
         return Stamps(nanoseconds(times, stated), names)
-    points = [_SECONDS.fullmatch(text) for text in texts]
-    places = max(len(point[1]) for point in points if point) if None not in points else 0
-    if places and (names is not None or places >= _PLACES) and len(columns) == 1:
+    places = places_of(texts)
+    if places and (names is not None or places >= PLACES) and len(columns) == 1:
         note = f"{path.name}: read as the Event Camera Dataset's and TUM's lists: seconds with a point"
         return Stamps(nanoseconds(times, "s"), names, note)
     raise _undeclared(str(path), any("." in text for text in texts))
+
+
+def places_of(times: Sequence[str]) -> int:
+    """Return the most places that seconds with a point have; 0: some time has no point, or is no number."""
+    points = [_SECONDS.fullmatch(text) for text in times]
+    return max((len(point[1]) for point in points if point), default=0) if None not in points else 0
 
 
 _MICROSECONDS = re.compile(r"[-+]?\d{1,16}")

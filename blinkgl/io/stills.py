@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import logging
 import re
 import warnings
@@ -112,6 +113,11 @@ class Stills:
         else:
             data = _bytes(self.path)
             by_opencv = suffix == ".hdr" or _deep(data)
+            further = len(data) - _end_of_pnm(data)
+            if further < 0:
+                raise Damage("cannot decode image (truncated)", where=str(self.path), value=f"{-further} bytes too few")
+            if re.match(rb"\s*P[456]\s", data[-further:] if further else b""):
+                self._say("left out: the pictures behind the first of a file")
             image = _by_opencv(data, self.path) if by_opencv else _by_pillow(data, self.path, self.notes)
             yield upright(image, self._orientation(data))
 
@@ -134,9 +140,8 @@ class Stills:
 
     def _animation(self, first: int) -> Iterator[np.ndarray]:
         with _pillow(self.path, self.path) as image, _decoding(self.path):
-            for k, page in enumerate(ImageSequence.Iterator(image)):
-                if k >= first:
-                    yield np.asarray(page.convert("RGBA"))
+            for page in itertools.islice(ImageSequence.Iterator(image), first + _hidden(image), None):
+                yield np.asarray(page if page.mode == "I;16" else page.convert("RGBA"))
 
     def _tiff_pages(self, first: int) -> Iterator[np.ndarray]:
         with _opened_tiff(self.path) as file:
@@ -175,8 +180,9 @@ class Stills:
         if image.ndim == 3 and page.axes == "SYX":
             image = np.moveaxis(image, 0, -1)
         if page.photometric == 3 and page.colormap is not None and image.ndim == 2:
-            # A TIFF palette has 16 bits, 257 times a code of 8 bits.
-            return np.moveaxis(page.colormap, 0, -1)[image] // 257
+            # A TIFF palette has 16 bits, 257 times a code of 8 bits; old writers have 8 bits there, as libtiff knows.
+            palette = page.colormap if page.colormap.max() < 256 else page.colormap // 257
+            return np.moveaxis(palette, 0, -1)[image].astype(np.uint8)
         if page.photometric == 0 and image.dtype.kind in "ub":
             image = ~image if image.dtype == bool else (2 ** _bits(page) - 1) - image
         if image.ndim == 2:
@@ -254,15 +260,21 @@ def _animated(path: Path) -> Stills:
     with _pillow(path, path) as image, _decoding(path):
         if problem := size_problem(*image.size, path.stat().st_size):
             raise AssetError(problem, where=str(path))
-        delays = []
-        for page in ImageSequence.Iterator(image):
+        delays, notes = [], []
+        if image.format == "PNG" and image.mode != "I;16" and _bytes(path, 25)[24] == 16:
+            notes.append("left out: the lower 8 of the 16 bits of an animation in colour")
+        for page in itertools.islice(ImageSequence.Iterator(image), _hidden(image), None):
             if image.format == "WEBP":
                 page.load()  # its delay is known then
             delays.append(float(page.info.get("duration", 0) or 0))
-    notes = []
     if zero := sum(delay <= 0 for delay in delays):
         notes.append(f"{zero} frames state no delay: {_UNSTATED_MS} ms each, as browsers show them (--fps)")
     return Stills(path, len(delays), [delay if delay > 0 else _UNSTATED_MS for delay in delays], notes=notes)
+
+
+def _hidden(image: Image.Image) -> int:
+    """Return how many of the pages are no part of an animation: the one that programs show which know none (APNG)."""
+    return int(getattr(image, "default_image", False))
 
 
 @contextlib.contextmanager
@@ -295,9 +307,11 @@ def _tiff(path: Path) -> Stills:
             raise AssetError(problem, where=str(path))
         _check_tags(page, path)
         stated, channels = _interval_ms(file, notes)
-        if ("C" in series.axes and len(series.shape) > 3) or channels > 1:
+        # What the pages are, besides rows, columns and samples.
+        along = [axis for axis, n in zip(series.axes, series.shape) if axis not in "YXS" and n > 1]
+        if "C" in along or len(along) > 1 or channels > 1:
             raise AssetError(
-                "channels of a microscope as pages",
+                "channels or slices of a microscope as pages",
                 where=str(path),
                 value=f"{series.axes} {series.shape}",
                 accepted="pages that are frames",
@@ -328,6 +342,7 @@ def _check_tags(page: Any, path: Path) -> None:
          "unsigned up to 16 bits, signed 16, float 16 to 64"),
         ("Orientation", _tag(page, _ORIENTATION), (_tag(page, _ORIENTATION) or 1) in range(1, 9), "1 to 8"),
         ("ExtraSamples", page.extrasamples, all(int(code) in _EXTRA for code in page.extrasamples), list(_EXTRA)),
+        ("white is zero with SampleFormat", sorted(kinds), page.photometric != 0 or kinds == {1}, 1),
         ("bits of CMYK or YCbCr", bits, page.photometric not in _CONVERTED or bits == 8, 8),
     )  # fmt: skip
     for name, value, known, accepted in held:
@@ -336,10 +351,11 @@ def _check_tags(page: Any, path: Path) -> None:
 
 
 def _interval_ms(file: Any, notes: list[str]) -> tuple[float | None, int]:
-    """Return the ms between pages that ImageJ's or OME's description states, and OME's number of channels."""
+    """Return the ms between pages that ImageJ's or OME's description states, and OME's number of pictures a time."""
     meta, text = file.imagej_metadata or {}, str(file.pages[0].description or "")
     pixels = dict(re.findall(r'(\w+)="([^"]*)"', next(iter(re.findall(r"<Pixels\b[^>]*>", text)), "")))
-    channels = int(pixels["SizeC"]) if re.fullmatch(r"\d{1,4}", pixels.get("SizeC", "")) else 1
+    sizes = {k: int(pixels.get(f"Size{k}", "1")) for k in "CZT" if pixels.get(f"Size{k}", "1").isdigit()}
+    channels = sizes.get("C", 1) * (sizes.get("Z", 1) if sizes.get("T", 1) > 1 else 1)
     value, unit = meta.get("finterval") or (1 / float(meta["fps"]) if meta.get("fps") else None), meta.get("tunit", "s")
     if "TimeIncrement" in pixels:
         value, unit = pixels["TimeIncrement"], pixels.get("TimeIncrementUnit", "s")
@@ -354,10 +370,24 @@ def _interval_ms(file: Any, notes: list[str]) -> tuple[float | None, int]:
     return (interval if 0 < interval < float("inf") else None), channels
 
 
+_PNM = re.compile(rb"P([2356])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,5})\s")
+"""Kind, width, height and maximum of a picture; comments may stand between them."""
+
+
 def _deep(data: bytes) -> bool:
     """Return whether a picture has bits that Pillow would reduce to 8: PNG of 16 bits, PNM of a larger maximum."""
-    heading = re.match(rb"P[2356]\s+\d+\s+\d+\s+(\d{1,5})\s", re.sub(rb"#[^\n]*", b"", data[:4096]))
-    return (data[:4] == b"\x89PNG" and data[24:25] == b"\x10") or bool(heading and int(heading[1]) > 255)
+    heading = _PNM.match(data)
+    return (data[:4] == b"\x89PNG" and data[24:25] == b"\x10") or bool(heading and int(heading[4]) > 255)
+
+
+def _end_of_pnm(data: bytes) -> int:
+    """Return where the samples of a binary PNM end; of any other picture, where the data do."""
+    heading = _PNM.match(data)
+    width, height = (int(heading[2]), int(heading[3])) if heading else (0, 0)
+    if not heading or heading[1] not in b"56" or size_problem(width, height, len(data)):  # whoever decodes it says that
+        return len(data)
+    samples = width * height * (3 if heading[1] == b"6" else 1)
+    return heading.end() + samples * (2 if int(heading[4]) > 255 else 1)
 
 
 def _by_opencv(data: bytes, path: Path) -> np.ndarray:
@@ -365,6 +395,14 @@ def _by_opencv(data: bytes, path: Path) -> np.ndarray:
     # OpenCV's order of channels is BGR.
     if data[:4] == b"\x89PNG" and data[25:26] == b"\x04":  # grey with alpha, of which OpenCV makes colour
         return image[..., [0, 3]]
+    if data[:4] == b"\x89PNG" and image.ndim == 2:
+        # The code of grey that is transparent, which OpenCV leaves out.
+        see_through = [int.from_bytes(body, "big") for _, kind, body in png_chunks(data) if kind == b"tRNS"]
+        return (
+            np.dstack([image, np.where(image == see_through[0], 0, 65535).astype(image.dtype)])
+            if see_through
+            else image
+        )
     return image if image.ndim == 2 else image[..., [2, 1, 0, 3][: image.shape[2]]]
 
 

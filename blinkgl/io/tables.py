@@ -8,16 +8,16 @@ user as the options to declare, and not read.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.clock import NANOSECONDS, named_unit
-from blinkgl.io.columns import events_of, microseconds
+from blinkgl.io.columns import events_of, microseconds, proposed_polarity
 from blinkgl.io.reading import EventReading, chosen
 from blinkgl.types.events import Events
 
@@ -28,6 +28,10 @@ _NAMES = {
     "p": "p ps pol pols polarity polarities on",
 }
 _SLOT = {word: slot for slot, words in _NAMES.items() for word in words.split()}
+_STATES = re.compile(
+    r"(.*[_ ])?(size|resolution|shape|geometry|offset|start|t0|scale|units?|width|height|origin)([_ ].*)?|h|w", re.I
+)
+"""Names beside the columns that may say something about the events."""
 _SAMPLE = 1 << 16
 """Rows that a proposal is made from."""
 _NANOSECONDS_FROM = 1e17
@@ -61,6 +65,13 @@ def named_columns(names: Iterable[str], reading: EventReading, where: str) -> di
             )
     columns = {slot: slot if slot in all_ else all_[0] for slot, all_ in named.items() if slot not in reading.named}
     return columns | {slot: name for slot, name in reading.named.items() if name in names}
+
+
+def not_read(names: Iterable[str], known: Collection[str]) -> list[str]:
+    """Return the line that says which of the ``names`` beside the columns seem to state something that no reader
+    knows."""
+    left = sorted({name for name in names if name not in known and _STATES.fullmatch(name)})
+    return [f"left out: {', '.join(left)}, whose meaning is not known (--size, --time-unit, --origin)"] if left else []
 
 
 def proposal(rows: np.ndarray | None, times: np.ndarray | None = None) -> str:
@@ -102,7 +113,8 @@ class Table:
     """Four columns in a file.   read : rows of a slice, "x", "y", "t", "p" and perhaps "cause" -> (N,) numbers.
     count : rows.   heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to
     t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   layout :
-    the name of the layout by which its unit is known; "": the file states it, or nothing does."""
+    the name of the layout by which its unit is known; "": the file states it, or nothing does.   per_px : steps of x
+    and y in a pixel.   notes : lines for the user."""
 
     read: Callable[[slice], dict[str, np.ndarray]]
     count: int
@@ -112,6 +124,8 @@ class Table:
     size: tuple[int, int] | None = None
     place: str = ""
     layout: str = ""
+    per_px: int = 1
+    notes: Sequence[str] = ()
 
 
 def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Table:
@@ -192,7 +206,7 @@ class TableReader:
 
     def __init__(self, path: Path, reading: EventReading, table: Table):
         self.path, self._keep, self._polarity, self.unread = path, reading.keep, reading.polarity, 0
-        self._table, self.notes = table, []
+        self._table, self.notes = table, [*table.notes]
         self.height, self.width = table.size or (None, None)
         first = table.read(slice(0, 1))
         self.count, self.causes = table.count, "cause" in first
@@ -209,13 +223,21 @@ class TableReader:
         """Yield all events in pieces of ``size``. Raises EventDataError, naming the event, for values that are none."""
         where, self.unread, unit = str(self.path), 0, NANOSECONDS[self.unit]
         offset = int(microseconds(np.array([self._table.offset]), where, 0, unit)[0])
+        off: set[int] = set()
         for first in range(0, self.count, size):
             columns = self._table.read(slice(first, min(self.count, first + size)))
             if self._keep:
                 columns = self._whole(columns)
             t = microseconds(columns["t"], where, first, unit)
-            x, y, p, cause = columns["x"], columns["y"], columns["p"], columns.get("cause")
+            x, y = (columns[side] if self._table.per_px == 1 else columns[side] / self._table.per_px for side in "xy")
+            p, cause = columns["p"], columns.get("cause")
             polarity = self._polarity
+            if polarity is None and len(p) and p.dtype.kind in "if":
+                # OFF is 0 or -1; the second of them in a file is another code.
+                off |= {-1, 0} if p.min() < 0 and (p == 0).any() else {min(int(p.min()), 1)}
+                if off >= {-1, 0}:
+                    accepted = f"0 and 1, or -1 and 1{proposed_polarity(p)}"
+                    raise EventDataError("polarities -1 and 0 in one file", where=where, accepted=accepted)
             yield events_of(x, y, t, p, where, first, cause=cause, offset=offset, signed=True, polarity=polarity)
         if self.count and self.unread == self.count:
             raise AssetError("no row is an event", where=where, accepted="x, y, t, p (--columns)")

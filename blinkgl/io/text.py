@@ -112,6 +112,12 @@ class TextReader:
             return False
         if not text or not (comment or re.match(r"[\s,;\"]*(?!(nan|inf|true|false)\b)[a-z]", text, re.I)):
             return bool(text)
+        if "\r" in text:
+            raise AssetError(
+                "lines that end with carriage returns alone",
+                where=str(self.path),
+                accepted="lines that end with newlines",
+            )
         names = _names(text.lstrip("#% "))
         declared = {name.lower(): slot for slot, name in self._reading.named.items()}
         bare = [name.partition("@")[0] for name in names]
@@ -120,6 +126,8 @@ class TextReader:
         named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
         if not self._order and named:
             self._order, self._unit = order, self._heading(dict(zip(order, names)))
+            if others := [name for name, slot in zip(names, order) if slot == "_" and name]:
+                self.notes.append(f"left out: columns that are none of t, x, y, p: {', '.join(others)}")
         elif not comment and not self._reading.columns:
             raise AssetError(
                 f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
@@ -149,6 +157,8 @@ class TextReader:
                 if suffix == ".zip":
                     archive = stack.enter_context(zipfile.ZipFile(self.path))
                     names = [n for n in archive.namelist() if n.lower().endswith((".txt", ".csv"))]
+                    if not names:
+                        raise AssetError("no text in the zip", where=str(self.path), value=archive.namelist()[:8])
                     name = names[chosen(self._reading.stream, names, str(self.path), "texts in the zip")]
                     yield cast(BinaryIO, stack.enter_context(archive.open(name)))
                 else:
@@ -211,11 +221,11 @@ class TextReader:
 
     def _refused(self, line: int, value: str, why: int) -> AssetError:
         p = self._order.index("p")
-        codes = proposed_polarity(self._sample[:, p]) if p < self._sample.shape[1] else "--polarity OFF/ON"
+        codes = proposed_polarity(self._sample[:, p : p + 1])
         order = " ".join(self._order)
         problem, accepted = {
             _NOT_A_ROW: ("is not an event", f"{order} (--columns)"),
-            _POLARITY: ("has a polarity that is not known", f"0/1, -1/1 or True/False as {order}; or {codes}"),
+            _POLARITY: ("has a polarity that is not known", f"0/1, -1/1 or True/False as {order}{codes}"),
             _LAYOUT: (
                 "is not as the lines before it, the Event Camera Dataset's: seconds with a point, x, y, 0 or 1",
                 "try --columns and --time-unit",
@@ -404,6 +414,9 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep, ecd):
             on = values[3] == pair[1]
             fits = field == len(places) and 0 <= values[1] <= 65535 and 0 <= values[2] <= 65535
             if wrong == 0 and fits and (on or values[3] == pair[0] or values[3] == pair[2]):
+                if not on:
+                    # 0 or -1: the first OFF of a file decides which.
+                    pair[0] = pair[2] = values[3]
                 t[n], x[n], y[n], p[n] = values[0], values[1], values[2], on
                 n += 1
                 i, line = i + 1, line + 1

@@ -7,8 +7,9 @@
     colmap          images.txt: id qw qx qy qz x y z …   the world in the camera; a rate
     nerf            transforms.json: T_world_cam         OpenGL's axes; "time" of each frame, or a rate
 
-A heading is believed before all of these (ESIM's has commas, ns and w last). What neither it nor the user says is
-guessed from the whole file, for order and unit each by itself, and the notes say so.
+A heading is believed before all of these. What neither it nor the user says is asked for, except in layouts that are
+known by name, which the notes say: TUM's, the Event Camera Dataset's and ORB-SLAM's rows (seconds with a point, of
+which some have six places), TUM's, EuRoC's and ESIM's headings.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,22 +26,16 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import write_whole
-from blinkgl.io.clock import NANOSECONDS, checked_unit, named_unit, nanoseconds
+from blinkgl.io.clock import checked_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding
 from blinkgl.io.rows import read_rows, titles_of
-from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.stamps import PLACES, places_of, read_timestamps
 from blinkgl.types.numbers import exact, is_number
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")
 AXES = ("opencv", "opengl", "ned")
 MAPS_FROM = ("camera", "world")
-_TYPICAL_HZ = 100.0
-"""Frame rate nearest to which, as a ratio, a guessed unit brings the frames."""
-_EPOCH_S = (9.4e8, 4.1e9)
-"""Seconds since 1970 of the years 2000 to 2099: times of a clock that counts from there betray their unit."""
-_LEAP = 500.0
-"""Ratio of neighbouring steps from which on a list of times is taken to be in two units."""
 _GAP = 20
 """A step this many times the usual one is a gap."""
 _COLUMNS = {
@@ -56,15 +50,19 @@ _TO_OPENCV = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ned": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
 }
-_SURE = 0.9
-"""Mean size of the component of a quaternion that is taken for w where nothing says which is."""
+_HEADINGS = {
+    "timestamp tx ty tz qx qy qz qw": ("TUM's", "s"), "timestamp,x,y,z,qx,qy,qz,qw": ("ESIM's", "ns"),
+    "timestamp,p_rs_r_x[m],p_rs_r_y[m],p_rs_r_z[m],q_rs_w[],q_rs_x[],q_rs_y[],q_rs_z[]": ("EuRoC's", "ns"),
+}  # fmt: skip
+"""Beginnings of headings that state no unit -> whose they are, and their unit. Of "s" every time has a point, of "ns"
+none."""
 _FASTEST = 60.0
 """units/s of a camera from which on a note asks for the unit."""
 
 
 @dataclass(frozen=True)
 class PoseFile:
-    """What a user declares of a trajectory; None: what the file says, else a guess that is said.
+    """What a user declares of a trajectory; None: what the file says.
 
     form : one of ``FORMS``.   columns : names of the columns, "t x y z qw qx qy qz"; "-" is left out.   time_unit :
     "s", "ms", "us", "ns".   maps_from : "camera" where poses map from the camera to the world, "world" where they map
@@ -115,10 +113,11 @@ def read_trajectory(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) int64 ns and poses (N, 4, 4) float64 T_world_body, N >= 2, with OpenCV's axes.
 
-    notes : gets what was guessed, a line each.
+    notes : gets what was recognised by a layout's name, a line each.
 
     Raises AssetError, naming the line: a wrong count of numbers, not finite, times that do not increase, a quaternion
-    of length other than 1, a gap of 20 usual steps, no times; ConfigError as :class:`PoseFile`."""
+    of length other than 1, a gap of 20 usual steps, no times, an order or a unit that has to be declared; ConfigError
+    as :class:`PoseFile`."""
     path = Path(path)
     with decoding(path, "cannot be read"):
         text = path.read_text(encoding="utf-8-sig")
@@ -172,16 +171,13 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     if not rows:
         return _Table(None, np.empty((0, 3)), Rotation.identity(), [])
     if not roles:
-        roles = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
-        numbers = _numbers(path, rows, list(range(4, 8)), " ".join(roles))
-        mean = np.abs(numbers).mean(axis=0)
-        # w is the largest near the start of most trajectories; EuRoC's states have it first and go on with speeds.
-        first = len(rows[0][1]) > 8 or (mean[0] > _SURE > mean[3])
-        if first:
-            roles = _COLUMNS["euroc"].split()
-        order = "qw qx qy qz" if first else "qx qy qz qw"
-        other = _COLUMNS["tum" if first else "euroc"]
-        notes.append(f"{path.name}: quaternions taken as {order} (columns: {other}, if that is wrong)")
+        roles = _COLUMNS["tum"].split()
+        if len(rows[0][1]) >= 8 and places_of([fields[0] for _, fields in rows]) < PLACES:
+            raise AssetError(
+                "no heading names the columns of poses",
+                where=str(path),
+                accepted=f"try form: tum or euroc, or columns: {_COLUMNS['tum']} and time_unit: s, ms, us or ns",
+            )
     at = {role: k for k, role in enumerate(roles) if role != "-"}
     wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
     most = max((at[role] for role in wanted), default=0)
@@ -193,8 +189,20 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     lines = [number for number, _ in rows]
     times = [fields[at["t"]] for _, fields in rows] if "t" in at else None
     stated = named_unit(titles[at["t"]]) if "t" in at and at["t"] < len(titles) and len(titles) >= len(roles) else None
-    unit = stated or (_UNITS.get(declared.form or ""))
+    unit = stated or _UNITS.get(declared.form or "")
+    if times is not None and not (unit or declared.time_unit) and (known := _known_layout(heading, times)):
+        notes.append(f"{path.name}: read as {known[0]} poses: {' '.join(roles)}, {known[1]}")
+        unit = known[1]
     return _Table(times, numbers[:, :3], _rotations(numbers[:, 3:], lines, path), lines, unit, notes)
+
+
+def _known_layout(heading: str, times: Sequence[str]) -> tuple[str, str] | None:
+    """Return whose layout a heading or the times show, and its unit; None: none that is known."""
+    bare, places = re.sub(r"\s*([,\[\]])\s*", r"\1", heading.strip("# \t").lower()), places_of(times)
+    for begin, known in _HEADINGS.items():
+        if bare.startswith(begin) and (places > 0 if known[1] == "s" else all(map(str.isdigit, times))):
+            return known
+    return ("TUM's or the Event Camera Dataset's", "s") if places >= PLACES else None
 
 
 def _roles(titles: Sequence[str]) -> list[str]:
@@ -336,13 +344,11 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
             if not is_number(text):
                 raise _no_pose(path, number, [text], "a time first, a finite number")
         times = list(map(exact, texts))
-        # Two equal times are refused in a moment, whatever the unit.
-        stated = table.unit or ("s" if any(a == b for a, b in pairwise(texts)) else None)
-        unit = declared.time_unit or stated
+        unit = declared.time_unit or table.unit
         if unit is None:
-            unit = _likely_unit(np.array(times, np.float64), str(path))
-            others = ", ".join(other for other in NANOSECONDS if other != unit)
-            notes.append(f"{path.name}: times taken as {unit} (time_unit: {others} if that is wrong)")
+            proposed = "s" if any("." in text for text in texts) else "ns" if max(map(abs, times)) > 1e17 else "us"
+            accepted = f"try time_unit: {proposed} if that is right"
+            raise AssetError("no unit of the times is stated", where=str(path), value=texts[0], accepted=accepted)
         values = nanoseconds(times, unit)
     # The difference of any two times below 2^62 fits into an int64.
     if (most := max(map(abs, values))) >= 2**62:
@@ -351,43 +357,6 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
     t_ns = np.array(values, np.int64)
     _check_times(t_ns, table.lines, path)
     return t_ns
-
-
-def _likely_unit(values: np.ndarray, where: str) -> str:
-    """Return the unit in which times of poses, (N,) numbers of an unknown unit, make sense together.
-
-    Times within this century's seconds since 1970 in one unit are in that unit; else the unit is the one in which the
-    median step is nearest to that of 100 Hz. Raises AssetError: steps that only two units explain."""
-    values = np.asarray(values, np.float64)
-    steps = np.diff(values)
-    if not len(steps):
-        # A single time has no step: a fraction is of seconds, a whole number is in µs.
-        return "s" if (values % 1).any() else "us"
-    size = np.abs(values)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        leaps = np.flatnonzero(np.maximum(size[1:], size[:-1]) > _LEAP * np.minimum(size[1:], size[:-1]))
-    for k in leaps[leaps > 0]:
-        # A pause leaps, too, but the steps after it are as long as those before.
-        before, after = (
-            np.median(np.abs(steps[:k])),
-            np.median(np.abs(steps[k + 1 :])) if k + 1 < len(steps) else np.inf,
-        )
-        if max(before, after) > _LEAP * min(before, after):
-            raise AssetError(
-                "times in two units",
-                where=f"{where}: frames {k} and {k + 1}",
-                value=values[k : k + 2].tolist(),
-                accepted="one unit for all, or time_unit: s, ms, us or ns",
-            )
-    positive = steps[steps > 0]
-    usual = float(np.median(positive)) if len(positive) else 1.0
-    # Decades between the frame rate that a unit gives and the typical one; a time of this century counts for 2.5.
-    likely = {
-        unit: abs(np.log10(1e9 / (usual * ns * _TYPICAL_HZ)))
-        - (2.5 if _EPOCH_S[0] <= values[0] * ns / 1e9 <= _EPOCH_S[1] else 0)
-        for unit, ns in NANOSECONDS.items()
-    }
-    return min(likely, key=likely.__getitem__)
 
 
 def _check_times(t_ns: np.ndarray, line: list[int], path: Path) -> None:

@@ -65,9 +65,9 @@ _RAW = {"h264", "hevc", "vvc", "mpegvideo", "m4v"}
 _PACKED = {
     "nv12": "yuv420p", "nv21": "yuv420p", "nv16": "yuv422p", "yuyv422": "yuv422p", "uyvy422": "yuv422p",
     "yvyu422": "yuv422p", "p010le": "yuv420p10le", "p210le": "yuv422p10le", "y210le": "yuv422p10le",
-    "v210": "yuv422p10le",
+    "v210": "yuv422p10le", "yuv411p": "yuv444p", "yuvj411p": "yuvj444p", "yuv410p": "yuv444p", "uyyvyy411": "yuv444p",
 }  # fmt: skip
-"""Formats with interleaved samples, by the planar one with the same samples."""
+"""Formats with interleaved samples, or chroma of every fourth column, by the planar one that holds them."""
 
 
 class VideoWriter(Finishing):
@@ -297,6 +297,8 @@ class VideoReader:
         planar = name.startswith(("yuv", "yuvj", "gbr", "gray")) and name.endswith(("p", "le", "gray")) and bits <= 16
         if bits == 32 or (bits == 16 and "f16" in name):
             return floats_of(frame)
+        if name in _PACKED and known(int(frame.colorspace)):
+            return self._codes(frame.reformat(format=_PACKED[name]))
         if planar and (self._by_levels or known(int(frame.colorspace))):
             planes = [samples_of(plane, bits) for plane in frame.planes]
             if self._grey:
@@ -312,8 +314,6 @@ class VideoReader:
                 return rgb
             alpha = planes[3] if bits == 8 else np.rint(planes[3] * (65535.0 / (2**bits - 1))).astype(np.uint16)
             return np.dstack([rgb, alpha])
-        if not self._by_levels and (name in _PACKED) and known(int(frame.colorspace)):
-            return self._codes(frame.reformat(format=_PACKED[name]))
         wanted = ("rgba" if self._alpha else "rgb24") if bits <= 8 else "rgba64le" if self._alpha else "rgb48le"
         if self._grey and bits <= 8:
             wanted = "rgba" if self._alpha else "gray"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.errors import AssetError
 from blinkgl.machine.kernels import kernel
 
 # Red and blue weights of luma, by the matrix' number in ITU-T H.273; an unstated one (2) is BT.601's.
@@ -86,8 +87,14 @@ def cut_riff(path: Path) -> str | None:
 def orientation_of(frame: Any) -> tuple[bool, bool, bool]:
     """Return (transposed, mirrored left to right, upside down), in the order of application, by which a frame becomes
     upright: x' = a x + c y, y' = b x + d y of its display matrix (ISO 14496-12, 8.3.2)."""
-    # By its key: what iterating yields differs between versions of PyAV.
-    data = frame.side_data.get("DISPLAYMATRIX")
+    try:
+        # By its key: what iterating yields differs between versions of PyAV.
+        data = frame.side_data.get("DISPLAYMATRIX")
+    except ValueError:
+        # Beside it lies what PyAV has no name for.
+        if frame.rotation:
+            raise AssetError("a turned picture with unknown side data", value=frame.rotation, accepted="0") from None
+        data = None
     if data is None:
         return False, False, False
     # The matrix has nine 32-bit numbers, row by row: a b u, c d v, x y w.

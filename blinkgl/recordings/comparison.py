@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.formats import ENDINGS, EventFile, open_events
-from blinkgl.io.frames import NOTHING, Declared
+from blinkgl.io.formats import ENDINGS, EventFile, ending_of, kind_of_files, open_events
+from blinkgl.io.frames import CALLED, NOTHING, Declared
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel
@@ -195,7 +195,7 @@ def compare(
     Raises EventDataError: frames of another size than a recording, no common time.
     AssetError: unreadable.
     """
-    if b is not None and frames is None and not _is_event_file(b):
+    if b is not None and frames is None and not _is_event_file(Path(b), declared.stream):
         b, frames = None, b
     files = [open_events(p, reading).sized() for p in ((a,) if b is None else (a, b))]
     spans = [_span(f) for f in files]
@@ -404,16 +404,19 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / norm) if norm > 0 else float("nan")
 
 
-def _is_event_file(path) -> bool:
-    path = Path(path)
-    if path.suffix.lower() in (".npy", ".npz") and path.is_file():
-        with contextlib.suppress(AssetError), numpy_errors(path):  # damaged: the reader reports it
-            if path.suffix.lower() == ".npz":
-                with NpzReader(path) as arrays:
-                    return "x" in arrays
+def _is_event_file(path: Path, stream: str | None) -> bool:
+    if kind_of_files(path) or path.is_dir():
+        return kind_of_files(path) is not None
+    with contextlib.suppress(AssetError), numpy_errors(path):  # damaged: the reader reports it
+        # Frames have three axes or more.
+        if path.suffix.lower() == ".npz":
+            with NpzReader(path) as arrays:
+                held = arrays.shapes()[0]
+                return not any(len(held[name][0]) >= 3 for name in (*CALLED, stream) if name in held)
+        if path.suffix.lower() == ".npy":
             with open(path, "rb") as file:
-                return "x" in (npy_header(file, path.stat().st_size, str(path))[2].names or ())
-    return path.suffix.lower() in ENDINGS and not path.is_dir()
+                return len(npy_header(file, path.stat().st_size, str(path))[0]) < 3
+    return ending_of(path) in ENDINGS
 
 
 def _spread(values: np.ndarray, lengths: np.ndarray) -> str:

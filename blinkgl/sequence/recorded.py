@@ -20,7 +20,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.io.clock import NANOSECONDS
 from blinkgl.io.flow import READ_ENDINGS, flow_form, read_flow
-from blinkgl.io.frames import IMAGE, read_any_image
+from blinkgl.io.frames import IMAGE, read_any_image, stated_levels
 from blinkgl.io.images import read_npy
 from blinkgl.io.names import series
 from blinkgl.io.stamps import Undeclared, read_timestamps
@@ -362,7 +362,8 @@ class RecordedSequence(SensorSimulation):
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         frames, stated = self._recorded, open_stills(self.files[0])
         assert self.camera is not None
-        levels = None if stated.white is None else (0.0, float(stated.white))
+        ask = frames.white_level is None and frames.range is None and self._kept[0].dtype == np.uint16
+        levels = stated_levels(self.files, ask=ask)
         steps = stepped(
             timed(self._given()),
             self.camera,

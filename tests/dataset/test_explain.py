@@ -217,13 +217,13 @@ def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
     assert explain(load_run(path)).scene["not drawn"] == LINE
 
 
-def test_what_is_guessed_of_a_trajectory_is_said(tmp_path, capsys):
-    """TUM's columns with milliseconds: on the screen as in the manifest."""
-    (tmp_path / "path.txt").write_text("".join(f"{20 * k} {k / 100} 0 0 0 0 0 1\n" for k in range(60)))
+def test_what_is_recognised_of_a_trajectory_is_said(tmp_path, capsys):
+    """TUM's rows without a heading: on the screen as in the manifest."""
+    (tmp_path / "path.txt").write_text("".join(f"{k / 50:.6f} {k / 100} 0 0 0 0 0 1\n" for k in range(60)))
     scene = {**EXPLICIT, "camera": {"trajectory": {"file": "path.txt"}}}
     assert run(str(recipe(tmp_path, scene)), str(tmp_path / "out")) == 0
     said = [line for line in capsys.readouterr().out.splitlines() if "path.txt" in line]
-    assert any("time_unit" in line for line in said) and all(line.startswith("note: path.txt") for line in said)
+    assert any("read as TUM's" in line for line in said) and all(line.startswith("note: path.txt") for line in said)
     (manifest, *_) = sorted((tmp_path / "out").glob("*/*/manifest.json"))
     assert {line.removeprefix("note: ") for line in said} <= set(json.loads(manifest.read_text())["scene_log"])
 

@@ -15,9 +15,10 @@ import yaml
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.errors import ConfigError
+from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.flow import read_flow_png
 from blinkgl.io.images import read_mask
+from blinkgl.sequence_files.sequence_dir import read_manifest
 
 H, W, N, SHIFT = 48, 64, 6, (1.5, 0.5)
 
@@ -138,3 +139,16 @@ def test_a_folder_that_cannot_be_used_is_set_aside(tmp_path, tartan, damage, mes
     outcome = run_dataset(recipe(tmp_path, copy), tmp_path / "out")
     assert list(outcome.set_aside) == ["test/tartan_000001"] and message in outcome.set_aside["test/tartan_000001"]
     assert [p.parent.name for p in (tmp_path / "out").rglob("*.h5")] == ["tartan_000000"]
+
+
+def test_white_of_twelve_bits_in_sixteen_is_asked_for(tmp_path, tartan):
+    """What is proposed is the key that reads them, to the events of the same light in 8 bits."""
+    deep = shutil.copytree(tartan, tmp_path / "deep")
+    for path in deep.rglob("*.png"):
+        cv2.imwrite(str(path), (cv2.imread(str(path)).astype(np.uint32) * 4095 // 255).astype(np.uint16))
+    with pytest.raises(BlinkGLError, match="no code of white is stated .* 4095 of 12 bits.*white_level in a recipe"):
+        run_dataset(recipe(tmp_path, deep), tmp_path / "asked")
+    run_dataset(recipe(tmp_path, deep, white_level=4095), tmp_path / "out")
+    run_dataset(recipe(tmp_path, tartan), tmp_path / "usual")
+    counts = [read_manifest(tmp_path / name / "test/tartan_000000")["events"] for name in ("out", "usual")]
+    assert counts[0] == pytest.approx(counts[1], rel=0.02) and counts[1] > 100

@@ -63,8 +63,8 @@ def test_arrays(tmp_path, dtype, channels):
     np.save(tmp_path / "a.npy", frames)
     np.savez(tmp_path / "a.npz", frames=frames, timestamps_us=[0, 5, 10, 20])
     for source, times in (
-        (open_frames(tmp_path / "a.npy", Declared(fps=10)), [0, 10**8, 2 * 10**8, 3 * 10**8]),
-        (open_frames(tmp_path / "a.npz"), [0, 5000, 10000, 20000]),
+        (open_frames(tmp_path / "a.npy", Declared(fps=10, white_level=65535)), [0, 10**8, 2 * 10**8, 3 * 10**8]),
+        (open_frames(tmp_path / "a.npz", Declared(white_level=65535)), [0, 5000, 10000, 20000]),
     ):
         got = list(source)
         assert [t for _, t, _ in got] == times

@@ -98,7 +98,8 @@ def bag(path: Path, form: str) -> None:
     from rosbags import rosbag2
 
     plugin = rosbag2.StoragePlugin.SQLITE3 if form == "sqlite" else rosbag2.StoragePlugin.MCAP
-    mode = rosbag2.CompressionMode.STORAGE if form == "mcap chunks" else rosbag2.CompressionMode.MESSAGE
+    modes = {"mcap chunks": rosbag2.CompressionMode.STORAGE, "mcap file": rosbag2.CompressionMode.FILE}
+    mode = modes.get(form, rosbag2.CompressionMode.MESSAGE)
     writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
     writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
     with writer:
@@ -165,6 +166,7 @@ CLAIMS = {
     "lz4.bag": (lambda p: bag(p, "LZ4"), events, f"lz4.bag: damaged bag: {PACKED}"),
     "sqlite": (lambda p: bag(p, "sqlite"), events, f"sqlite: damaged bag: {PACKED}"),
     "mcap messages": (lambda p: bag(p, "mcap"), events, f"damaged bag: {PACKED}"),
+    "mcap file": (lambda p: bag(p, "mcap file"), events, f"damaged bag: {PACKED}"),
     "mcap chunks": (lambda p: bag(p, "mcap chunks"), events, f"damaged bag: {PACKED}"),
     "a.mov": (mov, frames, "video too large .got '16000x16000'.; expected at most 64 Mpx a frame|Invalid argument"),
     "a.y4m": (lambda p: p.write_bytes(Y4M), frames, "video too large|cannot read video"),

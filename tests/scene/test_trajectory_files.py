@@ -40,7 +40,9 @@ def circle(t):
 
 def euroc_csv(t_ns, T):
     x, y, z, w = Rotation.from_matrix(T[:, :3, :3]).as_quat().T
-    rows = ["#timestamp, p_RS_R_x [m], p_y, p_z, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x"]
+    rows = [
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x"
+    ]
     rows += [
         f"{t},{a:.12f},{b:.12f},{c:.12f},{q[0]:.12f},{q[1]:.12f},{q[2]:.12f},{q[3]:.12f},0.5"
         for t, (a, b, c), q in zip(t_ns.tolist(), T[:, :3, 3], zip(w, x, y, z))
@@ -106,25 +108,53 @@ def test_a_heading_says_order_and_unit_whatever_separates(tmp_path, titles, orde
     (tmp_path / "t.txt").write_text(table(titles.format(f" [{unit}]"), rows, separator))
     t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
     assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7) and notes == []
-    (tmp_path / "t.txt").write_text(table(titles.format(""), rows, separator))
-    t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
-    assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7)
-    assert len(notes) == 1 and f"times taken as {unit}" in notes[0] and "time_unit:" in notes[0]
+    # Without a unit: asked for, and what is declared counts.
+    times = np.round(T_S * 1e9).astype(np.int64) * int(scale) // 10**9 if unit != "s" else np.round(T_S, 2)
+    text = "\n".join(separator.join([f"{t}", *(f"{v:.9f}" for v in row)]) for t, row in zip(times, rows[:, 1:]))
+    (tmp_path / "t.txt").write_text(f"{titles.format('')}\n{text}\n")
+    if "p_RS_R_x" not in titles and "# timestamp{}, x" not in titles:
+        with pytest.raises(AssetError, match=r"no unit of the times is stated .*; try time_unit: (s|us) if"):
+            read_trajectory(tmp_path / "t.txt")
+    t_ns, read = read_trajectory(tmp_path / "t.txt", time_unit=unit, notes=notes)
+    assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7) and notes == []
+
+
+ESIM, TUM = "# timestamp, x, y, z, qx, qy, qz, qw", "# ground truth\n# timestamp tx ty tz qx qy qz qw"
+EUROC = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x [m]"
 
 
 @pytest.mark.parametrize(
-    ("order", "said"), [("x y z qx qy qz qw", "qx qy qz qw"), ("x y z qw qx qy qz", "qw qx qy qz")]
+    ("heading", "times", "order", "said"),
+    [
+        (TUM, "{:.4f}", "x y z qx qy qz qw", "TUM's poses"),
+        (TUM, "{:.9f}", "x y z qx qy qz qw", "TUM's poses"),
+        (TUM, "{:.0f}", "x y z qx qy qz qw", None),
+        (ESIM, "ns", "x y z qx qy qz qw", "ESIM's poses"),
+        (ESIM, "{:.6f}", "x y z qx qy qz qw", "the Event Camera Dataset's poses"),
+        (ESIM, "{:.3f}", "x y z qx qy qz qw", None),
+        (EUROC, "ns", "x y z qw qx qy qz", "EuRoC's poses"),
+        ("", "{:.6f}", "x y z qx qy qz qw", "the Event Camera Dataset's poses"),
+        ("", "{:.5f}", "x y z qx qy qz qw", None),
+        ("", "ns", "x y z qx qy qz qw", None),
+        ("", "ns", "x y z qw qx qy qz", None),
+    ],
 )
-def test_without_a_heading_order_and_unit_are_guessed_and_said(tmp_path, order, said):
+def test_layouts_that_are_known_by_name(tmp_path, heading, times, order, said):
+    """All others are asked for, with what to paste, which reads the very file."""
     T, notes = np.tile(np.eye(4), (40, 1, 1)), []
     T[:, 0, 3], T[:, :3, :3] = T_S, Rotation.from_rotvec(np.outer(T_S, (0, 0, 1))).as_matrix()
-    (tmp_path / "t.txt").write_text(table("", np.column_stack([T_S, poses_of(T, order)]), " "))
-    assert np.allclose(read_trajectory(tmp_path / "t.txt", notes=notes)[1], T, atol=1e-7)
-    assert any(f"quaternions taken as {said}" in note and "columns:" in note for note in notes)
-    (other,) = [o for o in ("x y z qx qy qz qw", "x y z qw qx qy qz") if o != order]
-    (tmp_path / "t.txt").write_text(table("", np.column_stack([T_S, poses_of(T, other)]), " "))
-    declared = read_trajectory(tmp_path / "t.txt", columns=f"t {other}", time_unit="s")[1]
-    assert np.allclose(declared, T, atol=1e-7)
+    stamps = [f"{round(t * 1e9)}" if times == "ns" else times.format(t * (1e6 if ".0f" in times else 1)) for t in T_S]
+    rows = [" ".join([stamp, *map("{:.9f}".format, row)]) for stamp, row in zip(stamps, poses_of(T, order))]
+    (tmp_path / "t.txt").write_text("\n".join([heading, *rows]) + "\n")
+    if said is None:
+        with pytest.raises(AssetError, match="no heading names|no unit of the times"):
+            read_trajectory(tmp_path / "t.txt")
+        unit = "ns" if times == "ns" else "us" if ".0f" in times else "s"
+        t_ns, read = read_trajectory(tmp_path / "t.txt", columns=f"t {order}", time_unit=unit)
+    else:
+        t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
+        assert len(notes) == 1 and said in notes[0]
+    assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7)
 
 
 def test_other_programs_files(tmp_path):
@@ -225,22 +255,22 @@ def test_smoothing_takes_noise_away_and_no_line_off_its_way():
     assert np.allclose(smoothed(t_ns, noisy, flipped, 100_000_000)[1].as_matrix(), q.as_matrix(), atol=1e-12)
 
 
-GOOD = "0 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 0 1\n0.3 1 2 3 0 0 0 1\n"
+GOOD = "0.000000 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 0 1\n0.3 1 2 3 0 0 0 1\n"
 
 
 @pytest.mark.parametrize(
     "text, said",
     [
         ("", "no trajectory (got '0 poses')"),
-        ("# only a word\n0 1 2 3 0 0 0 1\n", "no trajectory (got '1 poses')"),
+        ("# only a word\n0.000000 1 2 3 0 0 0 1\n", "no trajectory (got '1 poses')"),
         (GOOD + "0.4 1 2 3 0 0 1\n", "line 5 is no pose"),
         (GOOD + "0.4 1 2 nan 0 0 0 1\n", "line 5 is no pose"),
         (GOOD + "0.4 1 2 x 0 0 0 1\n", "line 5 is no pose"),
         (GOOD + "0.3 1 2 3 0 0 0 1\n", "line 5 is at the time of the one before"),
         (GOOD + "0.25 1 2 3 0 0 0 1\n", "line 5 is before the one before"),
-        (GOOD + "9 1 2 3 0 0 0 1\n", "a gap before line 5"),
+        (GOOD + "9.0 1 2 3 0 0 0 1\n", "a gap before line 5"),
         (GOOD + "0.4 1 2 3 0 0 0 0.5\n", "line 5 has no rotation"),
-        ("0 1 2 3 0 0 0 1\ninf 1 2 3 0 0 0 1\n", "line 2 is no pose"),
+        ("#t[s] x y z qx qy qz qw\n0 1 2 3 0 0 0 1\ninf 1 2 3 0 0 0 1\n", "line 3 is no pose"),
         ("#t [s] x y z qx qy qz qw\n0 1 2 3 0 0 0 1\n10000000 1 2 3 0 0 0 1\n", "another unit of time"),
         (
             "#t_s x y z qx qy qz qw\n1403636579763555584 1 2 3 0 0 0 1\n1403636579763655584 1 2 3 0 0 0 1\n",

@@ -5,6 +5,7 @@ import contextlib
 import json
 import re
 import shutil
+import socket
 import subprocess
 import threading
 import urllib.request
@@ -190,6 +191,62 @@ def test_other_web_sites_cannot_connect():
             assert b"<title>" in page.read()
     finally:
         server.stop()
+
+
+def asked(port: int, head: str, connection: str = "close") -> bytes:
+    """All that the server sends for raw lines of a request."""
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as wire:
+        wire.sendall(f"{head}\r\nConnection: {connection}\r\n\r\n".encode())
+        data = b""
+        while part := wire.recv(1 << 16):
+            data += part
+    return data
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../../setup.cfg", "/..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/assets/../../x",
+     "/.git/config", "/index.html%00.js", "/\\..\\..\\etc\\passwd"],
+)  # fmt: skip
+def test_only_the_page_is_served(made, path):
+    with page_of(made.single) as page:
+        port = page.server.get_port()
+        assert b" 404 " in asked(port, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}").split(b"\r\n")[0]
+
+
+def test_a_rebound_name_gets_the_empty_page_and_nothing_of_a_sequence(made):
+    """A web site whose name leads to this machine has its own origin: it gets viser's page, but no connection."""
+    upgrade = "Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13"
+    with page_of(made.single) as page:
+        port = page.server.get_port()
+        assert made.single.name.encode() not in asked(port, f"GET / HTTP/1.1\r\nHost: evil.example:{port}")
+        for origin in (
+            f"http://evil.example:{port}",
+            "null",
+            "http://localhost:99999999",
+            "file://",
+            "https://localhost:1",
+        ):
+            head = f"GET / HTTP/1.1\r\nHost: evil.example:{port}\r\nOrigin: {origin}\r\n{upgrade}"
+            assert b" 403 " in asked(port, head, "Upgrade").split(b"\r\n")[0], origin
+        twice = f"GET / HTTP/1.1\r\nHost: x\r\nOrigin: http://localhost:1\r\nOrigin: http://evil.example\r\n{upgrade}"
+        assert b" 400 " in asked(port, twice, "Upgrade").split(b"\r\n")[0]
+
+
+MARKUP = "<img src=x onerror=alert(1)>![a](b)"
+
+
+def test_markup_in_names_is_text(made, tmp_path):
+    """On the live page, where viser shows Markdown and HTML as such, and in a saved one."""
+    folder = tmp_path / "train" / MARKUP
+    shutil.copytree(made.single, folder)
+    with page_of(folder) as page:
+        texts = [str(vars(sent)) for sent in page.server._websock_server._broadcast_buffer.message_from_id.values()
+                 if "Markdown" in type(sent).__name__ or "Html" in type(sent).__name__]  # fmt: skip
+        assert texts and all("<img" not in text and "![" not in text for text in texts)
+        assert any("&#60;img" in text for text in texts)
+    assert run(["view", str(folder), "--save", str(tmp_path / "page.html")]) == 0
+    assert "<img src=x" not in (tmp_path / "page.html").read_text()
 
 
 def test_a_port_in_use_is_refused():

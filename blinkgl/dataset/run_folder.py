@@ -332,7 +332,7 @@ class RunFolder:
     def log(self, name: str, text: str) -> None:
         SequenceLog(self.out, name).write(text)
 
-    def write_failures(self, set_aside: dict[str, str], plan: Plan) -> None:
+    def write_failures(self, set_aside: dict[str, str]) -> None:
         """Write the failures of this run, and of earlier runs whose sequences are still incomplete."""
         before = self.read("failed.json") or {}
         still = {name: reason for name, reason in {**before, **set_aside}.items() if self.state(name) != ""}

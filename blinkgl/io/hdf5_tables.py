@@ -134,7 +134,7 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
     )
 
 
-def _value(holder: Any, name: str, path: Path) -> np.ndarray | None:
+def _value(holder: Any, name: str) -> np.ndarray | None:
     """Return the few numbers or the text under a name, a data set or an attribute; None: there is none."""
     data = holder.get(name)
     if not isinstance(data, Data):
@@ -147,7 +147,7 @@ _FEW = 16
 
 def _number(holder: Any, name: str, path: Path) -> Any:
     """Return the number under a name; None: there is none. Raises AssetError: it is none."""
-    value = _value(holder, name, path)
+    value = _value(holder, name)
     if value is not None and (value.size != 1 or value.dtype.kind not in "iuf"):
         raise AssetError(f"'{name}' is no number", where=str(path), value=str(value.shape if value.ndim else value))
     return None if value is None else value.ravel()[0].item()
@@ -161,7 +161,7 @@ def _size(file: Hdf5File, group: Any, path: Path) -> tuple[int, int] | None:
             return height, width
     places = (holder for holder in (group, group.get("calib"), file) if isinstance(holder, Group))
     for holder, name in itertools.product(places, _SIZES):
-        if (value := _value(holder, name, path)) is None:
+        if (value := _value(holder, name)) is None:
             continue
         if value.dtype.kind in "SUO":
             text = value.item() if isinstance(value.item(), str) else value.item().decode("latin-1")

@@ -81,7 +81,7 @@ class Collected:
         return spans
 
 
-def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
+def collect(root: str | Path, *, examples: int = 6) -> Collected:
     """Collect the data of the page. Raises AssetError when there is no data set; unreadable sequences are listed."""
     root = Path(root)
     if not root.is_dir():
@@ -115,7 +115,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         unreadable=unreadable,
         damaged=damaged,
     )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     _sample(collected, rng, examples)
     _parameters(collected, rng)
     return collected

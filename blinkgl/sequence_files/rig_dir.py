@@ -100,10 +100,6 @@ def read_sensors(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
     }
 
 
-read_rig = read_sensors
-"""The former name, for one release: write ``read_sensors``."""
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Files about a lens with distortion: ``rectify_map.h5`` and ``cam_to_cam.yaml`` in DSEC's form, ``camchain.yaml`` in
 # Kalibr's.

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from blinkgl.errors import EventDataError
-from blinkgl.events.emulator import BLOCK, Emulator
+from blinkgl.events.bands import BLOCK
+from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
 from blinkgl.events.v2e import V2e
 from blinkgl.tensors.batch import Batch

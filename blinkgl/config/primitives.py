@@ -51,6 +51,6 @@ def seed_of(name: str) -> int:
     return zlib.crc32(name.encode()) if seed is None else seed
 
 
-def or_registered(value: Any, validate: Callable[[Any], Any]) -> Any:
+def or_registered(value: object, validate: Callable[[object], object]) -> Any:
     """Accept a kind that a plug-in registered beside those that ``validate`` knows."""
     return value if isinstance(value, str) and value in PRIMITIVES else validate(value)

@@ -92,12 +92,12 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
             yield config
 
 
-def _falls(tree: Any) -> bool:
+def _falls(tree: object) -> bool:
     """Return whether some draw of a recipe may have physics."""
     return any(physics is not None for physics in _values(tree, "physics"))
 
 
-def _values(tree: Any, key: str) -> Iterator[Any]:
+def _values(tree: object, key: str) -> Iterator[Any]:
     """Yield what ``key`` says anywhere in plain data."""
     if isinstance(tree, dict):
         yield from [tree[key]] if key in tree else ()

@@ -86,7 +86,7 @@ class Job:
         return asdict(self)
 
 
-def maker_of(name: str, job: Mapping[str, Any], device: int | None) -> Maker:
+def maker_of(name: str, job: Mapping[str, object], device: int | None) -> Maker:
     """Return the maker called ``name`` ("module:class", of a job's ``maker``) for a job in plain data."""
     load_plugins()  # those of the process that started this one
     module, _, kind = name.partition(":")

@@ -92,7 +92,7 @@ class Emulator(ABC):
     _state: ClassVar[tuple[str, ...]] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
         if "_advance" in cls.__dict__ and "_still_pixels_sleep" not in cls.__dict__:
             cls._still_pixels_sleep = False
@@ -298,7 +298,7 @@ class Emulator(ABC):
         clock = [self.t_ns is not None, self.t_ns or 0, self.frames, self.saturated]
         return {"clock": np.array(clock, np.int64), "shape": np.array([self.height, self.width]), **state}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         """Restore the result of :meth:`state_dict` in an emulator with the same size, config and seed."""
         wanted = {name for name in self._state if getattr(self, name) is not None} | {"clock", "shape"}
         if set(state) != wanted or tuple(state["shape"]) != (self.height, self.width):

@@ -189,7 +189,7 @@ class GLContext(Releasing):
             raise GLError(f"the driver has no {name}", where=self.renderer)
         return ctypes.CFUNCTYPE(restype, *argtypes)(address)
 
-    def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
+    def program(self, name: str, defines: Mapping[str, object] | None = None) -> moderngl.Program:
         """Return the program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
         _refuse_after_fork()
         return self.shaders.program(name, defines)

@@ -110,7 +110,7 @@ def _matrix(body: memoryview) -> tuple[str, Any]:
     return name, None
 
 
-def _joined(values: list[Any]) -> Any:
+def _joined(values: list[object]) -> Any:
     arrays = [value for value in values if isinstance(value, np.ndarray)]
     return np.concatenate(arrays) if len(arrays) == len(values) > 1 else values[0] if values else None
 
@@ -199,7 +199,7 @@ def _candidates(
     columns = named_columns(shapes, reading, where)
     beside = {name: load(name) for name in _KNOWN if name in shapes and name != "cause"}
     sides = [_declared(beside[side], side, where) for side in ("height", "width") if side in beside]
-    known: dict[str, Any] = {"size": (sides[0], sides[1]) if len(sides) == 2 else None}
+    known: dict[str, object] = {"size": (sides[0], sides[1]) if len(sides) == 2 else None}
     if "time_unit" in beside:
         known["unit"] = named_unit(f"[{beside['time_unit']}]")
 

@@ -262,7 +262,7 @@ def _check_storage(data: h5py.Dataset, name: str, path: Path) -> None:
         else layout.get_layout() != h5py.h5d.COMPACT and data.id.get_storage_size() < data.nbytes
     )
     packs = "the camera's .raw" if _ECF in codes else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)"
-    problems: list[tuple[Any, str, Any, str]] = [
+    problems: list[tuple[object, str, object, str]] = [
         (not _plain(data.dtype), f"{name} holds neither numbers nor text", str(data.dtype), "numbers or text"),
         (others, f"{name} is packed by an HDF5 filter that is not run here", ", ".join(others), packs),
         (bare, f"damaged HDF5 file: {name} lacks data that Blosc needs", bare, "its parameters"),

@@ -86,7 +86,7 @@ def _candidates(file: Hdf5File, path: Path, reading: EventReading) -> tuple[list
     return named, plain
 
 
-def _of_records(file: Hdf5File, group: Any, data: Data, fields: dict[str, str], path: Path) -> Table:
+def _of_records(file: Hdf5File, group: object, data: Data, fields: dict[str, str], path: Path) -> Table:
     data.check()
     geometry = any(holder.attribute("geometry") is not None for holder in (data, file))
     known = data.name == "CD/events" or geometry
@@ -94,7 +94,7 @@ def _of_records(file: Hdf5File, group: Any, data: Data, fields: dict[str, str], 
     return table_of_records(data, fields, place=data.name, size=_size(file, group, path), **layout)
 
 
-def _of_rows(file: Hdf5File, group: Any, data: Data, reading: EventReading, path: Path) -> Table:
+def _of_rows(file: Hdf5File, group: object, data: Data, reading: EventReading, path: Path) -> Table:
     data.check()
     place = data.name
     if place in EVENTS:
@@ -145,7 +145,7 @@ def _value(holder: Any, name: str) -> np.ndarray | None:
 _FEW = 16
 
 
-def _number(holder: Any, name: str, path: Path) -> Any:
+def _number(holder: object, name: str, path: Path) -> Any:
     """Return the number under a name; None: there is none. Raises AssetError: it is none."""
     value = _value(holder, name)
     if value is not None and (value.size != 1 or value.dtype.kind not in "iuf"):

@@ -234,7 +234,7 @@ class Label:
         """Return further entries of the manifest, by key: plain values."""
         return {}
 
-    def ask(self, tree: dict[str, Any]) -> None:
+    def ask(self, tree: dict[str, object]) -> None:
         """Request it in a tree of ``labels:``."""
         tree[self.name] = True
 

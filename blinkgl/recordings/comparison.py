@@ -427,7 +427,7 @@ def _spread(values: np.ndarray, lengths: np.ndarray) -> str:
     )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray):
         return [_plain(v) for v in value.tolist()]
     if isinstance(value, float) and not np.isfinite(value):

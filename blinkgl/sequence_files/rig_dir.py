@@ -33,10 +33,10 @@ from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter
 
 def sensors_yaml(sensors: Sequence[RigSensorConfig]) -> str:
     """Return ``rig.yaml``: the rig's sensors, by name, unrounded."""
-    tables: dict[str, Any] = {}
+    tables: dict[str, object] = {}
     for one in sensors:
         records = [key for key in ("events", "images", "imu") if getattr(one, key) is not None]
-        about: dict[str, Any] = {"records": records, "T_rig_sensor": one.place.T.tolist()}
+        about: dict[str, object] = {"records": records, "T_rig_sensor": one.place.T.tolist()}
         if one.sees:
             camera = one.camera.model
             about |= {

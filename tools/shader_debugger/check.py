@@ -72,7 +72,7 @@ def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
 
 
 def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]:
-    variants: dict[tuple, dict[str, Any]] = {}
+    variants: dict[tuple, dict[str, object]] = {}
     for one in passes:
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:

@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import lru_cache
@@ -219,7 +219,7 @@ class Inspector:
 
     # ---- answers -----------------------------------------------------------------------------------------------
 
-    def state(self, q: dict[str, Any]) -> dict:
+    def state(self, q: Mapping[str, object]) -> dict:
         """Return what the page shows around the pictures."""
         scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
         return {

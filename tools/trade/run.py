@@ -159,7 +159,7 @@ def write_tables(path: Path, result: dict, columns: tuple[str, ...], rows: Itera
     return paths
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value for JSON, which has no NaN."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}

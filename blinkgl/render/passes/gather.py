@@ -53,7 +53,7 @@ class Gather(ScreenPass):
         return [Rectangle(0, 0, width, height)] if rectangles else []
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        defines: dict[str, Any] = {}
+        defines: dict[str, object] = {}
         if self.smooth:
             columns, rows = steps_of(self.camera, self.of.samples.grid)
             defines = {"SMOOTH": 1, "COLUMNS": columns, "ROWS": rows}

@@ -160,7 +160,7 @@ class Config(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _present_keys(cls, data: object) -> Any:
+    def _present_keys(cls, data: object) -> object:
         """Return the given keys over those of the preset, without those of earlier versions."""
         if not isinstance(data, dict):
             return data
@@ -195,7 +195,7 @@ def _union(tag: str, default: str, *models: type[Config]) -> TypeAdapter:
     return TypeAdapter(one_of(tag, *models, default=default))
 
 
-def _with_tag(tag: str, default: str, data: object) -> Any:
+def _with_tag(tag: str, default: str, data: object) -> object:
     return {tag: default, **data} if isinstance(data, dict) and tag not in data else data
 
 

@@ -240,7 +240,7 @@ def cam_to_cam_yaml(
     return to_yaml({"intrinsics": intrinsics, "extrinsics": extrinsics, **more})
 
 
-def _lens(camera: CameraModel, key: str) -> dict[str, Any]:
+def _lens(camera: CameraModel, key: str) -> dict[str, object]:
     drawn = camera.coefficients and camera.kind in _COUNTS
     if not drawn and not isinstance(camera, PinHole):
         raise ValueError(f"{camera.kind} cannot be written to a calibration file")

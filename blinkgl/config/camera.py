@@ -200,7 +200,7 @@ def calibrated(camera: object, base: Path) -> Any:
     return {**own, "lens": "pinhole", "distortion": [], **camera_keys(seen)}
 
 
-def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, Any]:
+def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, object]:
     """Return what the calibration of a sensor's ``camera:`` says of places and the table does not: ``place`` on the
     rig, whose origin is the file's first camera, and ``imu`` with its position and rotation. Raises ConfigError."""
     from scipy.spatial.transform import Rotation
@@ -225,7 +225,7 @@ def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, 
     return keys
 
 
-def camera_keys(camera: CameraModel) -> dict[str, Any]:
+def camera_keys(camera: CameraModel) -> dict[str, object]:
     """Return the keys of ``camera:`` that describe a camera model, without ``near``."""
     keys: dict[str, object] = {"width": camera.width, "height": camera.height}
     keys |= zip(("fx", "fy", "cx", "cy"), camera.intrinsics)

@@ -71,7 +71,7 @@ def middle(tree: object) -> Any:
     return _walk(tree, (), _middle)
 
 
-def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
+def _middle(path: tuple[str, ...], kind: str, spec: Any) -> object:
     _check(path, kind, spec)
     if kind == "choice":
         # The lower one of two middle values.
@@ -92,7 +92,7 @@ def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
     return math.exp(0.5 * (math.log(low) + math.log(high))) if kind == "log_uniform" else low + 0.5 * (high - low)
 
 
-def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
+def _walk(node: Any, path: tuple[str, ...], replace) -> object:
     if is_distribution(node):
         kind, spec = next(iter(node.items()))
         value = replace(path, kind, spec)
@@ -171,7 +171,7 @@ def _check(path: tuple[str, ...], kind: str, spec: object) -> None:
         raise ConfigError(f"not {what}", where=".".join((*path, kind)), value=spec, accepted=accepted)
 
 
-def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> Any:
+def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> object:
     _check(path, kind, spec)
     key = int.from_bytes(hashlib.sha256("/".join(path).encode()).digest()[:8], "little")
     if kind == "shares":
@@ -203,7 +203,7 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     return float(rng.uniform(low, high))
 
 
-def _share_at(u: float, spec: list[Mapping[str, object]]) -> Any:
+def _share_at(u: float, spec: list[Mapping[str, object]]) -> object:
     """Return the value whose part of [0, 1) contains u."""
     parts = [part for part in spec if _number(part["share"]) > 0]
     upper = 0.0
@@ -306,7 +306,7 @@ class _Dealer:
         self._random = random.Random(0)
         self._decks: dict[tuple[Path, int], list[Any]] = {}
 
-    def deal(self, path: Path, node: dict[str, object]) -> Any:
+    def deal(self, path: Path, node: dict[str, object]) -> object:
         """Return the next option of the distribution."""
         deck = self._decks.get((path, id(node)))
         if not deck:
@@ -316,7 +316,7 @@ class _Dealer:
         return deck.pop()
 
 
-def _children(node: object) -> list[tuple[str, Any]]:
+def _children(node: object) -> list[tuple[str, object]]:
     if isinstance(node, dict):
         return [(str(key), value) for key, value in node.items()]
     return [(str(i), value) for i, value in enumerate(node)] if isinstance(node, list) else []

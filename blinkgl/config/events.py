@@ -120,7 +120,7 @@ class EmulatorConfig(Config):
         sensor : a :class:`~blinkgl.config.sensor.SensorConfig`, which knows the emulators' keys."""
 
 
-def _pixel(sensor: Any) -> dict[str, Any]:
+def _pixel(sensor: Any) -> dict[str, object]:
     return dict(
         contrast_threshold=sensor.contrast_threshold,
         contrast_threshold_off=sensor.contrast_threshold_off,
@@ -147,7 +147,7 @@ class _TwoThresholds(EmulatorConfig):
 
     @model_validator(mode="before")
     @classmethod
-    def _completed(cls, data: object) -> Any:
+    def _completed(cls, data: object) -> object:
         """Return the keys with those that follow from others: the missing threshold from the given one and the ratio,
         and the spread. Values that are no numbers are left to validation."""
         if not isinstance(data, dict):

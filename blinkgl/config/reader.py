@@ -117,7 +117,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             raise ConstructorError(None, None, "a key is not plain text", node.start_mark)
         return key
 
-    def plain_scalar(self, node: ScalarNode) -> Any:
+    def plain_scalar(self, node: ScalarNode) -> object:
         """Return text, a number, true/false or null, by the node's tag. Very long numbers are refused: nobody needs a
         hundred digits, and Python refuses to print five thousand."""
         kind = node.tag.rpartition(":")[2]
@@ -241,7 +241,7 @@ def merge(common: object, own: object) -> Any:
     return {**copy.deepcopy(common), **laid}
 
 
-def each_option(node: Any, change: Callable[[object], object]) -> Any:
+def each_option(node: Any, change: Callable[[object], object]) -> object:
     """Return ``node`` changed by ``change``, or with each option of its distribution changed."""
     if not is_distribution(node):
         return change(node)

@@ -186,7 +186,7 @@ def with_preset(tree: Mapping[str, object]) -> dict[str, Any]:
     return {**tree, "sensors": _laid(own, base)}
 
 
-def _laid(own: list[dict[str, object]], base: list[dict[str, object]]) -> list[dict[str, Any]]:
+def _laid(own: list[dict[str, object]], base: list[dict[str, object]]) -> list[dict[str, object]]:
     """Return a preset's sensors, in its order, with those of the same names laid over them, then the others."""
     by_name: dict[object, dict[str, object]] = {}
     for k, one in enumerate(own):

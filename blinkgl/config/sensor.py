@@ -38,7 +38,7 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 
 
-def _emulator_tables(tables: dict[str, dict[str, object]]) -> dict[str, dict[str, Any]]:
+def _emulator_tables(tables: dict[str, dict[str, object]]) -> dict[str, dict[str, object]]:
     """Check the keys of each emulator by a field validator: a rule would combine the keys of all emulators."""
     models = EmulatorConfig.members
     for name, keys in tables.items():
@@ -176,7 +176,7 @@ def known_sensor(name: object) -> str | None:
     )
 
 
-def sensor_file_or_name(sensor: Any, base: Path) -> Any:
+def sensor_file_or_name(sensor: Any, base: Path) -> object:
     """Return the value of a run's key ``sensor`` with a file's path (relative to ``base``) replaced by its table. A
     shipped sensor with distributions becomes its table, too, because a sequence must record the unit it drew; the
     others remain a name. Raises ConfigError."""
@@ -210,7 +210,7 @@ def fill_sensor(sensor: Any, emulator: object) -> dict[str, Any]:
     return keys if camera.readout is None else {**keys, "readout": camera.readout.model_dump()}
 
 
-def _sensor(name: object) -> Any:
+def _sensor(name: object) -> object:
     if known_sensor(name) is None:
         raise Refused(
             "unknown sensor",

@@ -8,7 +8,7 @@ read (:mod:`blinkgl.config.draw`).
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -125,7 +125,7 @@ def span_s(duration: float, label_rate: float) -> float:
     return duration + 1 / label_rate
 
 
-def _is_offered(name: object) -> Any:
+def _is_offered(name: object) -> object:
     """Refuse multi-sampling, which 0.1.0 had: it cost more than ``taps4`` and had more error than ``ssaa2``
     (docs/trade.md)."""
     if name == "msaa4":

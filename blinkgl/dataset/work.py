@@ -82,7 +82,7 @@ class Job:
     def plan(self) -> Plan:
         return Plan.of(RunTemplate(parse_yaml(self.recipe, "recipe"), Path(self.base)), self.num)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         return asdict(self)
 
 

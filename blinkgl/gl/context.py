@@ -329,7 +329,7 @@ def _overridden(device: int) -> int:
     return int(text)
 
 
-def _egl(device: int) -> Any:
+def _egl(device: int) -> object:
     """Return glcontext's EGL object, current in this thread."""
     from glcontext import egl  # type: ignore[missing-module-attribute]  # an extension module
 

@@ -339,7 +339,7 @@ def growing_dataset(
     )
 
 
-def packing(codec: str, shuffle: int) -> dict[str, Any]:
+def packing(codec: str, shuffle: int) -> dict[str, object]:
     """Return the arguments of ``create_dataset`` for a codec of :func:`growing_dataset`.   shuffle : of Blosc.
 
     Raises ConfigError: hdf5plugin is not installed, which gzip does not need."""
@@ -452,7 +452,7 @@ def _blosc() -> ctypes.CDLL:
     return ctypes.CDLL(str(Path(_plugin().PLUGIN_PATH) / "libh5blosc.so"))
 
 
-def _plugin() -> Any:
+def _plugin() -> object:
     """Return hdf5plugin, whose import makes its filters known to HDF5. Raises ImportError."""
     import hdf5plugin
 

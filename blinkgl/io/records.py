@@ -119,7 +119,7 @@ def seal_problem(text: str) -> str | None:
     return None if hashlib.sha256(whole.encode()).hexdigest() == seal[1] else "checksum differs"
 
 
-def _unique(pairs: list[tuple[str, object]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     table = dict(pairs)
     if len(table) != len(pairs):
         raise ValueError("a key is given twice")

@@ -230,7 +230,7 @@ class Label:
     def check(self, scene: Scene, labels: LabelsConfig) -> None:
         """Raise ConfigError for requests in ``labels:`` that the scene cannot give."""
 
-    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
+    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, object]:
         """Return further entries of the manifest, by key: plain values."""
         return {}
 

@@ -137,7 +137,7 @@ class Comparison:
             rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
         return rows
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain numbers and lists (without maps), for JSON."""
 
         def side(s: RecordingSide) -> dict:

@@ -100,7 +100,7 @@ class Lighting:
             | (rgb or ({"RGB": 1} if not one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
 
-    def _shadows(self, maps: Sequence[Any]) -> dict[str, Any]:
+    def _shadows(self, maps: Sequence[Any]) -> dict[str, object]:
         suns = sum(one.lamp.kind == "sun" for one in maps)
         counts = {"SHADOWS": len(maps), "SHADOW_SUNS": suns, "SHADOW_SPOTS": len(maps) - suns}
         return {name: n for name, n in counts.items() if n} | ({"SOFT": 1} if any(one.soft for one in maps) else {})

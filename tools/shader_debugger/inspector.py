@@ -124,7 +124,7 @@ ROUTES: dict[str, dict[str, Reader]] = {
 """Parameters of each route; all are optional, where a default makes sense."""
 
 
-def read_query(route: str, text: str) -> dict[str, Any]:
+def read_query(route: str, text: str) -> dict[str, object]:
     """Return the values of every parameter of a route in :data:`ROUTES`, from the text after the
     question mark. Raises ConfigError."""
     readers = ROUTES[route]

@@ -119,7 +119,7 @@ class Pool:
         self._sides[split] = {source: tuple(entries) for source, entries in sides.items()}
         return self._sides[split]
 
-    def load(self, entry: Entry) -> Any:
+    def load(self, entry: Entry) -> object:
         """Return the entry's content, which may be the cache's."""
         return self.cache.get((self._own, entry.source_hash), lambda: self.load_entry(entry), _bytes_of)
 

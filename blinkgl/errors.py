@@ -14,7 +14,7 @@ _MAX_VALUE_CHARS = 120
 _MAX_TEXT_CHARS = 400
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python does not print integers of more than 4300 digits

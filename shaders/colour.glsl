@@ -18,23 +18,8 @@ uniform vec3 base_color;
 #ifdef TEXTURED
 uniform sampler2D albedo;
 #endif
-#ifdef EMISSIVE
-uniform vec3 emission;
-#ifdef EMISSION_MAP
-uniform sampler2D emission_map;
-uniform mat3x2 emission_map_place;
-#endif
-#endif
-#if defined(LIT) && !defined(LIT_AT_CORNERS)
-#include "light.glsl"
-#endif
-#ifdef SURFACED
-#include "surface.glsl"
-#endif
-#ifdef FOG
-#include "fog.glsl"
-#endif
-#include "guard.glsl"
+#define EMITTED vec3
+#include "sent.glsl"
 
 void main()
 {

@@ -2,8 +2,8 @@
 // A lens's picture from the pinhole picture (blinkgl/render/lens.py): the value nearest to each pixel's ray, or
 // (SMOOTH) the mean over the pixel.
 //
-// SAMPLER_k, TEXEL_k   types of the k-th output, its sampler's and its own
-// COLUMNS, ROWS        SMOOTH: samples per pixel. Numbers computed per pixel would cost five times as much.
+// OUTPUTS         OUTPUT(k, SAMPLER, TEXEL) for each output: its number, its sampler's type and its own
+// COLUMNS, ROWS   SMOOTH: samples per pixel. Numbers computed per pixel would cost five times as much.
 
 #include "cover.glsl"
 
@@ -14,32 +14,8 @@ uniform vec2 flat_size;     // size, px, of the pinhole picture that places refe
 uniform sampler2D slopes;   // d(place) / d(px), columns
 #endif
 
-// Up to eight outputs; the renderer defines as many SAMPLER_k and TEXEL_k as the pass has.
-#define PICKED(k, SAMPLER, TEXEL) uniform SAMPLER picked_##k; layout(location = k) out TEXEL out_##k;
-#ifdef SAMPLER_0
-PICKED(0, SAMPLER_0, TEXEL_0)
-#endif
-#ifdef SAMPLER_1
-PICKED(1, SAMPLER_1, TEXEL_1)
-#endif
-#ifdef SAMPLER_2
-PICKED(2, SAMPLER_2, TEXEL_2)
-#endif
-#ifdef SAMPLER_3
-PICKED(3, SAMPLER_3, TEXEL_3)
-#endif
-#ifdef SAMPLER_4
-PICKED(4, SAMPLER_4, TEXEL_4)
-#endif
-#ifdef SAMPLER_5
-PICKED(5, SAMPLER_5, TEXEL_5)
-#endif
-#ifdef SAMPLER_6
-PICKED(6, SAMPLER_6, TEXEL_6)
-#endif
-#ifdef SAMPLER_7
-PICKED(7, SAMPLER_7, TEXEL_7)
-#endif
+#define OUTPUT(k, SAMPLER, TEXEL) uniform SAMPLER picked_##k; layout(location = k) out TEXEL out_##k;
+OUTPUTS
 
 void main()
 {
@@ -63,31 +39,9 @@ void main()
     out_0 = sum / float(ROWS * COLUMNS);
 #else
     ivec2 nearest = min(ivec2(place), ivec2(size) - 1);
-#define PICK(k) out_##k = texelFetch(picked_##k, nearest, 0);
-#ifdef SAMPLER_0
-    PICK(0)
-#endif
-#ifdef SAMPLER_1
-    PICK(1)
-#endif
-#ifdef SAMPLER_2
-    PICK(2)
-#endif
-#ifdef SAMPLER_3
-    PICK(3)
-#endif
-#ifdef SAMPLER_4
-    PICK(4)
-#endif
-#ifdef SAMPLER_5
-    PICK(5)
-#endif
-#ifdef SAMPLER_6
-    PICK(6)
-#endif
-#ifdef SAMPLER_7
-    PICK(7)
-#endif
+#undef OUTPUT
+#define OUTPUT(k, SAMPLER, TEXEL) out_##k = texelFetch(picked_##k, nearest, 0);
+    OUTPUTS
 #endif
 }
 #endif

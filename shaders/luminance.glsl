@@ -1,22 +1,22 @@
 #version 430 core
 // Event pass: linear luminance into one R32F target (the event kernel takes the logarithm).
 //
-// Variants   TEXTURED   albedo luminance from a one-channel texture, else the uniform alone
-//            LIT        Lambert, of the light of light.glsl: a white sun and sky; else unlit
-//            TAPS4      four texture lookups per pixel instead of one, each one mip level finer
-//           STRETCHED  with TAPS4: the taps lie along the direction of foreshortening
-//            TWO_SIDED  the normal is turned towards the camera on back faces
-//            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
-//            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
-//                       pixels
-//            FOG        seen through fog, see fog.glsl
-//           LIGHTS     other lights, see lights.glsl; RGB: the albedo is r, g, b, each times its share of the
-//                       luminance, because coloured light scales each channel separately
-//            TINTED     times the vertices' colours
-//           EMISSIVE   emitted light, EMISSION_MAP: from a texture of its luminance
+// Variants   TEXTURED       albedo luminance from a one-channel texture, else the uniform alone
+//            LIT            Lambert, of the light of light.glsl: a white sun and sky; else unlit
+//            TAPS4          four texture lookups per pixel instead of one, each one mip level finer
+//            STRETCHED      with TAPS4: the taps lie along the direction of foreshortening
+//            TWO_SIDED      the normal is turned towards the camera on back faces
+//            RATE           (luminance, its rate of change per second at this pixel) into an RG32F target
+//            EVERY n        the target holds every n-th pixel of the image: textures are filtered for the whole
+//                           image's pixels
+//            FOG            seen through fog, see fog.glsl
+//            LIGHTS         other lights, see lights.glsl; RGB: the albedo is r, g, b, each times its share of the
+//                           luminance, because coloured light scales each channel separately
+//            TINTED         times the vertices' colours
+//            EMISSIVE       emitted light, EMISSION_MAP: from a texture of its luminance
 //            GLOSSY, BUMPED, GLOSS_MAP   see surface.glsl
-//            MASKED     has holes, see vertex.glsl
-//           SHOW_LOOKUP  for the shader debugger: also writes the texture lookups, see lookup.glsl
+//            MASKED         has holes, see vertex.glsl
+//            SHOW_LOOKUP    for the shader debugger: also writes the texture lookups, see lookup.glsl
 
 // CHANGES: the surface varies from pixel to pixel, so that its motion changes the luminance.
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG) || defined(TINTED))
@@ -56,23 +56,8 @@ uniform mat4x3 rate;
 #include "motion.glsl"
 #include "rate.glsl"
 #endif
-#ifdef FOG
-#include "fog.glsl"
-#endif
-#ifdef EMISSIVE
-uniform float emission; // luminance
-#ifdef EMISSION_MAP
-uniform sampler2D emission_map; // of its luminance
-uniform mat3x2 emission_map_place;
-#endif
-#endif
-#if defined(LIT) && !defined(LIT_AT_CORNERS)
-#include "light.glsl"
-#endif
-#ifdef SURFACED
-#include "surface.glsl"
-#endif
-#include "guard.glsl"
+#define EMITTED float
+#include "sent.glsl"
 
 void main()
 {

@@ -128,7 +128,7 @@ def value(rng: np.random.Generator, annotation: object, bounds: list[object]) ->
 def drawn(seed: int, index: int) -> dict[str, object]:
     """Return configuration ``index``: the small recipe with one to four keys of other values."""
     rng = np.random.default_rng([seed, zlib.crc32(b"configurations"), index])
-    tree: dict[str, Any] = copy.deepcopy(SMALL)
+    tree: dict[str, object] = copy.deepcopy(SMALL)
     rows = leaves(SequenceConfig)
     for _ in range(int(rng.integers(1, 5))):
         path, kinds, info = rows[int(rng.integers(len(rows)))]

@@ -174,7 +174,7 @@ def run_stage(name: str, options: Namespace, report: dict[str, Any]) -> None:
 
 
 def run_process(
-    name: str, first: int, deadline: float, options: Namespace, report: dict[str, Any], outcomes: dict[str, Any]
+    name: str, first: int, deadline: float, options: Namespace, report: dict[str, object], outcomes: dict[str, Any]
 ) -> int | None:
     """Run a piece from a row on until it ends, hangs or its time is over. Return the row that another process begins
     with, or None."""

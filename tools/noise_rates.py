@@ -61,12 +61,12 @@ def rate_per_step(size: float, k: float, place: float, cells: int) -> float:
     return float(state @ counts)
 
 
-def rate_per_time_constant(size: float, k: float, ladders: int = 8) -> tuple[float, float]:
+def rate_per_time_constant(size: float, k: float) -> tuple[float, float]:
     """(harmonic mean of the rates over where the ladder stands, ln of the largest over the smallest)."""
     fresh = size * np.sqrt(-np.expm1(-2 * k))
     cells = int(min(max(np.ceil(4.0 / fresh), 24), 200))
     # Mirror images have the same rate: half of the places are enough.
-    rates = np.array([rate_per_step(size, k, (j + 0.5) / ladders / 2, cells) for j in range(ladders)])
+    rates = np.array([rate_per_step(size, k, (j + 0.5) / 16, cells) for j in range(8)])
     ends = [rate_per_step(size, k, place, cells) for place in (1e-3, 0.499)]
     return float(1 / np.mean(1 / rates)) / k, float(np.log(ends[1] / ends[0]))
 

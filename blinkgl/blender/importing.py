@@ -59,7 +59,7 @@ class Imported:
     wrong: tuple[str, ...]
     omissions: tuple[str, ...]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Return all of it as plain data, for JSON."""
         return {**asdict(self), "path": str(self.path)}
 

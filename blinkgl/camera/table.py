@@ -9,8 +9,6 @@ class Mine(CameraModel):           # or DistortedModel, which finds the bounds b
 
 from __future__ import annotations
 
-from typing import Any
-
 from blinkgl.camera.model import CameraModel
 
 CAMERA_MODELS: dict[str, type[CameraModel]] = {}
@@ -29,7 +27,7 @@ def register(model: type[CameraModel]) -> type[CameraModel]:
     return model
 
 
-def _checked(model: Any) -> str:
+def _checked(model: object) -> str:
     if not (isinstance(model, type) and issubclass(model, CameraModel)):
         raise TypeError(f"{model!r} is not a subclass of CameraModel")
     kind = getattr(model, "kind", None)

@@ -147,7 +147,7 @@ class Config(BaseModel):
         return core_schema.no_info_plain_validator_function(lambda data: union().validate_python(data))
 
     @classmethod
-    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+    def __pydantic_init_subclass__(cls, **_: object) -> None:
         # From the base class down, so that a subclass may replace a rule of the same name.
         bodies = [vars(base) for base in reversed(cls.__mro__)]
         rules = {name: value for body in bodies for name, value in body.items() if isinstance(value, Rule)}
@@ -160,7 +160,7 @@ class Config(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _present_keys(cls, data: Any) -> Any:
+    def _present_keys(cls, data: object) -> object:
         """Return the given keys over those of the preset, without those of earlier versions."""
         if not isinstance(data, dict):
             return data
@@ -195,7 +195,7 @@ def _union(tag: str, default: str, *models: type[Config]) -> TypeAdapter:
     return TypeAdapter(one_of(tag, *models, default=default))
 
 
-def _with_tag(tag: str, default: str, data: Any) -> Any:
+def _with_tag(tag: str, default: str, data: object) -> object:
     return {tag: default, **data} if isinstance(data, dict) and tag not in data else data
 
 
@@ -225,7 +225,7 @@ def members(annotation: Any) -> list[Any]:
     return [annotation]
 
 
-def is_model(annotation: Any) -> bool:
+def is_model(annotation: object) -> bool:
     """Return whether ``annotation`` is a pydantic model class."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
@@ -248,7 +248,7 @@ def below(annotation: Any, step: str | int) -> list[Any]:
     return []
 
 
-def limits_below(annotation: Any, step: str | int) -> FieldInfo | None:
+def limits_below(annotation: object, step: str | int) -> FieldInfo | None:
     """Return the limits of an entry of a list, which its annotation holds."""
     arguments = typing.get_args(annotation)
     if typing.get_origin(annotation) not in (tuple, list) or not str(step).isdigit() or not arguments:
@@ -261,14 +261,14 @@ def limits_below(annotation: Any, step: str | int) -> FieldInfo | None:
     )
 
 
-def _fits(annotation: Any, path: Iterable[str]) -> bool:
+def _fits(annotation: object, path: Iterable[str]) -> bool:
     here = [annotation]
     for step in path:
         here = [x for a in here for x in below(a, step)]
     return bool(here)
 
 
-def _value(model: Any, key: str, path: Path) -> Any:
+def _value(model: object, key: str, path: Path) -> Any:
     value = _get(model, path)
     if key[0] == "?":
         return value is not None

@@ -121,7 +121,7 @@ def _tree(text: str, where: str) -> dict[str, Any]:
     return tree
 
 
-def _of_matrix(tree: dict[str, Any], where: str) -> Calibrated | None:
+def _of_matrix(tree: Mapping[str, object], where: str) -> Calibrated | None:
     """Return the camera of a file of OpenCV, ROS or Metavision, or None for another kind of file."""
     inner = next((v for v in tree.values() if isinstance(v, dict) and any(key in v for key in _MATRIX)), {})
     table = tree if any(key in tree for key in _MATRIX) else inner if "K" in inner else {}
@@ -143,7 +143,7 @@ def _of_matrix(tree: dict[str, Any], where: str) -> Calibrated | None:
     return _camera(plain | {"distortion_coeffs": coefficients}, where, "intrinsics")
 
 
-def _flat(matrix: Any) -> list[float] | None:
+def _flat(matrix: object) -> list[float] | None:
     """Return the numbers of a matrix of OpenCV (rows, cols, data), of ROS, or a list of rows; None: none of these."""
     data = matrix.get("data") if isinstance(matrix, dict) else matrix
     if not isinstance(data, list):
@@ -206,7 +206,7 @@ def read_place_on_body(path: str | Path) -> np.ndarray:
 
 def camchain_yaml(cameras: Mapping[str, Calibrated]) -> str:
     """Return the text of a Kalibr camchain. Raises ValueError for a camera that Kalibr has no model of."""
-    tree: dict[str, Any] = {}
+    tree: dict[str, object] = {}
     for name, one in cameras.items():
         table = {"camera_model": "pinhole", **_lens(one.camera, "intrinsics")}
         if one.T_cam_before is not None:
@@ -218,7 +218,7 @@ def camchain_yaml(cameras: Mapping[str, Calibrated]) -> str:
 def cam_to_cam_yaml(
     cameras: Sequence[Calibrated],
     numbers: Sequence[int] | None = None,
-    disparity_to_depth: Mapping[str, Any] | None = None,
+    disparity_to_depth: Mapping[str, object] | None = None,
 ) -> str:
     """Return the text of DSEC's ``cam_to_cam.yaml``: the raw cameras cam0 … and the rectified ones, which have the same
     axes (:func:`blinkgl.camera.pinhole.rectified`).
@@ -226,8 +226,8 @@ def cam_to_cam_yaml(
     numbers : the cameras' numbers where they are not 0, 1, …: DSEC's right event camera is cam3.   disparity_to_depth :
     the table of that name, ``cams_03`` -> 4 x 4."""
     numbers = range(len(cameras)) if numbers is None else numbers
-    intrinsics: dict[str, Any] = {}
-    extrinsics: dict[str, Any] = {}
+    intrinsics: dict[str, object] = {}
+    extrinsics: dict[str, object] = {}
     for place, (k, one) in enumerate(zip(numbers, cameras, strict=True)):
         intrinsics[f"cam{k}"] = _lens(one.camera, "camera_matrix")
         if one.T_cam_before is not None and place:
@@ -240,7 +240,7 @@ def cam_to_cam_yaml(
     return to_yaml({"intrinsics": intrinsics, "extrinsics": extrinsics, **more})
 
 
-def _lens(camera: CameraModel, key: str) -> dict[str, Any]:
+def _lens(camera: CameraModel, key: str) -> dict[str, object]:
     drawn = camera.coefficients and camera.kind in _COUNTS
     if not drawn and not isinstance(camera, PinHole):
         raise ValueError(f"{camera.kind} cannot be written to a calibration file")
@@ -297,7 +297,7 @@ def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
         return Calibrated(CAMERA_MODELS[kind](int(size[0]), int(size[1]), *intrinsics, **coefficients))
 
 
-def _numbers(table: dict[str, Any], key: str, counts: tuple[int, ...], where: str) -> list[float]:
+def _numbers(table: Mapping[str, object], key: str, counts: tuple[int, ...], where: str) -> list[float]:
     listed = table.get(key)
     try:
         values = [float(v) for v in listed if not isinstance(v, (bool, list, dict))]  # type: ignore[union-attr]
@@ -311,7 +311,7 @@ def _numbers(table: dict[str, Any], key: str, counts: tuple[int, ...], where: st
     return values
 
 
-def _rigid(matrix: Any, where: str) -> np.ndarray:
+def _rigid(matrix: object, where: str) -> np.ndarray:
     try:
         T = np.array(matrix, np.float64)
     except (TypeError, ValueError):

@@ -11,6 +11,7 @@ without the file.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -97,7 +98,7 @@ class CameraConfig(Config):
             )
 
     @rule(*_KEYS)
-    def _can_be_drawn(width: int, height: int, lens: str, distortion: tuple[float, ...], *rest: Any):
+    def _can_be_drawn(width: int, height: int, lens: str, distortion: tuple[float, ...], *rest: object):
         if lens == "pinhole" or len(distortion) not in COUNTS[lens]:  # the rule of distortion reports this
             return
         with placed("distortion", Refused):
@@ -155,7 +156,7 @@ def room_for(camera: CameraModel, clearance: float, height: float) -> float:
     return least
 
 
-def calibrated(camera: Any, base: Path) -> Any:
+def calibrated(camera: object, base: Path) -> Any:
     """Return a ``camera:`` table with its calibration, read from ``base``, replaced by the calibration's keys. A table
     without a calibration is returned unchanged. Raises ConfigError."""
     if not isinstance(camera, dict) or camera.get("calibration") is None:
@@ -199,7 +200,7 @@ def calibrated(camera: Any, base: Path) -> Any:
     return {**own, "lens": "pinhole", "distortion": [], **camera_keys(seen)}
 
 
-def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:
+def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, object]:
     """Return what the calibration of a sensor's ``camera:`` says of places and the table does not: ``place`` on the
     rig, whose origin is the file's first camera, and ``imu`` with its position and rotation. Raises ConfigError."""
     from scipy.spatial.transform import Rotation
@@ -224,8 +225,8 @@ def placed_by_calibration(table: dict[str, Any], base: Path) -> dict[str, Any]:
     return keys
 
 
-def camera_keys(camera: CameraModel) -> dict[str, Any]:
+def camera_keys(camera: CameraModel) -> dict[str, object]:
     """Return the keys of ``camera:`` that describe a camera model, without ``near``."""
-    keys: dict[str, Any] = {"width": camera.width, "height": camera.height}
+    keys: dict[str, object] = {"width": camera.width, "height": camera.height}
     keys |= zip(("fx", "fy", "cx", "cy"), camera.intrinsics)
     return keys | ({"lens": camera.kind, "distortion": list(camera.distortion)} if camera.coefficients else {})

@@ -23,7 +23,7 @@ from __future__ import annotations
 import hashlib
 import math
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,12 +37,12 @@ _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "weighted", "
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: its multiples modulo 2^64 are spread as evenly as possible
 
 
-def is_distribution(node: Any) -> bool:
+def is_distribution(node: object) -> bool:
     """Return whether plain data is a distribution: a table of one key that names a kind."""
     return isinstance(node, dict) and len(node) == 1 and next(iter(node)) in _KINDS
 
 
-def draw(tree: Any, seed: int, sequence: int) -> Any:
+def draw(tree: object, seed: int, sequence: int) -> Any:
     """Return ``tree`` (plain YAML data) with every distribution replaced by the value drawn for ``sequence``.
 
     Raises ConfigError (with the path) for a malformed distribution."""
@@ -64,14 +64,14 @@ def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) 
     return list(dict.fromkeys((low, high, low + 0.381966 * (high - low)) if between else (low, high)))
 
 
-def middle(tree: Any) -> Any:
+def middle(tree: object) -> Any:
     """Return ``tree`` with every distribution replaced by its middle: half-way between the ends of a range (of their
     logarithms for ``log_uniform``; the lower of two integers), and of choices the value at which half of the chances
     are reached. Raises ConfigError (with the path) for a malformed one."""
     return _walk(tree, (), _middle)
 
 
-def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
+def _middle(path: tuple[str, ...], kind: str, spec: Any) -> object:
     _check(path, kind, spec)
     if kind == "choice":
         # The lower one of two middle values.
@@ -92,7 +92,7 @@ def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
     return math.exp(0.5 * (math.log(low) + math.log(high))) if kind == "log_uniform" else low + 0.5 * (high - low)
 
 
-def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
+def _walk(node: Any, path: tuple[str, ...], replace) -> object:
     if is_distribution(node):
         kind, spec = next(iter(node.items()))
         value = replace(path, kind, spec)
@@ -104,7 +104,7 @@ def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
     return node
 
 
-def _number(x: Any) -> float:
+def _number(x: object) -> float:
     if isinstance(x, bool) or not isinstance(x, (int, float, str)):
         raise ValueError
     try:
@@ -161,7 +161,7 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str, str]] = {
 """Kind -> whether its parameters are valid, what they are, and what is accepted."""
 
 
-def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
+def _check(path: tuple[str, ...], kind: str, spec: object) -> None:
     right, what, accepted = _RULES[kind]
     try:
         ok = right(spec)
@@ -171,7 +171,7 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
         raise ConfigError(f"not {what}", where=".".join((*path, kind)), value=spec, accepted=accepted)
 
 
-def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> Any:
+def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> object:
     _check(path, kind, spec)
     key = int.from_bytes(hashlib.sha256("/".join(path).encode()).digest()[:8], "little")
     if kind == "shares":
@@ -203,7 +203,7 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     return float(rng.uniform(low, high))
 
 
-def _share_at(u: float, spec: list[dict[str, Any]]) -> Any:
+def _share_at(u: float, spec: list[Mapping[str, object]]) -> object:
     """Return the value whose part of [0, 1) contains u."""
     parts = [part for part in spec if _number(part["share"]) > 0]
     upper = 0.0
@@ -238,25 +238,25 @@ class Fill:
     reads: tuple[str, ...]
     values: Callable[..., dict[str, Any]]
 
-    def __call__(self, tree: dict[str, Any]) -> dict[str, Any]:
+    def __call__(self, tree: Mapping[str, object]) -> dict[str, Any]:
         """Return ``tree`` laid over the fill's values."""
         return _lay(self.values(*(_said(tree, key.split(".")) for key in self.reads)), tree)
 
 
-def _said(tree: Any, path: list[str]) -> Any:
+def _said(tree: object, path: list[str]) -> Any:
     for step in path:
         tree = tree.get(step) if isinstance(tree, dict) else None
     return tree
 
 
-def _lay(under: Any, over: Any) -> Any:
+def _lay(under: object, over: object) -> Any:
     """Lay ``over`` on ``under``: tables key by key; any other value of ``over`` replaces the one below."""
     if not (isinstance(under, dict) and isinstance(over, dict)):
         return over
     return {**under, **{key: _lay(under[key], value) if key in under else value for key, value in over.items()}}
 
 
-def sites(tree: Any) -> dict[Path, int]:
+def sites(tree: object) -> dict[Path, int]:
     """Return the paths of all distributions and their numbers of options, outermost first, including those inside the
     choices of others. Raises ConfigError for a bad one."""
     counts: dict[Path, int] = {}
@@ -275,7 +275,7 @@ def sites(tree: Any) -> dict[Path, int]:
     return counts
 
 
-def corners(tree: Any) -> Iterator[Any]:
+def corners(tree: object) -> Iterator[Any]:
     """Yield plain trees that represent all that ``tree`` can draw (see the comment above); the first has every first
     option. They share the parts that do not vary. Raises ConfigError for a bad distribution."""
     if not (every := sites(tree)):
@@ -306,7 +306,7 @@ class _Dealer:
         self._random = random.Random(0)
         self._decks: dict[tuple[Path, int], list[Any]] = {}
 
-    def deal(self, path: Path, node: dict[str, Any]) -> Any:
+    def deal(self, path: Path, node: dict[str, object]) -> object:
         """Return the next option of the distribution."""
         deck = self._decks.get((path, id(node)))
         if not deck:
@@ -316,7 +316,7 @@ class _Dealer:
         return deck.pop()
 
 
-def _children(node: Any) -> list[tuple[str, Any]]:
+def _children(node: object) -> list[tuple[str, object]]:
     if isinstance(node, dict):
         return [(str(key), value) for key, value in node.items()]
     return [(str(i), value) for i, value in enumerate(node)] if isinstance(node, list) else []

@@ -114,13 +114,13 @@ class EmulatorConfig(Config):
 
     @classmethod
     @abstractmethod
-    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
+    def from_sensor(cls, sensor: object) -> dict[str, Any]:
         """Return the values of the keys that a camera's data sheet describes; None where this sensor gives none.
 
         sensor : a :class:`~blinkgl.config.sensor.SensorConfig`, which knows the emulators' keys."""
 
 
-def _pixel(sensor: Any) -> dict[str, Any]:
+def _pixel(sensor: Any) -> dict[str, object]:
     return dict(
         contrast_threshold=sensor.contrast_threshold,
         contrast_threshold_off=sensor.contrast_threshold_off,
@@ -147,7 +147,7 @@ class _TwoThresholds(EmulatorConfig):
 
     @model_validator(mode="before")
     @classmethod
-    def _completed(cls, data: Any) -> Any:
+    def _completed(cls, data: object) -> object:
         """Return the keys with those that follow from others: the missing threshold from the given one and the ratio,
         and the spread. Values that are no numbers are left to validation."""
         if not isinstance(data, dict):
@@ -236,7 +236,7 @@ class EsimConfig(_TwoThresholds):
     device: Device = _DEVICE
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
+    def from_sensor(cls, sensor: object) -> dict[str, Any]:
         return _pixel(sensor)
 
 

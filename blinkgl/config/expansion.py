@@ -73,7 +73,7 @@ def expanded(tree: Table, base: Path) -> Table:
     return with_groups(tree, whole)
 
 
-def _recipe(events: Any) -> Any:
+def _recipe(events: object) -> object:
     if not isinstance(events, dict) or "recipe" not in events:
         return events
     own = {key: value for key, value in events.items() if key != "recipe"}

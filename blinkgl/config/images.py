@@ -140,7 +140,7 @@ class ImagesConfig(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _times_instead_of_a_rate(cls, data: Any) -> Any:
+    def _times_instead_of_a_rate(cls, data: object) -> object:
         """Return the keys with a rate of null beside times: the rate of a preset or the default would contradict."""
         return {"rate": None, **data} if isinstance(data, dict) and data.get("times") is not None else data
 

@@ -43,7 +43,7 @@ def _each_once(flow: tuple[str | float, ...]) -> tuple[str | float, ...]:
     return flow
 
 
-def _a_table(value: Any) -> Any:
+def _a_table(value: object) -> object:
     """Check a table of patterns, so that a wrong value gives one message instead of one per member of the union."""
     if isinstance(value, bool):
         return value
@@ -69,7 +69,7 @@ class LabelsConfig(Config, extra="allow"):
 
     @model_validator(mode="before")
     @classmethod
-    def _with_added(cls, data: Any) -> Any:
+    def _with_added(cls, data: object) -> object:
         """Return the keys with those of plug-ins, false unless they are given. Raises Refused for an unknown key."""
         if not isinstance(data, dict):
             return data
@@ -133,7 +133,7 @@ class LabelsConfig(Config, extra="allow"):
     )
 
 
-def fill_causes(events: bool | None, emulator: str | None) -> dict[str, Any]:
+def fill_causes(events: bool | None, emulator: str | None) -> dict[str, object]:
     """Return ``causes: true`` for emulators that know their events' causes where ``labels.events`` is on."""
     name = EmulatorConfig.default_member if emulator is None else emulator
     model = EmulatorConfig.members.get(name) if isinstance(name, str) else None

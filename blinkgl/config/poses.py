@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -23,7 +23,7 @@ Matrix = tuple[_Row, _Row, _Row, _Row]
 _RIGID = 1e-4
 
 
-def check_rigid(matrix: Any, where: str) -> None:
+def check_rigid(matrix: object, where: str) -> None:
     """Raise Refused for (4, 4) numbers that are not a rotation and a translation, apart from rounding."""
     T = np.array(matrix, np.float64)
     R = T[:3, :3]
@@ -39,7 +39,7 @@ def check_rigid(matrix: Any, where: str) -> None:
         )
 
 
-def rigid_matrix(matrix: Any) -> np.ndarray:
+def rigid_matrix(matrix: object) -> np.ndarray:
     """Return a valid matrix (:func:`check_rigid`) as (4, 4) float64 with its rounded rotation made exact."""
     T = np.array(matrix, np.float64)
     u, _, v = np.linalg.svd(T[:3, :3])

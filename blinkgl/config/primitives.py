@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 
 class PrimitiveKind(NamedTuple):
@@ -51,6 +51,6 @@ def seed_of(name: str) -> int:
     return zlib.crc32(name.encode()) if seed is None else seed
 
 
-def or_registered(value: Any, validate: Callable[[Any], Any]) -> Any:
+def or_registered(value: object, validate: Callable[[object], object]) -> object:
     """Accept a kind that a plug-in registered beside those that ``validate`` knows."""
     return value if isinstance(value, str) and value in PRIMITIVES else validate(value)

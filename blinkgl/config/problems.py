@@ -23,7 +23,7 @@ def _dotted(*names: str) -> str:
     return ".".join(name for name in names if name)
 
 
-def validate(model: type[Config], data: Any, *, where: str = "") -> Any:
+def validate(model: type[Config], data: object, *, where: str = "") -> Any:
     """Return ``model`` built from plain data. Raises :class:`ConfigError` naming the first bad path, its value and what
     is accepted (for an unknown key: the nearest valid one)."""
     try:
@@ -173,7 +173,7 @@ def _locate(
     return path, owners, here, info
 
 
-def describe(annotations: list[Any], info: FieldInfo | None = None) -> str:
+def describe(annotations: list[object], info: FieldInfo | None = None) -> str:
     """Return what a field accepts, in words."""
     words = list(dict.fromkeys(_word(a, info) for a in annotations))
     if info is not None and type(None) in typing.get_args(info.annotation):
@@ -229,5 +229,5 @@ def _limits(info: FieldInfo | None) -> str:
     return re.sub(r"^ at least (\S+) and at most (\S+)$", r" from \1 to \2", f" {text}") if limits else ""
 
 
-def _plain(number: Any) -> str:
+def _plain(number: object) -> str:
     return str(number) if isinstance(number, int) and abs(number) < 1e6 else f"{number:.7g}"

@@ -14,7 +14,7 @@ DEFAULT: Quality = "balanced"
 """The preset of a configuration without the key; ``quality: null`` leaves every key at its own default."""
 
 
-def with_default(tree: Any) -> Any:
+def with_default(tree: object) -> Any:
     """Return a configuration's plain data with ``quality`` filled in."""
     return {"quality": DEFAULT, **tree} if isinstance(tree, dict) else tree
 
@@ -31,7 +31,7 @@ def measured_presets() -> dict[str, Any]:
     return json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text(encoding="utf-8"))
 
 
-def fill_quality(quality: Any, kind: Any) -> dict[str, Any]:
+def fill_quality(quality: object, kind: object) -> dict[str, Any]:
     """Return the preset's values for a configuration with this timeline.kind (None: not given). Unknown presets have
     none. The preset's timeline values are left out for a timeline of another kind."""
     if quality not in QUALITIES:

@@ -117,7 +117,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             raise ConstructorError(None, None, "a key is not plain text", node.start_mark)
         return key
 
-    def plain_scalar(self, node: ScalarNode) -> Any:
+    def plain_scalar(self, node: ScalarNode) -> object:
         """Return text, a number, true/false or null, by the node's tag. Very long numbers are refused: nobody needs a
         hundred digits, and Python refuses to print five thousand."""
         kind = node.tag.rpartition(":")[2]
@@ -205,18 +205,18 @@ def read_table(path: str | Path, accepted: str = "key: value lines") -> dict[str
     return tree
 
 
-def to_yaml(tree: Any) -> str:
+def to_yaml(tree: object) -> str:
     """Return YAML text that :func:`parse_yaml` reads as ``tree``; keys keep their order, without aliases."""
     return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-def to_short_yaml(tree: Any) -> str:
+def to_short_yaml(tree: object) -> str:
     """Return YAML text with each innermost table or list on one line, easy to copy."""
     return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
 
 
 class _Dumper(yaml.SafeDumper):
-    def ignore_aliases(self, data: Any) -> bool:
+    def ignore_aliases(self, data: object) -> bool:
         return True
 
 
@@ -229,7 +229,7 @@ _WHOLE = ("sensor",)
 """Keys whose tables are replaced as a whole: a sensor is not mixed from two."""
 
 
-def merge(common: Any, own: Any) -> Any:
+def merge(common: object, own: object) -> Any:
     """Return ``own`` laid over ``common``: tables key by key. Any other value, a distribution, or a table of another
     kind (``kind: explicit`` over ``kind: random``) replaces the common value."""
     both = (
@@ -241,7 +241,7 @@ def merge(common: Any, own: Any) -> Any:
     return {**copy.deepcopy(common), **laid}
 
 
-def each_option(node: Any, change: Callable[[Any], Any]) -> Any:
+def each_option(node: Any, change: Callable[[object], object]) -> object:
     """Return ``node`` changed by ``change``, or with each option of its distribution changed."""
     if not is_distribution(node):
         return change(node)
@@ -312,7 +312,7 @@ def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
 # Files that ship with the program, by name: runs, and tables of sensors, rigs, quality presets and recipes.
 
 
-def shipped(kind: str, name: Any, what: str = "table", where: str = "") -> dict[str, Any]:
+def shipped(kind: str, name: object, what: str = "table", where: str = "") -> dict[str, Any]:
     """Return a copy of the table of this name. Raises ConfigError listing the known ones (:func:`shipped_names`).
 
     what, where : for the message."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -127,12 +127,12 @@ class RigSensorConfig(Config):
         return self.events is not None or self.images is not None or labelled
 
 
-def is_rig(tree: Any) -> bool:
+def is_rig(tree: object) -> bool:
     """Return whether a configuration has several sensors."""
     return isinstance(tree, dict) and (tree.get("rig") is not None or tree.get("sensors") is not None)
 
 
-def check_one_lens(tree: dict[str, Any]) -> None:
+def check_one_lens(tree: Mapping[str, object]) -> None:
     """Raise ConfigError where the top level has a calibration and a sensor has a camera of its own: keys of both would
     be one lens."""
     camera = tree.get("camera")
@@ -148,7 +148,9 @@ def check_one_lens(tree: dict[str, Any]) -> None:
                 )
 
 
-def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]) -> dict[str, Any]:
+def spelled_out(
+    tree: dict[str, object], fills: Iterable[Callable[[dict[str, object]], dict[str, object]]]
+) -> dict[str, Any]:
     """Return ``tree`` with every sensor of its rig, if it is one, complete: the sensor's own keys over the preset's,
     both over the top level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes
     nothing.
@@ -170,7 +172,7 @@ def spelled_out(tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]],
     return {**tree, "sensors": [_complete(one, k, tree, fills) for k, one in enumerate(tables)]}
 
 
-def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
+def with_preset(tree: Mapping[str, object]) -> dict[str, Any]:
     """Return ``tree`` with its own sensors laid over those of its preset. Repeating it changes nothing. Raises
     ConfigError for an unknown rig, no list of sensors, or two of one name."""
     sensors = tree.get("sensors")
@@ -184,9 +186,9 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     return {**tree, "sensors": _laid(own, base)}
 
 
-def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _laid(own: list[dict[str, object]], base: list[dict[str, object]]) -> list[dict[str, object]]:
     """Return a preset's sensors, in its order, with those of the same names laid over them, then the others."""
-    by_name: dict[Any, dict[str, Any]] = {}
+    by_name: dict[object, dict[str, object]] = {}
     for k, one in enumerate(own):
         name = one.get("name")
         low = name.lower() if isinstance(name, str) else k
@@ -205,7 +207,7 @@ def _laid(own: list[dict[str, Any]], base: list[dict[str, Any]]) -> list[dict[st
     ]
 
 
-def _over_preset(preset: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+def _over_preset(preset: dict[str, object], own: dict[str, object]) -> dict[str, Any]:
     """Return a preset's sensor with its own keys laid over it: another way to give the focal length or the place, as a
     calibration does, takes the place of the preset's."""
     preset, place = copy.deepcopy(preset), own.get("place")
@@ -220,7 +222,10 @@ _UNSAID = CameraConfig().model_dump(mode="json")
 
 
 def _complete(
-    own: dict[str, Any], number: int, tree: dict[str, Any], fills: Iterable[Callable[[dict[str, Any]], dict[str, Any]]]
+    own: dict[str, object],
+    number: int,
+    tree: dict[str, object],
+    fills: Iterable[Callable[[dict[str, object]], dict[str, object]]],
 ) -> dict[str, Any]:
     for key in _SHARED:
         if key in own:
@@ -261,7 +266,7 @@ _FOCAL = (("fov",), ("focal",), ("fx", "fy"))
 """Alternative ways to give the focal length; a camera has one."""
 
 
-def _drop_other_focal(above: Any, own: Any) -> None:
+def _drop_other_focal(above: object, own: object) -> None:
     """Drop the top level's focal length where a sensor gives its own in another way."""
     if isinstance(above, dict) and isinstance(own, dict):
         used = {key for keys in _FOCAL if any(own.get(key) is not None for key in keys) for key in keys}

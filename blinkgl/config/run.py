@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -184,7 +184,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
     return tuple(made)
 
 
-def _group(name: str, tree: dict[str, Any], template: RunTemplate, enabled: bool) -> Group:
+def _group(name: str, tree: dict[str, object], template: RunTemplate, enabled: bool) -> Group:
     made = RunTemplate(tree, template.base)
     config: SequenceConfig = made.check()
     return Group(name, made, config.output.first_index, config.output.sequences, enabled)
@@ -195,7 +195,7 @@ def derived_seed(seed: int, name: str) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little") >> 1
 
 
-def without_places(node: Any) -> Any:
+def without_places(node: object) -> Any:
     """Return a copy of plain data with absolute paths by their last parts: another mount, node or container has the
     same files at another place, and contents are compared."""
     if isinstance(node, dict):
@@ -205,7 +205,7 @@ def without_places(node: Any) -> Any:
     return Path(node).name if isinstance(node, str) and Path(node).is_absolute() else node
 
 
-def _plain(node: Any) -> Any:
+def _plain(node: object) -> Any:
     if isinstance(node, dict):
         return [
             ["table"],
@@ -216,7 +216,7 @@ def _plain(node: Any) -> Any:
     return repr(node)
 
 
-def _validated(tree: dict[str, Any]) -> SequenceConfig:
+def _validated(tree: Mapping[str, object]) -> SequenceConfig:
     """Return the SequenceConfig of plain data; the values of a named quality and sensor fill in the keys that are not
     given. Each of several sensors keeps the rules of a single camera."""
     tree = with_whole_sensors(with_default(tree), FILLS)

@@ -22,6 +22,7 @@ differ. A sequence draws one unit; :func:`load_sensor` returns the middle, or a 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,7 +38,7 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 
 
-def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _emulator_tables(tables: dict[str, dict[str, object]]) -> dict[str, dict[str, object]]:
     """Check the keys of each emulator by a field validator: a rule would combine the keys of all emulators."""
     models = EmulatorConfig.members
     for name, keys in tables.items():
@@ -119,7 +120,7 @@ class SensorConfig(Config):
         known = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
         return {**known, **copy.deepcopy(self.emulators.get(emulator, {}))}
 
-    def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
+    def emulator(self, emulator: str, **overrides: object) -> EmulatorConfig:
         """Return the configuration of the emulator of this name with this sensor's values, then ``overrides``. Raises
         ConfigError."""
         models = EmulatorConfig.members
@@ -146,7 +147,7 @@ def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
     return validate(SensorConfig, middle(table) if unit is None else draw(table, unit, 0), where=str(name))
 
 
-def _check(table: dict[str, Any], where: str) -> None:
+def _check(table: Mapping[str, object], where: str) -> None:
     """Validate values that represent all that a sensor can draw. Raises ConfigError."""
     for tree in corners(table):
         validate(SensorConfig, tree, where=where)
@@ -160,12 +161,12 @@ def sensor_table(name: Any) -> dict[str, Any]:
         return shipped("sensors", known_sensor(_sensor(name)))
 
 
-def is_sensor_file(name: Any) -> bool:
+def is_sensor_file(name: object) -> bool:
     """Return whether a sensor's name is the path of a file."""
     return isinstance(name, str) and name.lower().endswith((".yaml", ".yml"))
 
 
-def known_sensor(name: Any) -> str | None:
+def known_sensor(name: object) -> str | None:
     """Return the name in :func:`sensor_names` that ``name`` means; None if it is not shipped."""
     plain = lambda s: "".join(c for c in s.lower() if c.isalnum())
     return (
@@ -175,7 +176,7 @@ def known_sensor(name: Any) -> str | None:
     )
 
 
-def sensor_file_or_name(sensor: Any, base: Path) -> Any:
+def sensor_file_or_name(sensor: Any, base: Path) -> object:
     """Return the value of a run's key ``sensor`` with a file's path (relative to ``base``) replaced by its table. A
     shipped sensor with distributions becomes its table, too, because a sequence must record the unit it drew; the
     others remain a name. Raises ConfigError."""
@@ -188,14 +189,14 @@ def sensor_file_or_name(sensor: Any, base: Path) -> Any:
     return table if _has_distributions(table) else sensor
 
 
-def _has_distributions(node: Any) -> bool:
+def _has_distributions(node: object) -> bool:
     if is_distribution(node):
         return True
     inside = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
     return any(_has_distributions(child) for child in inside)
 
 
-def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
+def fill_sensor(sensor: Any, emulator: object) -> dict[str, Any]:
     """Return the keys that ``sensor``, a name or a table, gives to a configuration with ``emulator`` (None: the default
     one); none for an unknown sensor or an invalid table."""
     try:
@@ -209,7 +210,7 @@ def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
     return keys if camera.readout is None else {**keys, "readout": camera.readout.model_dump()}
 
 
-def _sensor(name: Any) -> Any:
+def _sensor(name: object) -> object:
     if known_sensor(name) is None:
         raise Refused(
             "unknown sensor",

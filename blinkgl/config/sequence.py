@@ -8,7 +8,7 @@ read (:mod:`blinkgl.config.draw`).
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -125,7 +125,7 @@ def span_s(duration: float, label_rate: float) -> float:
     return duration + 1 / label_rate
 
 
-def _is_offered(name: Any) -> Any:
+def _is_offered(name: object) -> object:
     """Refuse multi-sampling, which 0.1.0 had: it cost more than ``taps4`` and had more error than ``ssaa2``
     (docs/trade.md)."""
     if name == "msaa4":
@@ -306,7 +306,7 @@ class SequenceConfig(Config):
         which are not used."""
         assert self.sensors is not None
         one = self.sensors[number]
-        own: dict[str, Any] = {key: getattr(one, key) for key in SECTIONS}
+        own: dict[str, object] = {key: getattr(one, key) for key in SECTIONS}
         if one.events is None:
             own["events"] = self.events
         preview = self.preview.model_copy(update={"enabled": False})

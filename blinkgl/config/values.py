@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from blinkgl.config.materials import Radiance
 
 
-def as_pair(value: Any) -> Any:
+def as_pair(value: object) -> object:
     """Return a range; a number is both of its ends."""
     # Text too: YAML 1.1 reads 1e-1 as text, and pydantic converts it later.
     return (value, value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else value
@@ -22,7 +22,7 @@ def ordered(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-def _as_list(value: Any) -> Any:
+def _as_list(value: object) -> object:
     return (value,) if isinstance(value, str) else value
 
 
@@ -43,7 +43,7 @@ def word_or_list(words: tuple, kinds: tuple[str, ...] = ()) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-def number_or_three(value: Any) -> Any:
+def number_or_three(value: object) -> object:
     """Return a number, or a list of three. Raises ValueError."""
     items = value if isinstance(value, (list, tuple)) else [value]
     try:
@@ -59,7 +59,7 @@ def number_or_three(value: Any) -> Any:
     return value
 
 
-def parameter_value(value: Any) -> Any:
+def parameter_value(value: object) -> object:
     """Return a word unchanged, for the primitive to check, and a number as a number (YAML 1.1 reads 1e-1 as text)."""
     if isinstance(value, str):
         try:
@@ -69,7 +69,7 @@ def parameter_value(value: Any) -> Any:
     return number_or_three(value)
 
 
-def greater_than_zero(value: Any) -> Any:
+def greater_than_zero(value: Any) -> object:
     """Return a number or a tuple of them, each in (0, 1e9]. Raises ValueError."""
     values = value if isinstance(value, tuple) else (value,)
     if min(values) <= 0 or max(values) > 1e9:

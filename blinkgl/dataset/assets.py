@@ -8,7 +8,6 @@ import posixpath
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from blinkgl.config.base import placed
 from blinkgl.config.run import Group, RunTemplate, without_places
@@ -92,12 +91,12 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
             yield config
 
 
-def _falls(tree: Any) -> bool:
+def _falls(tree: object) -> bool:
     """Return whether some draw of a recipe may have physics."""
     return any(physics is not None for physics in _values(tree, "physics"))
 
 
-def _values(tree: Any, key: str) -> Iterator[Any]:
+def _values(tree: object, key: str) -> Iterator[object]:
     """Yield what ``key`` says anywhere in plain data."""
     if isinstance(tree, dict):
         yield from [tree[key]] if key in tree else ()

@@ -208,7 +208,7 @@ class RayCluster:
 
         return NodeAffinitySchedulingStrategy(node_id=node, soft=soft)
 
-    def _collect(self, reference: Any) -> Message:
+    def _collect(self, reference: object) -> Message:
         task = self._tasks.pop(reference)
         reason = self._reasons.pop(task, None)
         exceptions = self._ray.exceptions
@@ -282,7 +282,7 @@ def _egl_device(gpu_ids: list) -> int | None:
     return cards[int(gpu_ids[0])] if int(gpu_ids[0]) < len(cards) else None
 
 
-def _hello(job: tuple[dict[str, Any], list[str]]) -> Message:
+def _hello(job: tuple[dict[str, object], list[str]]) -> Message:
     try:
         return _open(*job)[1]
     except BlinkGLError as error:
@@ -290,7 +290,7 @@ def _hello(job: tuple[dict[str, Any], list[str]]) -> Message:
 
 
 def _work(
-    job: tuple[dict[str, Any], list[str]], task: int, attempt: int, expected: tuple[dict[str, str], str], board: Any
+    job: tuple[dict[str, object], list[str]], task: int, attempt: int, expected: tuple[dict[str, str], str], board: Any
 ) -> Message:
     try:
         if _maker is None or _maker.job.to_dict() != job[0]:

@@ -246,7 +246,7 @@ def comparable(config: SequenceConfig) -> dict[str, Any]:
     return tree
 
 
-def first_difference(a: Any, b: Any, path: str = "") -> str:
+def first_difference(a: object, b: object, path: str = "") -> str:
     """Return the dotted path of the first difference, "" when they are equal. Numbers that a text form rounds are
     equal."""
     if isinstance(a, dict) and isinstance(b, dict):

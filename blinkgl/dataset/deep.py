@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from blinkgl.dataset.cross_checks import Known, Verification, guarded, made_with
 from blinkgl.dataset.generate import generate_sequence
@@ -91,7 +90,7 @@ def _compared(name: str, one: Known, made: Path, result: Verification) -> list[s
     return problems
 
 
-def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
+def _apart(one: dict[str, object], other: dict[str, object]) -> str:
     """Return what may make the bytes of two machines differ; "" where nothing does."""
     mine, here = ({"BlinkGL": manifest.get("blinkgl"), **made_with(manifest)} for manifest in (one, other))
     different = [k for k in mine.keys() | here.keys() if mine.get(k) != here.get(k)]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import operator
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,7 @@ def drop(root: str | Path, names: Sequence[str] = (), where: Sequence[str] = (),
     return sorted(chosen)
 
 
-def _meeting(lines: list[dict[str, Any]], where: Sequence[str]) -> Iterator[str]:
+def _meeting(lines: list[dict[str, object]], where: Sequence[str]) -> Iterator[str]:
     """Yield the names of the sequences that meet all conditions; of a rig one camera has to."""
     conditions = [_CONDITION.fullmatch(text) for text in where]
     if None in conditions:
@@ -85,7 +85,7 @@ def _meeting(lines: list[dict[str, Any]], where: Sequence[str]) -> Iterator[str]
             yield task_of(line)
 
 
-def _met(line: dict[str, Any], key: str, test: str, text: str) -> bool:
+def _met(line: Mapping[str, object], key: str, test: str, text: str) -> bool:
     value, compare = line.get(key), _TESTS[test]
     if key not in line:
         raise ConfigError("unknown key", where="--where", value=key, accepted=f"one of {', '.join(sorted(line))}")

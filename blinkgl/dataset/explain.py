@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.config.over_time import imu_count, track_times
@@ -83,7 +83,7 @@ def error_in_words(config: SequenceConfig) -> str:
     return "not measured for these settings; blinkgl trade measures it for your scene"
 
 
-def _apart(table: str, mine: dict[str, Any], usual: dict[str, Any]) -> list[str]:
+def _apart(table: str, mine: Mapping[str, object], usual: Mapping[str, object]) -> list[str]:
     return [
         f"{table}.{key} {_plain(mine[key])} (not {_plain(usual[key])})"
         for key in COMPARED[table]
@@ -91,7 +91,7 @@ def _apart(table: str, mine: dict[str, Any], usual: dict[str, Any]) -> list[str]
     ]
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -130,7 +130,7 @@ class Explanation:
     def add(self, name: str, why: str, count: int) -> None:
         self.passes.append(Pass(name, why, count))
 
-    def leave_out(self, *parts: tuple[str, Any, str]) -> None:
+    def leave_out(self, *parts: tuple[str, object, str]) -> None:
         """List those parts, (name, whether it is there, why not), that are not there."""
         self.left_out += [(name, why) for name, there, why in parts if not there]
 

@@ -97,9 +97,7 @@ class PreviewRecorder:
                 self._video.close() if kind is None else self._video.abort()
 
 
-def generate_run(
-    template: RunTemplate, out: str | Path, num: int | None = None, progress: Progress | None = None
-) -> Iterator[SequenceReport]:
+def generate_run(template: RunTemplate, out: str | Path, num: int | None = None) -> Iterator[SequenceReport]:
     """Generate ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order, in this
     process, and yield a report after each. The first error ends it; :mod:`blinkgl.dataset.run` is the loop that
     continues.
@@ -118,7 +116,7 @@ def generate_run(
             # The first sequence that is drawn opens the context, which the others share.
             if gl is None and config.frames is None:
                 gl = stack.enter_context(create_context(config.gl.backend, config.gl.device))
-            yield generate_sequence(config, task.index, out, gl, base=template.base, progress=progress)
+            yield generate_sequence(config, task.index, out, gl, base=template.base)
 
 
 def generate_sequence(

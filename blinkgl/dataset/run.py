@@ -148,7 +148,7 @@ def _leave(plan: Plan, folder: RunFolder, outcome: Outcome, assets: dict[str, st
         # Deleted during the run; without it the recipe of the run would be unknown.
         if folder.read("run.json") is None:
             folder.begin(plan, assets, folder.environment, num)
-    folder.write_failures(outcome.set_aside, plan)
+    folder.write_failures(outcome.set_aside)
     with contextlib.suppress(OutputError):
         write_index(folder.out)
 

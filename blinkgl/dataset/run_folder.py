@@ -20,7 +20,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -332,7 +332,7 @@ class RunFolder:
     def log(self, name: str, text: str) -> None:
         SequenceLog(self.out, name).write(text)
 
-    def write_failures(self, set_aside: dict[str, str], plan: Plan) -> None:
+    def write_failures(self, set_aside: dict[str, str]) -> None:
         """Write the failures of this run, and of earlier runs whose sequences are still incomplete."""
         before = self.read("failed.json") or {}
         still = {name: reason for name, reason in {**before, **set_aside}.items() if self.state(name) != ""}
@@ -356,7 +356,7 @@ class RunFolder:
 
     def costs(self) -> list[dict[str, Any]]:
         """Return the last line of each sequence; a line cut by a crash is left out."""
-        costs: dict[str, dict[str, Any]] = {}
+        costs: dict[str, dict[str, object]] = {}
         with contextlib.suppress(FileNotFoundError, AssetError):
             for line in read_text(self.record("costs.jsonl")).splitlines():
                 with contextlib.suppress(ValueError):
@@ -384,5 +384,5 @@ class RunFolder:
             path.write_text(_text(data), encoding="utf-8")
 
 
-def _text(data: dict[str, Any]) -> str:
+def _text(data: Mapping[str, object]) -> str:
     return json.dumps(data, indent=1, sort_keys=True) + "\n"

@@ -106,7 +106,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     key = f"{called}_{k:06d}"
     count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
     start, end = read_label_times(folder / str(_FLOW.stamps), 2, count)[k]
-    about: dict[str, Any] = {
+    about: dict[str, object] = {
         "sequence": called,
         "label": k,
         "from_us": start,

@@ -7,7 +7,7 @@ Any content of a record, valid or not, leads to a line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ def times_of(config: SequenceConfig) -> list[tuple[str, Any]]:
     return [("t_offset_us", t0), ("duration_us", t1 - t0)]
 
 
-def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: bool = True) -> list[str]:
+def bound(name: str, manifest: dict[str, object], config: SequenceConfig, events: bool = True) -> list[str]:
     """Return where the folder's name, the manifest and the sequence's own configuration disagree, and missing or extra
     files.
     events : whether there are some."""
@@ -81,7 +81,7 @@ def bound(name: str, manifest: dict[str, Any], config: SequenceConfig, events: b
     return problems
 
 
-def unlike(manifest: dict[str, Any], said: list[tuple[str, Any]]) -> list[str]:
+def unlike(manifest: Mapping[str, object], said: list[tuple[str, object]]) -> list[str]:
     """Return where the manifest differs from ``said``."""
     return [
         f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}"
@@ -184,7 +184,7 @@ def look(folder: Path, name: str) -> tuple[list[str], Known | None]:
     return guarded(check), known[0] if known else None
 
 
-def look_at_sensors(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def look_at_sensors(folder: Path, name: str, manifest: dict[str, object], config: SequenceConfig) -> list[str]:
     """Return the problems of a rig's folder whose files are complete: its own, and those of each camera's folder."""
     if config.sensors is None:
         return ["config.yaml: a single camera's, but the manifest is a rig's"]
@@ -199,7 +199,7 @@ def look_at_sensors(folder: Path, name: str, manifest: dict[str, Any], config: S
     return problems or unlike(manifest, [("events", sum(read_manifest(folder / name)["events"] for name in names))])
 
 
-def look_at_camera(folder: Path, name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def look_at_camera(folder: Path, name: str, manifest: dict[str, object], config: SequenceConfig) -> list[str]:
     """Return the problems of the folder of a camera, of a rig's if the configuration has several sensors."""
     for camera in config.cameras():
         if camera.name == (manifest.get("sensor") or ""):

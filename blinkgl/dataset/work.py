@@ -82,18 +82,18 @@ class Job:
     def plan(self) -> Plan:
         return Plan.of(RunTemplate(parse_yaml(self.recipe, "recipe"), Path(self.base)), self.num)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         return asdict(self)
 
 
-def maker_of(name: str, job: Mapping[str, Any], device: int | None) -> Maker:
+def maker_of(name: str, job: Mapping[str, object], device: int | None) -> Maker:
     """Return the maker called ``name`` ("module:class", of a job's ``maker``) for a job in plain data."""
     load_plugins()  # those of the process that started this one
     module, _, kind = name.partition(":")
     return getattr(importlib.import_module(module), kind).of(job, device)
 
 
-def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.environ) -> dict[str, str]:
+def thread_environment(workers: int, cores: int) -> dict[str, str]:
     """Return variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed.
     Variables set by the user are kept. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) if there are two
     workers or more (two processes then draw 1.2-1.35 times as fast as one with two threads), or one on a single
@@ -102,7 +102,7 @@ def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.e
     wanted = {"NUMBA_NUM_THREADS": str(share), "OMP_NUM_THREADS": str(share), "OPENBLAS_NUM_THREADS": str(share)}
     if workers > 1 or cores == 1:
         wanted["LP_NUM_THREADS"] = "0" if share == 1 else str(share)
-    return {key: value for key, value in wanted.items() if key not in given}
+    return {key: value for key, value in wanted.items() if key not in os.environ}
 
 
 class Maker:

@@ -11,7 +11,7 @@ Coefficients are Chebyshev fits made with mpmath on the reduced intervals; the t
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numba.extending import overload, register_jitable
@@ -42,7 +42,7 @@ def _bits_f64(v):
 
 
 @register_jitable
-def horner(v: float, coefficients: tuple[Any, ...]) -> float:
+def horner(v: float, coefficients: tuple[object, ...]) -> float:
     """Return the polynomial of v, coefficients from the highest power down; one rounding for each product and sum."""
     p = v * coefficients[0] + coefficients[1]
     for k in range(2, len(coefficients)):

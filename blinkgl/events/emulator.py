@@ -11,13 +11,12 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import LOG_MAX_INPUT
+from blinkgl.events.bands import BLOCK, Work
 from blinkgl.events.packing import MAX_CAUSE_ROWS, MAX_INTERVAL_NS, PackedBuffer
 from blinkgl.events.response import Response
 from blinkgl.events.threads import run, thread_count
 from blinkgl.types.events import Events
 
-BLOCK = 1024
-"""Pixels that a kernel processes at once: their data fits the first cache levels. Threads get whole blocks."""
 SHARE_BLOCKS = 64
 """Smallest share of a thread: 65,536 pixels, 100 µs and more. Waking a thread takes 20 to 50 µs."""
 BANDS_PER_THREAD = 4
@@ -93,7 +92,7 @@ class Emulator(ABC):
     _state: ClassVar[tuple[str, ...]] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
         if "_advance" in cls.__dict__ and "_still_pixels_sleep" not in cls.__dict__:
             cls._still_pixels_sleep = False
@@ -262,11 +261,8 @@ class Emulator(ABC):
         """Run a band kernel over all blocks, on up to :func:`~blinkgl.events.threads.thread_count` threads, and sort
         its events.
 
-        ``kernel(taken, start, edges, progress, share, packed, *arguments)`` takes bands of whole blocks, [edges[b],
-        edges[b + 1]), by :func:`~blinkgl.events.threads.take_part` until there are none. In band b it continues from
-        block ``progress[b, 0]`` with ``progress[b, 1]`` events in ``packed[b]``, and stops early when that might not
-        hold the next block; it then continues from there in a larger buffer. ``share`` is the number of events a block
-        may emit.
+        ``kernel(taken, start, work, *arguments)`` calls :func:`~blinkgl.events.bands.drive`. A band that stops early,
+        because its buffer might not hold the next block, continues from there in a larger one.
         """
         first, stop = self._changed if self._still_pixels_sleep else (0, self.height * self.width)
         first_block, stop_block = first // BLOCK, -(-stop // BLOCK)
@@ -284,7 +280,8 @@ class Emulator(ABC):
         while True:
             # The first room is for one event of every fourth pixel.
             packed = self._buffer.rows(bands, self.height * self.width // (4 * bands))
-            run(kernel, bands, (edges, progress, share, packed, *arguments), threads)
+            work = Work(edges=edges, progress=progress, packed=packed, share=share, pixels=self.height * self.width)
+            run(kernel, bands, (work, *arguments), threads)
             # Every band has reached its end.
             if (progress[:, 0] >= edges[1:]).all():
                 break
@@ -301,7 +298,7 @@ class Emulator(ABC):
         clock = [self.t_ns is not None, self.t_ns or 0, self.frames, self.saturated]
         return {"clock": np.array(clock, np.int64), "shape": np.array([self.height, self.width]), **state}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         """Restore the result of :meth:`state_dict` in an emulator with the same size, config and seed."""
         wanted = {name for name in self._state if getattr(self, name) is not None} | {"clock", "shape"}
         if set(state) != wanted or tuple(state["shape"]) != (self.height, self.width):

@@ -24,12 +24,12 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator, Source
-from blinkgl.events.packing import T_SHIFT, compact_flags, copy_block, lookup_block
+from blinkgl.events.bands import BLOCK, driver
+from blinkgl.events.emulator import NEVER_NS, Emulator, Source
+from blinkgl.events.packing import T_SHIFT, copy_block, lookup_block
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters
 from blinkgl.events.response import Response
 from blinkgl.events.table import register
-from blinkgl.events.threads import take_part
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -108,7 +108,7 @@ def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
 
 
 @kernel(error_model="numpy")
-def _emit_block(active, count, first, now, p, v, cap, packed, begin):
+def _emit_block(active, first, now, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
     levels. Return (end of the events, events cut by ``cap``)."""
     out, cut = begin, 0
@@ -118,7 +118,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
     row_end = (y + 1) * v.width
     # The interval's start after the microsecond base, 0 to 999.
     start_ns = v.t0_ns - 1000 * v.base_us
-    for j in range(count):
+    for j in range(active.size):
         i = np.int64(active[j])
         while i >= row_end:
             y += 1
@@ -174,54 +174,34 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin):
     return out, cut
 
 
-@kernel(error_model="numpy")
-def _band(first_block, stop_block, share, packed, filled, source, p, v):
-    """Process the blocks of a band, see :meth:`Emulator._run`."""
-    # Scratch memory of one block. compact_flags writes eight numbers at a time, so ``active``
-    # has eight more.
-    cut, pixels = 0, p.log.size
-    flags, scratch = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
-    active, now = np.empty(BLOCK + 8, np.int32), np.empty(BLOCK, np.int32)
-    for block in range(first_block, stop_block):
-        s = block * BLOCK
-        e = min(s + BLOCK, pixels)
-        n = e - s
-        if n < BLOCK:
-            # The last block is shorter, and compact_flags looks at whole words.
-            flags[:] = 0
-        # A uint8 frame needs 256 logarithms, which are in the table.
-        if source.codes.size:
-            lookup_block(source.codes[s:e], source.table, now[:n])
-        else:
-            log_block(source.frame[s:e], v.eps, now[:n])
-        farthest = _flag_block(now[:n], p.upper[s:e], p.lower[s:e], flags)
-        if farthest >= 0:
-            count = compact_flags(flags, scratch, s, active)
-            # As many events a pixel as levels fit between the first one and the farthest, rounded up; never more than
-            # the block's share.
-            cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
-            if count * cap > share:
-                cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been changed: the caller makes room and repeats it.
-            if filled + count * cap > packed.size:
-                return block, filled, cut
-            filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled)
-            cut += cut_here
-        # The copy comes last, because p.log is the previous frame until here.
-        copy_block(now[:n], p.log[s:e])
-    return stop_block, filled, cut
+@register_jitable(inline="always")
+def _sense(block, s, e, source, p, v, flags, now):
+    """See :mod:`blinkgl.events.bands`; the state at the end is the logarithms."""
+    end = now[: e - s]
+    # A uint8 frame needs 256 logarithms, which are in the table.
+    if source.codes.size:
+        lookup_block(source.codes[s:e], source.table, end)
+    else:
+        log_block(source.frame[s:e], v.eps, end)
+    farthest = _flag_block(end, p.upper[s:e], p.lower[s:e], flags)
+    if farthest < 0:
+        return np.int64(0), end
+    # As many events a pixel as levels fit between the first one and the farthest, rounded up; never more than the
+    # block's share.
+    return min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel), end
+
+
+@register_jitable(inline="always")
+def _keep(block, s, e, end, p):
+    copy_block(end, p.log[s:e])
+
+
+_drive = driver(_sense, _emit_block, _keep)
 
 
 @kernel(error_model="numpy")
-def _bands(taken, start, edges, progress, share, packed, source, p, v):
-    # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
-    # until none is left.
-    b = take_part(taken, start)
-    while b >= 0:
-        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], source, p, v)
-        progress[b, 0], progress[b, 1] = block, filled
-        progress[b, 2] += cut
-        b = take_part(taken, start)
+def _bands(taken, start, work, source, p, v):
+    _drive(taken, start, work, source, p, v, np.empty(BLOCK, np.int32))
 
 
 def to_q25(value: float | np.ndarray) -> np.ndarray:

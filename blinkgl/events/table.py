@@ -76,7 +76,7 @@ def _checked(emulator: Any) -> str:
         raise TypeError(f"{emulator!r} is not a subclass of Emulator")
     name = emulator.__name__
 
-    def unless(right: Any, part: str, problem: str) -> None:
+    def unless(right: object, part: str, problem: str) -> None:
         if not right:
             raise TypeError(f"emulator {name}: `{part}` {problem}")
 

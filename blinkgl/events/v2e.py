@@ -23,18 +23,20 @@ from __future__ import annotations
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator, Source
+from blinkgl.events.bands import BLOCK, driver
+from blinkgl.events.emulator import NEVER_NS, Emulator, Source
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import compact_flags, copy_block, lookup_block, scale_block
+from blinkgl.events.packing import copy_block, lookup_block, scale_block
 from blinkgl.events.response import Response
 from blinkgl.events.table import register
-from blinkgl.events.threads import take_part
 from blinkgl.events.v2e_blocks import (
     DRAWS,
+    End,
     add_scaled_block,
     emit,
     flag_block,
@@ -108,91 +110,81 @@ class Interval(NamedTuple):
     bound_per_pixel: int
 
 
-@kernel(error_model="numpy")
-def _band(first_block, stop_block, share, packed, filled, source, p, v):
-    """Process the blocks of a band, see :meth:`Emulator._run`."""
-    cut, pixels = 0, p.x.size
-    # Scratch memory of one block. compact_flags writes eight numbers at a time.
-    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
-    now, normals = np.empty((5, BLOCK), _F), np.empty(BLOCK, _F)
-    keys, draws = np.empty(BLOCK, np.int64), (np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS))
-    clock_ns, clock_index = np.int64(0), np.int64(0)
-    for block in range(first_block, stop_block):
-        s = block * BLOCK
-        e = min(s + BLOCK, pixels)
-        n = e - s
-        if n < BLOCK:
-            flags[:] = 0
-        # The block's state at the interval's end; z is what the comparator sees. ``p`` is of the frame before.
-        intensity, x, lag, noise, z = now[0, :n], now[1, :n], now[2, :n], now[3, :n], now[4, :n]
-        # uint8 frames: luminance and lin-log of all 256 codes are in tables.
-        if source.codes.size:
-            lookup_block(source.codes[s:e], source.signals, x)
-            lookup_block(source.codes[s:e], source.table, intensity)
-        else:
-            scale_block(source.frame[s:e], v.scale, intensity)
-            lin_log_block(intensity, x)
-        # The low-pass of the photoreceptor.
-        if p.lag.size:
-            relax_block(p.lag[s:e], p.x[s:e], x, p.intensity[s:e], intensity, _F(v.kappa), lag, z)
-        else:
-            copy_block(x, z)
-        if p.leak.size:
-            add_scaled_block(p.leak[s:e], _F(v.since_epoch_1), z)
-        if p.noise.size:
-            noise_block(
-                p.noise[s:e], p.intensity[s:e], intensity, _F(v.kappa), p.noise_sizes, v.seed, v.step, s, normals,
-                noise, z,
-            )  # fmt: skip
-        farthest = flag_block(z, p.upper[s:e], p.lower[s:e], flags)
-        shots = 0
-        if p.clock_ns.size:
-            shots, clock_ns, clock_index = shot_block(block, n, p, v, intensity, keys, draws)
-            # -1 event: no room. Draws are functions of their numbers, so the block is done again with twice the room.
-            while shots < 0:
-                keys = np.empty(2 * keys.size, np.int64)
-                shots, clock_ns, clock_index = shot_block(block, n, p, v, intensity, keys, draws)
-            # A pixel with shot noise is listed even where its signal reaches no level. Bits 42 and up: its number.
-            for j in range(shots):
-                flags[keys[j] >> 42] = 1
-        if farthest >= _ZERO or shots:
-            count = compact_flags(flags, scratch, s, active)
-            # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
-            cap = (
-                min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
-            )
-            if count * cap > share:
-                cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been changed.
-            if filled + count * cap > packed.size:
-                return block, filled, cut
-            filled, cut_here = emit(
-                active[:count], s, (intensity, x, lag, noise), keys[:shots], p, v, cap, packed, filled
-            )
-            cut += cut_here
-        # Last, because these arrays hold the previous frame until here.
-        if p.intensity.size:
-            copy_block(intensity, p.intensity[s:e])
-        copy_block(x, p.x[s:e])
-        if p.lag.size:
-            copy_block(lag, p.lag[s:e])
-        if p.noise.size:
-            copy_block(noise, p.noise[s:e])
-        if p.clock_ns.size:
-            p.clock_ns[block], p.clock_index[block] = clock_ns, clock_index
-    return stop_block, filled, cut
+class Scratch(NamedTuple):
+    """Memory of a thread for one block."""
+
+    now: np.ndarray  # (5, BLOCK) float32: intensity, x, lag, noise and comparator's input at the interval's end
+    normals: np.ndarray  # (BLOCK,) float32
+    keys: np.ndarray  # (BLOCK,) int64, see shot_block
+    draws: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@register_jitable(inline="always")
+def _sense(block, s, e, source, p, v, flags, scratch):
+    """See :mod:`blinkgl.events.bands`."""
+    n = e - s
+    now, keys = scratch.now, scratch.keys
+    # z is what the comparator sees. ``p`` is of the frame before.
+    intensity, x, lag, noise, z = now[0, :n], now[1, :n], now[2, :n], now[3, :n], now[4, :n]
+    # uint8 frames: luminance and lin-log of all 256 codes are in tables.
+    if source.codes.size:
+        lookup_block(source.codes[s:e], source.signals, x)
+        lookup_block(source.codes[s:e], source.table, intensity)
+    else:
+        scale_block(source.frame[s:e], v.scale, intensity)
+        lin_log_block(intensity, x)
+    # The low-pass of the photoreceptor.
+    if p.lag.size:
+        relax_block(p.lag[s:e], p.x[s:e], x, p.intensity[s:e], intensity, _F(v.kappa), lag, z)
+    else:
+        copy_block(x, z)
+    if p.leak.size:
+        add_scaled_block(p.leak[s:e], _F(v.since_epoch_1), z)
+    if p.noise.size:
+        noise_block(
+            p.noise[s:e], p.intensity[s:e], intensity, _F(v.kappa), p.noise_sizes, v.seed, v.step, s,
+            scratch.normals, noise, z,
+        )  # fmt: skip
+    farthest = flag_block(z, p.upper[s:e], p.lower[s:e], flags)
+    shots, clock_ns, clock_index = 0, np.int64(0), np.int64(0)
+    if p.clock_ns.size:
+        shots, clock_ns, clock_index = shot_block(block, n, p, v, intensity, keys, scratch.draws)
+        # -1 event: no room. Draws are functions of their numbers, so the block is done again with twice the room.
+        while shots < 0:
+            keys = np.empty(2 * keys.size, np.int64)
+            shots, clock_ns, clock_index = shot_block(block, n, p, v, intensity, keys, scratch.draws)
+        # A pixel with shot noise is listed even where its signal reaches no level. Bits 42 and up: its number.
+        for j in range(shots):
+            flags[keys[j] >> 42] = 1
+    end = End(intensity, x, lag, noise, keys[:shots], clock_ns, clock_index)
+    if farthest < _ZERO and not shots:
+        return np.int64(0), end
+    # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
+    levels = np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2
+    return min(levels, v.bound_per_pixel) + shots, end
+
+
+@register_jitable(inline="always")
+def _keep(block, s, e, end, p):
+    if p.intensity.size:
+        copy_block(end.intensity, p.intensity[s:e])
+    copy_block(end.x, p.x[s:e])
+    if p.lag.size:
+        copy_block(end.lag, p.lag[s:e])
+    if p.noise.size:
+        copy_block(end.noise, p.noise[s:e])
+    if p.clock_ns.size:
+        p.clock_ns[block], p.clock_index[block] = end.clock_ns, end.clock_index
+
+
+_drive = driver(_sense, emit, _keep)
 
 
 @kernel(error_model="numpy")
-def _bands(taken, start, edges, progress, share, packed, source, p, v):
-    # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
-    # until none is left.
-    b = take_part(taken, start)
-    while b >= 0:
-        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], source, p, v)
-        progress[b, 0], progress[b, 1] = block, filled
-        progress[b, 2] += cut
-        b = take_part(taken, start)
+def _bands(taken, start, work, source, p, v):
+    draws = (np.empty(DRAWS, np.int64), np.empty(DRAWS), np.empty(DRAWS))
+    scratch = Scratch(np.empty((5, BLOCK), _F), np.empty(BLOCK, _F), np.empty(BLOCK, np.int64), draws)
+    _drive(taken, start, work, source, p, v, scratch)
 
 
 _TAIL = 4.0

@@ -4,13 +4,13 @@ see :mod:`blinkgl.events.packing`.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.events.arith import select
-from blinkgl.events.emulator import BLOCK
+from blinkgl.events.bands import BLOCK
 from blinkgl.events.packing import CAUSE_SHIFT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, normal2, rough_normal, uniform2
 from blinkgl.events.v2e_model import (
@@ -209,12 +209,23 @@ _NONE, _CROSSING, _BY_SHOT = 0, 1, 2
 _NANOSECONDS = 2**41 - 1  # bits 1 to 41 of a key: its time
 
 
+class End(NamedTuple):
+    """State of one block at the interval's end, as in :class:`~blinkgl.events.v2e.Pixels`."""
+
+    intensity: np.ndarray
+    x: np.ndarray
+    lag: np.ndarray
+    noise: np.ndarray
+    keys: np.ndarray  # int64: its shot noise in the interval, sorted, see shot_block
+    clock_ns: int  # of its next shot noise candidate
+    clock_index: int
+
+
 @kernel(error_model="numpy")
 def emit(
     active: np.ndarray,
     first: int,
-    now: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    keys: np.ndarray,
+    at_end: End,
     p: Any,
     v: Any,
     cap: int,
@@ -223,8 +234,7 @@ def emit(
 ) -> tuple[int, int]:
     """Write the events of the listed pixels to ``packed[begin:]``, pixel by pixel, and move their levels.
 
-    active : int32, in raster order.   first : the pixel that ``now`` and the keys count from.
-    now : (intensity, x, lag, noise) at the interval's end.   keys : int64, sorted shot noise, see ``shot_block``.
+    active : int32, in raster order.   first : the pixel that the block's arrays and keys count from.
     p, v : Pixels and Interval of v2e.py.   cap : most events of a pixel; there is room for as many of each. Returns
     (end of the events, number of events beyond the cap)."""
     dt_ns, dt = v.dt_ns, v.dt_ns * 1e-9
@@ -234,7 +244,8 @@ def emit(
     since, noise_at_reference, hot = p.since_ns, p.noise_then, p.hot
     low_pass, leaking = lag_before.size > 0, leaks.size > 0
     dead_time, causes = release.size > 0, since.size > 0
-    intensity_now, x_now, lag_now, noise_now = now
+    intensity_now, x_now, lag_now, noise_now = at_end.intensity, at_end.x, at_end.lag, at_end.noise
+    keys = at_end.keys
     # Start of the interval after the microsecond base, 0 to 999 ns.
     start_ns = v.t0_ns - 1000 * v.base_us
     out, cut, key = begin, 0, 0

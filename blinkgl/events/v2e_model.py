@@ -13,7 +13,7 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import V2eConfig
 from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, horner, log_f32, log_f64, select
-from blinkgl.events.emulator import BLOCK
+from blinkgl.events.bands import BLOCK
 from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_places, start_sizes
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters, rough_normal, uniform2
 

@@ -34,12 +34,12 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig, VoltmeterConfig
-from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator, Source
+from blinkgl.events.bands import BLOCK, driver
+from blinkgl.events.emulator import NEVER_NS, Emulator, Source
 from blinkgl.events.packing import (
     CAUSE_SHIFT,
     T_SHIFT,
     cause_of,
-    compact_flags,
     copy_block,
     lookup_block,
     scale_block,
@@ -47,7 +47,6 @@ from blinkgl.events.packing import (
 from blinkgl.events.philox import Stream, normal2_and_uniform
 from blinkgl.events.response import Response
 from blinkgl.events.table import register
-from blinkgl.events.threads import take_part
 from blinkgl.events.voltmeter_model import (
     NEAREST,
     V_ONE,
@@ -93,6 +92,7 @@ class Pixels(NamedTuple):
 class Ends(NamedTuple):
     """State of one block at the interval's end, as in :class:`Pixels`."""
 
+    intensity: np.ndarray
     v: np.ndarray
     unspent: np.ndarray
     light: np.ndarray
@@ -199,7 +199,7 @@ def _end_of_part(side, distance, mean, noise, seed, pixel, draw):
 
 
 @kernel(error_model="numpy")
-def _emit_block(active, first, now, end, p, v, cap, packed, begin):
+def _emit_block(active, first, end, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
     voltages.
 
@@ -219,7 +219,7 @@ def _emit_block(active, first, now, end, p, v, cap, packed, begin):
             row_end += v.width
         # The packed word (packing.py) without time and polarity.
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
+        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(end.intensity[i - first]), dt_us, v)
         voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
         t_us = 0.0
         if p.release.size and p.release[i] != NEVER_NS:
@@ -302,63 +302,43 @@ def _emit_block(active, first, now, end, p, v, cap, packed, begin):
     return out, cut
 
 
+@register_jitable(inline="always")
+def _sense(block, s, e, source, p, v, flags, scratch):
+    """See :mod:`blinkgl.events.bands`."""
+    now = scratch.intensity[: e - s]
+    if source.codes.size:
+        lookup_block(source.codes[s:e], source.table, now)
+    else:
+        scale_block(source.frame[s:e], v.scale, now)
+    most = _sense_block(p.intensity[s:e], now, p.v[s:e], p.unspent[s:e], v, scratch.v, scratch.unspent, flags)
+    if p.by_light.size:
+        _share_block(p.intensity[s:e], now, p.by_light[s:e], p.by_leak[s:e], v, scratch.light, scratch.leak)
+    most = np.float64(min(most, _MAX_BOUND))
+    # The cap is far above the mean plus random fluctuations.
+    return min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel), scratch
+
+
+@register_jitable(inline="always")
+def _keep(block, s, e, end, p):
+    n = e - s
+    copy_block(end.intensity[:n], p.intensity[s:e])
+    copy_block(end.v[:n], p.v[s:e])
+    copy_block(end.unspent[:n], p.unspent[s:e])
+    if p.by_light.size:
+        copy_block(end.light[:n], p.by_light[s:e])
+        copy_block(end.leak[:n], p.by_leak[s:e])
+
+
+_drive = driver(_sense, _emit_block, _keep)
+
+
 @kernel(error_model="numpy")
-def _band(first_block, stop_block, share, packed, filled, source, p, v):
-    """Process the blocks of a band, see :meth:`Emulator._run`."""
-    cut, pixels = 0, p.v.size
-    # Scratch memory of one block. compact_flags writes eight numbers at a time.
-    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
-    now, v_end, unspent_end = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+def _bands(taken, start, work, source, p, v):
     shares = BLOCK if p.by_light.size else 0
-    light_end, leak_end = np.empty(shares, np.float32), np.empty(shares, np.float32)
-    end = Ends(v=v_end, unspent=unspent_end, light=light_end, leak=leak_end)
-    for block in range(first_block, stop_block):
-        s = block * BLOCK
-        e = min(s + BLOCK, pixels)
-        n = e - s
-        if n < BLOCK:
-            # compact_flags reads whole words of eight flags.
-            flags[:] = 0
-        if source.codes.size:
-            lookup_block(source.codes[s:e], source.table, now[:n])
-        else:
-            scale_block(source.frame[s:e], v.scale, now[:n])
-        most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], p.unspent[s:e], v, v_end, unspent_end, flags)
-        if p.by_light.size:
-            _share_block(p.intensity[s:e], now[:n], p.by_light[s:e], p.by_leak[s:e], v, light_end[:n], leak_end[:n])
-        most = np.float64(min(most, _MAX_BOUND))
-        count = compact_flags(flags, scratch, s, active)
-        if count:
-            # The cap is far above the mean plus random fluctuations.
-            cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
-            # Every block has its share of max_events_per_step.
-            if count * cap > share:
-                cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been changed: the caller makes room and repeats it.
-            if filled + count * cap > packed.size:
-                return block, filled, cut
-            filled, cut_here = _emit_block(active[:count], s, now, end, p, v, cap, packed, filled)
-            cut += cut_here
-        # The copies come last, because p holds the previous frame until here.
-        copy_block(now[:n], p.intensity[s:e])
-        copy_block(v_end[:n], p.v[s:e])
-        copy_block(unspent_end[:n], p.unspent[s:e])
-        if p.by_light.size:
-            copy_block(light_end[:n], p.by_light[s:e])
-            copy_block(leak_end[:n], p.by_leak[s:e])
-    return stop_block, filled, cut
-
-
-@kernel(error_model="numpy")
-def _bands(taken, start, edges, progress, share, packed, source, p, v):
-    # A row of ``progress`` is a band: next block, events written, events cut. A thread takes bands
-    # until none is left.
-    b = take_part(taken, start)
-    while b >= 0:
-        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], source, p, v)
-        progress[b, 0], progress[b, 1] = block, filled
-        progress[b, 2] += cut
-        b = take_part(taken, start)
+    scratch = Ends(
+        np.empty(BLOCK, _F), np.empty(BLOCK, np.int32), np.empty(BLOCK, _F), np.empty(shares, _F), np.empty(shares, _F)
+    )
+    _drive(taken, start, work, source, p, v, scratch)
 
 
 @register

@@ -63,7 +63,7 @@ def unknown_argument(name: str, known: Iterable[str], prefix: str = "") -> Confi
     return ConfigError("unknown argument", where=prefix + name, accepted=accepted)
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return the value as plain lists and numbers instead of arrays, tuples and NumPy scalars, as a YAML file gives
     it."""
     if isinstance(value, np.ndarray):
@@ -77,7 +77,7 @@ def plain(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def given(**arguments: Any) -> dict[str, Any]:
+def given(**arguments: object) -> dict[str, Any]:
     """Return the arguments that are not None, as plain data."""
     return {name: plain(value) for name, value in arguments.items() if value is not None}
 
@@ -97,7 +97,7 @@ def existing(value: Any, where: str) -> str:
 
 
 def number(
-    value: Any, where: str, *, least: float = -math.inf, most: float = math.inf, above: float = -math.inf
+    value: object, where: str, *, least: float = -math.inf, most: float = math.inf, above: float = -math.inf
 ) -> float:
     """Return a finite number in [least, most] and greater than ``above``. Raises ConfigError."""
     bounds = (
@@ -116,19 +116,19 @@ def number(
     return float(value)
 
 
-def whole(value: Any, where: str, least: int, most: int) -> int:
+def whole(value: object, where: str, least: int, most: int) -> int:
     """Return a whole number in [least, most]. Raises ConfigError."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not least <= int(value) <= most:
         raise ConfigError("not a whole number in range", where=where, value=value, accepted=f"{least} to {most}")
     return int(value)
 
 
-def seed(value: Any, where: str = "seed") -> int:
+def seed(value: object, where: str = "seed") -> int:
     """Return a whole number that is valid as a seed. Raises ConfigError."""
     return whole(value, where, 0, 2**63 - 1)
 
 
-def one_of(value: Any, where: str, kinds: type | tuple[type, ...], accepted: str) -> Any:
+def one_of(value: object, where: str, kinds: type | tuple[type, ...], accepted: str) -> Any:
     """Return ``value`` if it is an instance of one of the classes. Raises ConfigError."""
     if not isinstance(value, kinds):
         kind = type(value).__name__
@@ -136,7 +136,7 @@ def one_of(value: Any, where: str, kinds: type | tuple[type, ...], accepted: str
     return value
 
 
-def array(value: Any, where: str, shape: tuple[int | None, ...], accepted: str) -> np.ndarray:
+def array(value: object, where: str, shape: tuple[int | None, ...], accepted: str) -> np.ndarray:
     """Return a numeric array of the shape (None: any length). Raises ConfigError."""
     try:
         made = np.asarray(value)

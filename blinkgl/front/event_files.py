@@ -107,7 +107,7 @@ def write_events(
     )
 
 
-def _chunks(events: Any) -> Iterator[Events]:
+def _chunks(events: object) -> Iterator[Events]:
     if isinstance(events, Events):
         events = (events,)
     if not isinstance(events, Iterable):
@@ -147,7 +147,7 @@ def convert(
     return count
 
 
-def checked_size(size: Any) -> tuple[int, int]:
+def checked_size(size: object) -> tuple[int, int]:
     """Return (height, width), px. Raises ConfigError."""
     pair = check.one_of(size, "size", (list, tuple), "(height, width)")
     if len(pair) != 2:

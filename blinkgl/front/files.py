@@ -294,7 +294,7 @@ def simulate_file(
     from blinkgl.recordings import simulation
 
     use, options, sensor_size = _options(**frames)
-    declared: dict[str, Any] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
+    declared: dict[str, object] = {**frames, "timestamps": timestamps, "time_unit": time_unit, "background": background}
     declared |= {"stream": stream, "damaged": damaged}
     options = {key: options[key] for key in ("emulator", "seed", "readout")}
     return simulation.file_to_events(

@@ -31,7 +31,7 @@ class Piece:
         if "__init__" in vars(cls):
             cls.__init__ = check.public()(cls.__init__)
 
-    def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
+    def _checked(self, model: type[Config], tree: dict[str, object], **renamed: str) -> dict[str, Any]:
         """Return ``tree`` unchanged if the model accepts it. renamed : further names, as of :attr:`_called`."""
         names = {**self._called, **renamed}
 

@@ -130,7 +130,7 @@ def _pixels(texture: Theirs, notes: list[str]) -> np.ndarray:
     return np.ascontiguousarray(pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2))
 
 
-def _lamp(light: Theirs, pose: np.ndarray) -> dict[str, Any]:
+def _lamp(light: Theirs, pose: np.ndarray) -> dict[str, object]:
     """Return the table of a light, which shines along its -z: lux and candela over pi are the radiance of a white
     surface."""
     back, place = pose[:3, 2] / np.linalg.norm(pose[:3, 2]), pose[:3, 3].tolist()

@@ -84,7 +84,7 @@ class RigSensor(Piece):
         self.tree = tree
 
 
-def _camera_tree(camera: Camera | Mapping[str, Any]) -> dict[str, Any]:
+def _camera_tree(camera: Camera | Mapping[str, object]) -> dict[str, object]:
     """Return all keys of a Camera, so that none of the run's camera is merged into it; only the given ones of a
     table."""
     if isinstance(camera, Mapping):

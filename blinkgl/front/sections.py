@@ -69,7 +69,7 @@ def label_names(labels: Sequence[str | float]) -> set[str | float]:
     return set(wanted)
 
 
-def is_interval(label: Any) -> bool:
+def is_interval(label: object) -> bool:
     """Whether a label is the interval of a flow, s; ``labels.flow`` checks which ones are valid."""
     return isinstance(label, (int, float)) and not isinstance(label, bool)
 
@@ -77,7 +77,7 @@ def is_interval(label: Any) -> bool:
 def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
     """Return the ``labels:`` that requests exactly these. Raises ConfigError as :func:`label_names`."""
     wanted = label_names(labels)
-    everything: dict[str, Any] = {}
+    everything: dict[str, object] = {}
     asked: dict[str, Any] = {}
     for label in LABELS.values():
         label.ask(everything)
@@ -115,7 +115,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def sections(arguments: Mapping[str, Any]) -> dict[str, Any]:
+def sections(arguments: Mapping[str, object]) -> dict[str, Any]:
     """Return the sections of the configuration that the arguments give, without those that are None. Raises
     ConfigError."""
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from blinkgl.config.sensor import SensorConfig, load_sensor as _load_sensor
@@ -22,7 +23,7 @@ _STEP = """
     Raises ConfigError and, from ``step``, EventDataError."""
 
 
-def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, values: dict[str, Any]) -> Emulator:
+def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, values: Mapping[str, object]) -> Emulator:
     height, width = check.whole(height, "height", 1, MAX_SIDE - 1), check.whole(width, "width", 1, MAX_SIDE - 1)
     config, _ = with_sensor({"emulator": kind, **check.plain(values)}, sensor)
     return make_on_device(config, height, width, check.seed(seed))

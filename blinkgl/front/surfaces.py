@@ -92,11 +92,11 @@ class Material(Piece):
                 check.existing(file, f"Material.{key}")
 
 
-def _is_file(image: Any) -> bool:
+def _is_file(image: object) -> bool:
     return isinstance(image, (str, os.PathLike))
 
 
-def _pixels(image: Any, key: str, accepted: str) -> np.ndarray:
+def _pixels(image: object, key: str, accepted: str) -> np.ndarray:
     """Return an array (h, w, 3), of a mask (h, w). Raises ConfigError."""
     where, shape = f"Material.{key}", (None, None) if key == "mask" else (None, None, 3)
     pixels = check.array(image, where, shape, accepted)
@@ -110,11 +110,11 @@ def _pixels(image: Any, key: str, accepted: str) -> np.ndarray:
     return np.array(pixels, np.float32 if light else np.uint8, order="C")  # a copy: the scene is a value
 
 
-def _map(image: Any, key: str) -> np.ndarray:
+def _map(image: object, key: str) -> np.ndarray:
     """Return an array (h, w, 3) uint8, of a mask (h, w)."""
     return _pixels(image, key, f"a file, or an array ({'h, w' if key == 'mask' else 'h, w, 3'}), uint8")
 
 
-def _texture(image: Any) -> data.Texture:
+def _texture(image: object) -> data.Texture:
     pixels = _pixels(image, "image", "a file, or an array (h, w, 3), uint8 sRGB or float linear light from 0 to 1")
     return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))

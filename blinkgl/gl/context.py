@@ -189,7 +189,7 @@ class GLContext(Releasing):
             raise GLError(f"the driver has no {name}", where=self.renderer)
         return ctypes.CFUNCTYPE(restype, *argtypes)(address)
 
-    def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
+    def program(self, name: str, defines: Mapping[str, object] | None = None) -> moderngl.Program:
         """Return the program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
         _refuse_after_fork()
         return self.shaders.program(name, defines)
@@ -329,7 +329,7 @@ def _overridden(device: int) -> int:
     return int(text)
 
 
-def _egl(device: int) -> Any:
+def _egl(device: int) -> object:
     """Return glcontext's EGL object, current in this thread."""
     from glcontext import egl  # type: ignore[missing-module-attribute]  # an extension module
 

@@ -50,7 +50,7 @@ _MESSAGES = (
 _STAGE_HEADER = re.compile(r"(vertex|geometry|fragment)_shader$")
 
 
-def stages_of(defines: Mapping[str, Any] | None) -> tuple[str, ...]:
+def stages_of(defines: Mapping[str, object] | None) -> tuple[str, ...]:
     """Return the stages of a variant of a program that draws, in the order in which they run."""
     return (STAGES[0], GEOMETRY, STAGES[1]) if (defines or {}).get("GEOMETRY_STAGE") else STAGES
 
@@ -89,7 +89,7 @@ def shader_folder() -> Traversable:
 
 
 def expand(
-    name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None
+    name: str, stage: str, defines: Mapping[str, object] | None = None, folder: Traversable | None = None
 ) -> ShaderSource:
     """Return the source of one stage with includes and defines expanded.
 
@@ -121,7 +121,7 @@ def made_includes() -> dict[str, str]:
     return {name: text for make in MADE for name, text in make().items()}
 
 
-def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]:
+def normalised(defines: Mapping[str, object] | None) -> tuple[tuple[str, str], ...]:
     """Return sorted (name, GLSL text) pairs: the key under which a variant is cached."""
     pairs = []
     for key, value in sorted((defines or {}).items()):
@@ -289,7 +289,7 @@ class ShaderLoader:
             tuple[str, tuple[tuple[str, str], ...]], dict[str, str]
         ] = {}  # generated includes of a program
 
-    def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
+    def program(self, name: str, defines: Mapping[str, object] | None = None) -> moderngl.Program:
         """Return the program of file ``name`` with ``defines``; it is compiled when first requested, and again when a
         generated include has changed. Raises ShaderError."""
         key = (name, normalised(defines))
@@ -302,7 +302,7 @@ class ShaderLoader:
         """Return (file, sorted defines) of every program requested so far."""
         return tuple(self._programs)
 
-    def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
+    def _compile(self, name: str, defines: Mapping[str, object] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in stages_of(defines)}
         program = link(self.ctx, sources)
         program.extra = name  # for messages

@@ -47,7 +47,7 @@ _MATRIX, _COMPRESSED, _STRUCT, _ARRAYS = 14, 15, 2, range(6, 16)
 _DAMAGE = (ValueError, LookupError, RuntimeError, StopIteration, struct.error, zlib.error)
 
 
-def read_mat(path: str | os.PathLike) -> dict[str, Any]:
+def read_mat(path: str | os.PathLike) -> dict[str, object]:
     """Return arrays, (N,) or (N, K), by the names of their variables, a struct (or an array of structs, joined) as a
     table of arrays; None for anything else. Raises AssetError: damaged, or it unpacks to far more than it holds."""
     data = memoryview(Path(path).read_bytes())
@@ -91,7 +91,7 @@ def _unpacked(data: memoryview, path: str | os.PathLike) -> Iterator[tuple[int, 
             yield kind, body
 
 
-def _matrix(body: memoryview) -> tuple[str, Any]:
+def _matrix(body: memoryview) -> tuple[str, object]:
     """Return name and value. The fields of each element of a struct array follow each other as matrices without names;
     the elements' columns are joined."""
     parts = _elements(body)
@@ -113,7 +113,7 @@ def _matrix(body: memoryview) -> tuple[str, Any]:
     return name, None
 
 
-def _joined(values: list[Any]) -> Any:
+def _joined(values: list[object]) -> Any:
     arrays = [value for value in values if isinstance(value, np.ndarray)]
     return np.concatenate(arrays) if len(arrays) == len(values) > 1 else values[0] if values else None
 

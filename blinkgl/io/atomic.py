@@ -123,10 +123,10 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
             fsync(final.parent)
 
 
-def write_whole(final: str | os.PathLike, data: str | bytes, *, overwrite: bool = True) -> None:
+def write_whole(final: str | os.PathLike, data: str | bytes) -> None:
     """Write ``data``, text as UTF-8, to a file that appears completely or not at all. Raises OutputError as
     :func:`atomic_file`."""
-    with atomic_file(final, overwrite=overwrite) as temporary, output_errors(final):
+    with atomic_file(final, overwrite=True) as temporary, output_errors(final):
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 

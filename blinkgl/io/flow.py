@@ -50,9 +50,9 @@ def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_
     return encode_png(bgr, cv2.IMWRITE_PNG_STRATEGY_DEFAULT), int(np.count_nonzero(valid & ~holds))
 
 
-def write_flow_png(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_SCALE) -> int:
+def write_flow_png(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray) -> int:
     """Write :func:`encode_flow_png`; return the number of valid pixels that the format could not hold."""
-    png, lost = encode_flow_png(flow, valid, scale=scale)
+    png, lost = encode_flow_png(flow, valid)
     with output_errors(path):
         Path(path).write_bytes(png)
     return lost

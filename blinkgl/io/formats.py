@@ -58,7 +58,7 @@ class EventFormat:
         """Return a reader of the file. Raises AssetError: not what the ending says."""
         return self._class(self.reader)(path, reading)
 
-    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, Any]) -> CheckedWriter:
+    def create(self, path: Path, height: int | None, width: int | None, options: Mapping[str, object]) -> CheckedWriter:
         """Return a writer of the file. options : those that it takes are used."""
         taken = {name: options[name] for name in self.takes}
         return self._class(self.writer)(path, height, width, **self.fixed, **taken)

@@ -271,7 +271,7 @@ def _check_storage(data: h5py.Dataset, name: str, path: Path) -> None:
     if layout.fill_value_defined() == h5py.h5d.FILL_VALUE_USER_DEFINED and data.nbytes <= _MAX_FILLED_BYTES:
         missing = False
     packs = "the camera's .raw" if _ECF in codes else f"{', '.join(_FILTERS.values())} (h5repack -f GZIP=1)"
-    problems: list[tuple[Any, str, Any, str]] = [
+    problems: list[tuple[object, str, object, str]] = [
         (not _plain(data.dtype), f"{name} holds neither numbers nor text", str(data.dtype), "numbers or text"),
         (others, f"{name} is packed by an HDF5 filter that is not run here", ", ".join(others), packs),
         (bare, f"damaged HDF5 file: {name} lacks data that Blosc needs", bare, "its parameters"),
@@ -348,7 +348,7 @@ def growing_dataset(
     )
 
 
-def packing(codec: str, shuffle: int) -> dict[str, Any]:
+def packing(codec: str, shuffle: int) -> dict[str, object]:
     """Return the arguments of ``create_dataset`` for a codec of :func:`growing_dataset`.   shuffle : of Blosc.
 
     Raises ConfigError: hdf5plugin is not installed, which gzip does not need."""
@@ -461,7 +461,7 @@ def _blosc() -> ctypes.CDLL:
     return ctypes.CDLL(str(Path(_plugin().PLUGIN_PATH) / "libh5blosc.so"))
 
 
-def _plugin() -> Any:
+def _plugin() -> object:
     """Return hdf5plugin, whose import makes its filters known to HDF5. Raises ImportError."""
     import hdf5plugin
 

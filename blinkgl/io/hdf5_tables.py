@@ -87,7 +87,7 @@ def _candidates(file: Hdf5File, path: Path, reading: EventReading) -> tuple[list
     return named, plain
 
 
-def _of_records(file: Hdf5File, group: Any, data: Data, fields: dict[str, str], path: Path) -> Table:
+def _of_records(file: Hdf5File, group: object, data: Data, fields: dict[str, str], path: Path) -> Table:
     data.check()
     geometry = any(holder.attribute("geometry") is not None for holder in (data, file))
     known = data.name == "CD/events" or geometry
@@ -95,7 +95,7 @@ def _of_records(file: Hdf5File, group: Any, data: Data, fields: dict[str, str], 
     return table_of_records(data, fields, place=data.name, size=_size(file, group, path), **layout)
 
 
-def _of_rows(file: Hdf5File, group: Any, data: Data, reading: EventReading, path: Path) -> Table:
+def _of_rows(file: Hdf5File, group: object, data: Data, reading: EventReading, path: Path) -> Table:
     data.check()
     place = data.name
     if place in EVENTS:
@@ -136,7 +136,7 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
     )
 
 
-def _value(holder: Any, name: str, path: Path) -> np.ndarray | None:
+def _value(holder: Any, name: str) -> np.ndarray | None:
     """Return the few numbers or the text under a name, a data set or an attribute; None: there is none."""
     data = holder.get(name)
     if not isinstance(data, Data):
@@ -153,9 +153,9 @@ def _notes(file: Hdf5File, group: Group, t: Data) -> list[str]:
     return not_read(names, _USED)
 
 
-def _number(holder: Any, name: str, path: Path) -> Any:
+def _number(holder: object, name: str, path: Path) -> Any:
     """Return the number under a name; None: there is none. Raises AssetError: it is none."""
-    value = _value(holder, name, path)
+    value = _value(holder, name)
     if value is not None and (value.size != 1 or value.dtype.kind not in "iuf"):
         raise AssetError(f"'{name}' is no number", where=str(path), value=str(value.shape if value.ndim else value))
     return None if value is None else value.ravel()[0].item()
@@ -169,7 +169,7 @@ def _size(file: Hdf5File, group: Any, path: Path) -> tuple[int, int] | None:
             return height, width
     places = (holder for holder in (group, group.get("calib"), file) if isinstance(holder, Group))
     for holder, name in itertools.product(places, _SIZES):
-        if (value := _value(holder, name, path)) is None:
+        if (value := _value(holder, name)) is None:
             continue
         if value.dtype.kind in "SUO":
             text = value.item() if isinstance(value.item(), str) else value.item().decode("latin-1")

@@ -79,7 +79,7 @@ def encode_npy(array: np.ndarray) -> bytes:
     return encoded(np.save, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def encoded(save: Callable[..., None], *given: Any, **named: Any) -> bytes:
+def encoded(save: Callable[..., None], *given: object, **named: object) -> bytes:
     """Return the bytes that ``save(file, …)`` writes, one of NumPy's."""
     buffer = io.BytesIO()
     save(buffer, *given, **named)

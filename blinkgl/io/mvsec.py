@@ -15,9 +15,9 @@ EVENTS = (DATASET, "davis/right/events")
 """Of both cameras: x, y, t, p; t in s."""
 
 
-def event_table(file: Group, path: Path, name: str = DATASET) -> Data:
+def event_table(file: Group, path: Path) -> Data:
     """Return the (N, 4) float64 data set of events. Raises AssetError."""
-    return dataset(file, name, path, shape=(None, 4), kinds="f")
+    return dataset(file, DATASET, path, shape=(None, 4), kinds="f")
 
 
 def events_of_rows(rows: np.ndarray, where: str, first: int, t0_s: float = 0.0) -> Events:

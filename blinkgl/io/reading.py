@@ -125,7 +125,7 @@ def _polarity(polarity: str | Sequence[float] | None) -> tuple[float, float] | N
     return off, on
 
 
-def _refused(option: str, value: Any, accepted: str) -> ConfigError:
+def _refused(option: str, value: object, accepted: str) -> ConfigError:
     return ConfigError(f"cannot read --{option}", where=f"--{option}", value=value, accepted=accepted)
 
 
@@ -151,5 +151,5 @@ def chosen(
     behind = labels or (names if numbered else [""] * len(names))
     listed = (f"--stream {key} ({label})" if label else f"--stream {key}" for key, label in zip(shown, behind))
     problem = f"{len(names)} {what}, and none is chosen" if stream is None else f"no such one of the {what}"
-    value: dict[str, Any] = {} if stream is None else {"value": stream}
+    value: dict[str, object] = {} if stream is None else {"value": stream}
     raise AssetError(problem, where=where, accepted=("one of " if len(names) > 1 else "") + ", ".join(listed), **value)

@@ -102,7 +102,7 @@ SEAL = "record_sha256"
 _OPEN = "0" * 64
 
 
-def sealed(record: Mapping[str, Any], default: Callable[[Any], Any] | None = None) -> str:
+def sealed(record: Mapping[str, object], default: Callable[[object], object] | None = None) -> str:
     """Return the JSON text of a record with a hash of itself: SHA-256 of the text with zeros in the hash's place."""
     text = json.dumps({**record, SEAL: _OPEN}, indent=1, sort_keys=True, default=default) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -119,14 +119,14 @@ def seal_problem(text: str) -> str | None:
     return None if hashlib.sha256(whole.encode()).hexdigest() == seal[1] else "checksum differs"
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     table = dict(pairs)
     if len(table) != len(pairs):
         raise ValueError("a key is given twice")
     return table
 
 
-def shown(name: Any, most: int = 160) -> str:
+def shown(name: object, most: int = 160) -> str:
     """Return a name from disk for printing on a terminal: one line, no control characters, not too long."""
     text = str(name)
     text = text if text.isprintable() else ascii(text)[1:-1]

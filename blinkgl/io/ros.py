@@ -57,7 +57,7 @@ def typestore(ros2: bool) -> Any:
     except ImportError:
         raise AssetError("bags are read by the package rosbags", accepted=f"run {install('rosbags')}") from None
     store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
-    types: dict[str, Any] = {}
+    types: dict[str, object] = {}
     for name, text in DEFINITIONS.items():
         types |= get_types_from_msg(text, name)
     store.register(types)

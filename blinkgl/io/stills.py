@@ -432,7 +432,7 @@ def _by_pillow(data: bytes, path: Path, notes: list[str], index: int = 0, *, as_
                 transparent = "transparency" in meta and mode in ("1", "L", "RGB", "P")
                 wanted = "RGBA" if transparent else _MODES[mode]
                 wanted = None if as_stored and mode in ("RGBa", "La") else wanted
-                how: dict[str, Any] = {"mode": wanted}
+                how: dict[str, object] = {"mode": wanted}
                 return file.read(index=index, **how)
     except AssetError:
         raise

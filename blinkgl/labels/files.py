@@ -61,7 +61,7 @@ def _images(name: str) -> Callable[[Any], Any]:
     """Return a function of :mod:`blinkgl.io.images` that is imported when first used, because configuration imports
     this module."""
 
-    def call(value: Any) -> Any:
+    def call(value: object) -> Any:
         from blinkgl.io import images
 
         return getattr(images, name)(value)

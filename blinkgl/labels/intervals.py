@@ -127,7 +127,7 @@ class OcclusionIntervals(_OverIntervals):
     def asked(self, labels: LabelsConfig) -> bool:
         return bool(seconds_of(labels)) and labels.occlusion
 
-    def ask(self, tree: dict[str, Any]) -> None:
+    def ask(self, tree: dict[str, object]) -> None:
         tree["occlusion"] = True
 
     def finish(self, drawn: Drawn) -> Occlusions:

@@ -230,11 +230,11 @@ class Label:
     def check(self, scene: Scene, labels: LabelsConfig) -> None:
         """Raise ConfigError for requests in ``labels:`` that the scene cannot give."""
 
-    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
+    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, object]:
         """Return further entries of the manifest, by key: plain values."""
         return {}
 
-    def ask(self, tree: dict[str, Any]) -> None:
+    def ask(self, tree: dict[str, object]) -> None:
         """Request it in a tree of ``labels:``."""
         tree[self.name] = True
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from blinkgl.config.labels import LabelsConfig
@@ -29,7 +27,7 @@ class OcclusionAt(Label):
     def asked(self, labels: LabelsConfig) -> bool:
         return labels.occlusion and self.towards in labels.flow
 
-    def ask(self, tree: dict[str, Any]) -> None:
+    def ask(self, tree: dict[str, object]) -> None:
         tree["occlusion"] = True
 
     def finish(self, drawn: Drawn) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from fnmatch import fnmatchcase
-from typing import Any
 
 import numpy as np
 
@@ -76,7 +75,7 @@ class Semantics(Label):
                 + "; '*': 0 accepts scenes without any",
             )
 
-    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, Any]:
+    def facts(self, scene: Scene, labels: LabelsConfig) -> dict[str, object]:
         categories = categories_of(labels)
         of_objects = {obj.name: category_of(obj, categories) for obj in scene.objects}
         return {"categories": {"patterns": dict(categories), "objects": of_objects}}

@@ -44,7 +44,7 @@ def _checked(label: Any) -> None:
     """Check a row. Raises TypeError as :func:`register`."""
     name = getattr(label, "name", None)
 
-    def unless(right: Any, part: str, problem: str) -> None:
+    def unless(right: object, part: str, problem: str) -> None:
         if not right:
             raise TypeError(f"label {name!r}: `{part}` {problem}")
 
@@ -72,7 +72,7 @@ def _checked(label: Any) -> None:
         unless(getattr(label, "tolerance", None) is not None, "tolerance", "is missing")
 
 
-def _check_drawing(label: Label, unless: Callable[[Any, str, str], None]) -> None:
+def _check_drawing(label: Label, unless: Callable[[object, str, str], None]) -> None:
     """Check what the label shader needs, and the other labels that it uses."""
     buffers = (None, *BUFFERS)
     unless(label.buffer in buffers, "buffer", f"is {label.buffer!r} and none of {', '.join(BUFFERS)}")

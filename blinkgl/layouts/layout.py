@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -58,7 +58,7 @@ class Layout:
         raise NotImplementedError
 
 
-def need(what: str, yaml: str, there: Callable[[Source], Any]) -> Need:
+def need(what: str, yaml: str, there: Callable[[Source], object]) -> Need:
     """Return a check for what is always called the same.   there : whether a sequence has it, or another check reports
     it."""
     return lambda source: None if there(source) else Missing(what, yaml)
@@ -86,7 +86,7 @@ def write_bytes(target: Path, data: bytes) -> None:
         target.write_bytes(data)
 
 
-def write_lines(target: Path, lines: Sequence[Any]) -> None:
+def write_lines(target: Path, lines: Sequence[object]) -> None:
     """Write one value per line, UTF-8. Raises OutputError."""
     write_bytes(target, ("\n".join(map(str, lines)) + "\n").encode())
 

@@ -96,12 +96,12 @@ def _events(source: Source, topic: str) -> Iterator[Message]:
 _IMAGE = "sensor_msgs/msg/Image"
 
 
-def _header(store: Any, t_us: int, frame: str = "cam0") -> Any:
+def _header(store: Any, t_us: int, frame: str = "cam0") -> object:
     stamp = store.types["builtin_interfaces/msg/Time"](sec=t_us // 10**6, nanosec=t_us % 10**6 * 1000)
     return store.types["std_msgs/msg/Header"](seq=0, stamp=stamp, frame_id=frame)
 
 
-def _image(store: Any, t_us: int, encoding: str, image: np.ndarray) -> Any:
+def _image(store: Any, t_us: int, encoding: str, image: np.ndarray) -> object:
     """Return an image, or a map of float32, as a message."""
     rows = np.ascontiguousarray(image, np.uint8 if encoding == "mono8" else "<f4")
     size = {"height": image.shape[0], "width": image.shape[1], "step": rows.strides[0]}
@@ -121,7 +121,7 @@ def _flow(source: Source, k: int, t_us: int, store: Any) -> Any:
     return store.types[FLOW](header=_header(store, t_us), flow_x=u, flow_y=v, **size)
 
 
-def _camera_info(source: Source, t_us: int, store: Any) -> tuple[str, Any]:
+def _camera_info(source: Source, t_us: int, store: Any) -> tuple[str, object]:
     kind, camera = "sensor_msgs/msg/CameraInfo", source.camera
     assert camera is not None
     flat = isinstance(camera, PinHole)
@@ -143,7 +143,7 @@ def _camera_info(source: Source, t_us: int, store: Any) -> tuple[str, Any]:
     )
 
 
-def _vector(store: Any, kind: str, values: np.ndarray) -> Any:
+def _vector(store: Any, kind: str, values: np.ndarray) -> object:
     return store.types[f"geometry_msgs/msg/{kind}"](**dict(zip("xyzw", values.tolist())))
 
 

@@ -85,10 +85,10 @@ class _CheckedFile(IndexDataCacheFile):
     """numba's files of one kernel. Each entry ends with a checksum and names its key, so that a damaged index cannot
     lead to the code of other types."""
 
-    def save(self, key: Any, data: Any) -> None:
+    def save(self, key: object, data: object) -> None:
         super().save(key, (key, data))
 
-    def load(self, key: Any) -> Any:
+    def load(self, key: object) -> object:
         entry = super().load(key)
         if entry is None:
             return None
@@ -97,11 +97,11 @@ class _CheckedFile(IndexDataCacheFile):
             raise ValueError("the index of the kernel cache leads to another entry")
         return data
 
-    def _dump(self, obj: Any) -> bytes:
+    def _dump(self, obj: object) -> bytes:
         content = super()._dump(obj)
         return content + _checksum(content)  # pickle stops reading where an object ends
 
-    def _load_data(self, name: str) -> Any:
+    def _load_data(self, name: str) -> object:
         content = Path(self._data_path(name)).read_bytes()
         if _checksum(content[:-4]) != content[-4:]:
             raise ValueError("an entry of the kernel cache does not fit its check sum")
@@ -121,7 +121,7 @@ class _Cache(FunctionCache):
         stamp = self._impl.locator.get_source_stamp(), _stamps_of_imports(function.__module__)
         self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, stamp)
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: object, target_context: object) -> object:
         try:
             overload = super().load_overload(sig, target_context)
             if overload is None and turn.begin():
@@ -135,7 +135,7 @@ class _Cache(FunctionCache):
                 self.flush()
             return None
 
-    def save_overload(self, sig: Any, data: Any) -> None:
+    def save_overload(self, sig: object, data: object) -> None:
         try:
             super().save_overload(sig, data)
         except OSError as error:

@@ -116,7 +116,7 @@ class SampleStream(Closing):
         text = to_yaml(template.tree)
         return cls(replace(job, base=str(template.base.resolve()), recipe=text), **how)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Return a taker from the spool, without the workers."""
         return {**self.__dict__, "_executor": None, "_thread": None}
 

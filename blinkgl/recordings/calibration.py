@@ -113,7 +113,7 @@ class Calibration:
         }
 
 
-def _short(value: Any, digits: int = 4) -> Any:
+def _short(value: object, digits: int = 4) -> object:
     return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 

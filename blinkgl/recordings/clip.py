@@ -52,6 +52,7 @@ LEAST_CORRELATION = 0.25
 """Of polarity sums with the frames' change: below, events and frames are of different scenes or clocks."""
 DARK_BACKGROUND = 0.2
 """Luminance of the scene of a recording without frames: about the middle of the scale."""
+_STILL_PARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,12 +285,12 @@ def _path(
     return [(other, begin - (SETTLING + 1) * interval), (path[0][0], begin - SETTLING * interval), *path]
 
 
-def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:
+def clip_of_still(events: Events, size: tuple[int, int]) -> Clip:
     """Return the clip of a recording of a static scene in constant light: only noise. Time is divided into
-    ``parts``."""
+    eight parts."""
     begin, end = int(events.t[0]), int(events.t[-1]) + 1
-    edges = begin + (end - begin) * np.arange(parts + 1) // parts
-    frame = np.full(size, luminance, np.float32)
+    edges = begin + (end - begin) * np.arange(_STILL_PARTS + 1) // _STILL_PARTS
+    frame = np.full(size, DARK_BACKGROUND, np.float32)
     path = [(frame, int(edges[0]) * 1000 - 1000), *((frame, int(t) * 1000) for t in edges)]
     everywhere = np.ones(size, bool)
     return Clip(
@@ -300,7 +301,7 @@ def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = D
         used=everywhere,
         still=everywhere,
         light=np.zeros(size, np.uint8),
-        change=np.zeros((parts, *size), np.float32),
+        change=np.zeros((_STILL_PARTS, *size), np.float32),
         sensor=size,
     )
 

@@ -137,7 +137,7 @@ class Comparison:
             rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
         return rows
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain numbers and lists (without maps), for JSON."""
 
         def side(s: RecordingSide) -> dict:
@@ -430,7 +430,7 @@ def _spread(values: np.ndarray, lengths: np.ndarray) -> str:
     )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray):
         return [_plain(v) for v in value.tolist()]
     if isinstance(value, float) and not np.isfinite(value):

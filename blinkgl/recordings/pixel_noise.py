@@ -131,7 +131,7 @@ def fit_pixels_of(
     pixel = halves[0].pixel(width)
     counts = np.bincount(pixel, minlength=height * width)
     say("counts of pixels", 0.1)
-    dead = _dead_time(halves[0], pixel, counts, seconds[0])
+    dead = _dead_time(halves[0], pixel, counts)
     law = _Counts(counts[looked], seconds[0], dead)
     answered = law.best(say)
     values, uncertainty = answered.values, answered.uncertainty
@@ -291,7 +291,7 @@ def _preferences(
     )
 
 
-def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray, seconds: float) -> float:
+def _dead_time(events: Events, pixel: np.ndarray, counts: np.ndarray) -> float:
     """Return the dead time of a pixel after an event, s: a low percentile of the intervals of the most active pixels,
     if no shorter ones are expected; 0 where no pixel is active enough."""
     # Only pixels that fire nearly without a pause show the shortest possible interval.

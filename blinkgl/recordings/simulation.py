@@ -456,7 +456,7 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     return validate(members[kind], data, where=kind)
 
 
-def with_sensor(emulator: dict[str, Any], sensor: str | None) -> tuple[EmulatorConfig, SensorConfig | None]:
+def with_sensor(emulator: dict[str, object], sensor: str | None) -> tuple[EmulatorConfig, SensorConfig | None]:
     """Return the emulator of a plain table, with the values of a sensor where the table gives none, and that sensor, a
     shipped one's name or a sensor file; None: the emulator's defaults. Raises ConfigError."""
     from blinkgl.config.sensor import load_sensor
@@ -489,7 +489,7 @@ def timed(
         yield frame, t_ns - start if zero_time else t_ns, name
 
 
-def _nanoseconds(time: Any, unit: str, name: str) -> int:
+def _nanoseconds(time: object, unit: str, name: str) -> int:
     """Return a time as whole ns. Raises EventDataError: not a number, not finite, or a float of ns."""
     if isinstance(time, (int, np.integer)) and not isinstance(time, bool):
         return int(time) * NANOSECONDS[unit]

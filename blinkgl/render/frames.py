@@ -232,7 +232,7 @@ class Memory:
         seen.flags.writeable = False
         return seen
 
-    def reader(self, device: Any, name: str) -> TextureReader:
+    def reader(self, device: object, name: str) -> TextureReader:
         """Return the reader of an attachment into tensors of a device; made when first needed."""
         i = self.attachment(name)
         if (i, str(device)) not in self._readers:

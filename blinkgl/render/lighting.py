@@ -77,7 +77,7 @@ class Lighting:
             if any(lamp.over_time is not None for lamp in lamps)
         }
 
-    def defines(self, kind: Kind, one_channel: bool, maps: Sequence[Any]) -> dict[str, Any]:
+    def defines(self, kind: Kind, one_channel: bool, maps: Sequence[object]) -> dict[str, Any]:
         """Return the defines of a lit pass's variant. RGB: light of three channels, where one is not enough: for
         colour pictures, and for the luminance of surfaces with several colours. maps : shadow maps of the pass."""
         rgb = {"RGB": 1} if kind.rgb and one_channel else {}
@@ -100,7 +100,7 @@ class Lighting:
             | (rgb or ({"RGB": 1} if not one_channel and (self.coloured or "GLOSSY" in kind.more) else {}))
         )
 
-    def _shadows(self, maps: Sequence[Any]) -> dict[str, Any]:
+    def _shadows(self, maps: Sequence[Any]) -> dict[str, object]:
         suns = sum(one.lamp.kind == "sun" for one in maps)
         counts = {"SHADOWS": len(maps), "SHADOW_SUNS": suns, "SHADOW_SPOTS": len(maps) - suns}
         return {name: n for name, n in counts.items() if n} | ({"SOFT": 1} if any(one.soft for one in maps) else {})

@@ -3,8 +3,8 @@ pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import moderngl
 import numpy as np
@@ -57,7 +57,7 @@ class LineDrawer:
         self._rows.reshape(-1, CROSSING)[: len(crossings)] = crossings
         self._crossings.write(self._rows[:rows], viewport=(0, 0, 2 * ROW, rows))
 
-    def program(self, name: str, defines: dict[str, Any]) -> tuple[Uniforms, moderngl.VertexArray] | None:
+    def program(self, name: str, defines: Mapping[str, object]) -> tuple[Uniforms, moderngl.VertexArray] | None:
         """Return the uniforms of a program and the array to draw; None where no pixel has a line."""
         if not self._count:
             return None

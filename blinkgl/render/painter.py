@@ -206,7 +206,7 @@ class Painter:
         self.resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)
         self.stats.triangles += len(item.mesh.faces)
 
-    def cover(self, source: str, defines: Mapping[str, Any]) -> tuple[Uniforms, moderngl.VertexArray]:
+    def cover(self, source: str, defines: Mapping[str, object]) -> tuple[Uniforms, moderngl.VertexArray]:
         """Return the program over the whole target, and the empty vertex array that draws its one triangle."""
         key = (source, *defines.items())
         if key not in self._covers:

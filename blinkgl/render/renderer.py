@@ -366,7 +366,7 @@ class Labels:
         draw.stats.render_s += working_clock() - started
         return LabelFrame(t_ns, {name: values[name] for name in request})
 
-    def _finished(self, name: str, seen: Seen, values: dict[str, Any]) -> Any:
+    def _finished(self, name: str, seen: Seen, values: dict[str, object]) -> object:
         if name not in values:
             label = LABELS[name]
             value = label.finish(DrawnLabel(label, self.scene, seen, lambda other: self._finished(other, seen, values)))

@@ -34,7 +34,7 @@ class NoInteropError(Exception):
     """The reason why CUDA does not read this texture, one line."""
 
 
-def torch_device(name: Any) -> Any:
+def torch_device(name: object) -> Any:
     """Return torch and the device of this name, with its number. Raises GLError: no torch, or no such device."""
     try:
         torch = importlib.import_module("torch")
@@ -93,7 +93,7 @@ class TextureReader:
         return made
 
     # -- CUDA beside OpenGL --------------------------------------------------------------------------------------
-    def _call(self, name: str, *arguments: Any) -> Any:
+    def _call(self, name: str, *arguments: object) -> Any:
         """Return the results of a driver call without its status. Raises NoInteropError."""
         try:
             status, *values = getattr(self._driver, name)(*arguments)
@@ -130,7 +130,7 @@ class TextureReader:
             self.release()
             raise NoInteropError("CUDA reads other numbers than OpenGL")
 
-    def _here(self, name: str, *arguments: Any) -> Any:
+    def _here(self, name: str, *arguments: object) -> Any:
         """Call the driver with torch's context current."""
         self._call("cuCtxPushCurrent", self._context)
         try:

@@ -6,7 +6,7 @@ import base64
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -104,7 +104,7 @@ def size(count: float) -> str:
 # Pages from jinja2 templates. Inserted values are escaped, unless a template made them; a missing name is an error.
 
 
-def render(name: str, **values: Any) -> str:
+def render(name: str, **values: object) -> str:
     """Return the HTML text of a template ``"ROOM/FILE.html"``, which is templates/FILE.html of ``blinkgl.ROOM``."""
     return _environment().get_template(name).render(values)
 

@@ -82,7 +82,7 @@ class Collected:
         return spans
 
 
-def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
+def collect(root: str | Path, *, examples: int = 6) -> Collected:
     """Collect the data of the page. Raises AssetError when there is no data set; unreadable sequences are listed."""
     root = Path(root)
     if not root.is_dir():
@@ -117,7 +117,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         unreadable=unreadable,
         damaged=damaged,
     )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     _sample(collected, rng, examples)
     _parameters(collected, rng)
     return collected
@@ -264,7 +264,7 @@ def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], int
         if all(not isinstance(o, (dict, list)) for o in options):
             into.append(Parameter(group, ".".join(path), kind, spec, values))
             return
-        counted: list[Any] = []
+        counted: list[object] = []
         for option in options:
             having = [c for c in configs if _fits(_at(c, path), option)]
             counted += [_label(option)] * len(having)
@@ -287,7 +287,7 @@ def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], int
             _walk(group, value, (*path, str(i)), configs, into)
 
 
-def _at(config: Any, path: tuple[str, ...]) -> Any:
+def _at(config: object, path: tuple[str, ...]) -> Any:
     for key in path:
         if isinstance(config, list) and key.isdigit() and int(key) < len(config):
             config = config[int(key)]
@@ -311,7 +311,7 @@ def _fits(value: Any, option: Any) -> bool:
     return all(key in value and _fits(value[key], inner) for key, inner in option.items())
 
 
-def _label(option: Any) -> str:
+def _label(option: object) -> str:
     if isinstance(option, dict):
         return str(next((option[tag] for tag in ("emulator", "kind") if tag in option), "; ".join(map(str, option))))
     return str(option)

@@ -109,7 +109,7 @@ def _distributions(q: dict[str, np.ndarray]) -> list[tuple]:
 
 
 def _parameter(p: Parameter) -> dict[str, Any]:
-    shown: dict[str, Any] = {
+    shown: dict[str, object] = {
         "path": p.path,
         "group": p.group or "all",
         "kind": p.kind,

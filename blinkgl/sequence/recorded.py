@@ -10,7 +10,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -413,7 +412,7 @@ class RecordedSequence(SensorSimulation):
     def poses(self) -> dict[str, np.ndarray]:
         return {}
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         return {
             "source": {
                 "folder": self.folder.name,

@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -179,7 +178,7 @@ class SensorSimulation(ABC):
         return dict(self.clock.seconds)
 
     @abstractmethod
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """Return plain values for the manifest about its source; complete when the iteration is."""
 
     @abstractmethod

@@ -102,7 +102,7 @@ def write_index(root: str | Path) -> int:
     return len(entries)
 
 
-def write_lines(root: Path, lines: list[dict[str, Any]]) -> None:
+def write_lines(root: Path, lines: list[dict[str, object]]) -> None:
     """Write ``index.jsonl`` of these lines. Raises OutputError."""
     with atomic_file(root / INDEX) as path, output_errors(path), open(path, "w", encoding="utf-8") as file:
         file.writelines(json.dumps(line, sort_keys=True) + "\n" for line in sorted(lines, key=itemgetter("path")))

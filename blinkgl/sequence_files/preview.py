@@ -78,20 +78,19 @@ class Panels:
         if events.cause is not None:
             self._noise = (self._noise or 0) + int(np.count_nonzero(events.cause))
 
-    def set_flow(self, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
-        """Set flow, (H, W, 2) px, and its valid mask. Full saturation follows the 95th percentile of speed: up at once,
+    def set_flow(self, flow: np.ndarray) -> None:
+        """Set flow, (H, W, 2) px. Full saturation follows the 95th percentile of speed: up at once,
         down slowly, so that a passing object does not fade the rest and colours do not flicker."""
         if not self._has_flow:
             return
         # Every fourth pixel in x and y is enough for a percentile.
         speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
-        speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
+        speed = speed[np.isfinite(speed)]
         if speed.size:
             # The scale follows larger motion at once and smaller slowly, so that colours do not flicker.
             self._flow_max = max(0.95 * self._flow_max, float(np.percentile(speed, 95)))
         nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # keeps edges sharp
-        shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0
-        self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None, shown)
+        self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None)
         self._legend()
         self._caption(2, f"full colour = {self._flow_max:.3g} px")
 
@@ -174,7 +173,7 @@ class PreviewWriter(VideoWriter):
     sequence.
 
         preview.panels[0].add_events(events)            every chunk
-        preview.panels[0].set_flow(flow, valid)         whenever a label exists; shown until the next
+        preview.panels[0].set_flow(flow)                whenever a label exists; shown until the next
         if preview.panels[0].due(t_us):                 ask first: making the picture may be expensive
             preview.frame(t_us, image)
 

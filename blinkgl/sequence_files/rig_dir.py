@@ -33,10 +33,10 @@ from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter
 
 def sensors_yaml(sensors: Sequence[RigSensorConfig]) -> str:
     """Return ``rig.yaml``: the rig's sensors, by name, unrounded."""
-    tables: dict[str, Any] = {}
+    tables: dict[str, object] = {}
     for one in sensors:
         records = [key for key in ("events", "images", "imu") if getattr(one, key) is not None]
-        about: dict[str, Any] = {"records": records, "T_rig_sensor": one.place.T.tolist()}
+        about: dict[str, object] = {"records": records, "T_rig_sensor": one.place.T.tolist()}
         if one.sees:
             camera = one.camera.model
             about |= {
@@ -98,10 +98,6 @@ def read_sensors(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
         name: {**one.model_dump(), "T_rig_sensor": np.array(one.T_rig_sensor, np.float64)}
         for name, one in sensors.items()
     }
-
-
-read_rig = read_sensors
-"""The former name, for one release: write ``read_sensors``."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------

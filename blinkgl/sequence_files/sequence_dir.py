@@ -263,7 +263,7 @@ class SequenceWriter:
 
     # ---- machinery -------------------------------------------------------------------------------------------
 
-    def _encoded(self, label: Label, form: Form, value: Any) -> bytes:
+    def _encoded(self, label: Label, form: Form, value: object) -> bytes:
         assert form.encode is not None
         data = form.encode(value)
         if isinstance(data, tuple):
@@ -468,7 +468,7 @@ def digest_of(path: Path) -> dict[str, Any]:
         return {"bytes": file.tell(), "sha256": digest}
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):

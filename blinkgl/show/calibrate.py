@@ -36,7 +36,7 @@ def run(
     overrides: Sequence[str] = (),
     overwrite: bool = False,
     quiet: bool = False,
-    **options: Any,
+    **options: object,
 ) -> int:
     """Fit an emulator and write the sensor file ``out`` and a page of the same name that ends in .html; both or
     neither. ``options``: of :func:`~blinkgl.recordings.calibration.calibrate` and of its FrameReading."""

@@ -166,7 +166,7 @@ def philox4x32(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> lis
     return [c0, c1, c2, c3]
 
 
-def uniform2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[Tensor, Tensor]:
+def uniform2(key: tuple[object, ...], pixel: object, stream: int, index: object) -> tuple[Tensor, Tensor]:
     """Return two independent uniforms in (0, 1), float64."""
     w0, w1, w2, w3 = philox4x32(key, pixel, stream, index)
     # The upper 53 of 64 bits, and a half: 0 and 1 cannot occur.
@@ -174,7 +174,7 @@ def uniform2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple
     return (u.to(torch.float64) + 0.5) * _ULP53, (v.to(torch.float64) + 0.5) * _ULP53
 
 
-def normal2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[Tensor, Tensor]:
+def normal2(key: tuple[object, ...], pixel: object, stream: int, index: object) -> tuple[Tensor, Tensor]:
     """Return two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(key, pixel, stream, index)
     radius = sqrt(log_f64(u) * -2.0)
@@ -182,7 +182,7 @@ def normal2(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> tuple[
     return radius * c, radius * s
 
 
-def rough_normal(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> Tensor:
+def rough_normal(key: tuple[object, ...], pixel: object, stream: int, index: object) -> Tensor:
     """Return a nearly normal value of mean 0 and variance 1: the sum of four uniforms, float64."""
     w0, w1, w2, w3 = philox4x32(key, pixel, stream, index)
     # Mean 2 and variance 1/3, shifted and scaled as in events.philox.rough_normal.

@@ -209,7 +209,7 @@ class Batch(ABC):
         self._clock[:, 2] += 1
         return events
 
-    def reset(self, mask: Any = None) -> None:
+    def reset(self, mask: object = None) -> None:
         """Reset the environments of ``mask`` ((environments,) bool; None: all), which restart with their next frame, at
         any time.
 
@@ -261,7 +261,7 @@ class Batch(ABC):
         # One flat array of all environments, whose gradient is not followed.
         return frames.detach().reshape(-1)
 
-    def _interval(self, t_ns: Any) -> Interval:
+    def _interval(self, t_ns: object) -> Interval:
         """Return the interval of the step to ``t_ns``. Raises EventDataError naming the first environment with an
         invalid time."""
         try:

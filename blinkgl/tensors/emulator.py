@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from blinkgl.errors import EventDataError
-from blinkgl.events.emulator import BLOCK, Emulator
+from blinkgl.events.bands import BLOCK
+from blinkgl.events.emulator import Emulator
 from blinkgl.events.esim import Esim
 from blinkgl.events.v2e import V2e
 from blinkgl.tensors.batch import Batch
@@ -85,7 +86,7 @@ class _OnDevice(Emulator):
                 mine[...] = values.cpu().numpy().reshape(mine.shape)
         return super().state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         super().load_state_dict(state)
         there = self._batch.state_dict()
         # The batch's clock: started, time, frames, start of the leak clock (Batch._clock).
@@ -143,7 +144,7 @@ def emulator_on(kind: Any, config: Any, height: int, width: int, seed: int) -> E
     raise problem
 
 
-def _problem(kind: Any, config: Any, device: Any) -> EventDataError | None:
+def _problem(kind: object, config: Any, device: Any) -> EventDataError | None:
     """Return why this device cannot make these events; None: it can."""
     if kind not in KINDS:
         return EventDataError(

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE
-from blinkgl.events.emulator import BLOCK, NEVER_NS
+from blinkgl.events.bands import BLOCK
+from blinkgl.events.emulator import NEVER_NS
 from blinkgl.events.esim import MIN_THRESHOLD, draw_thresholds, to_q25
 from blinkgl.events.philox import Stream
 from blinkgl.tensors.arith import log_q25_, normal2

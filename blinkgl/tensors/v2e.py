@@ -21,7 +21,7 @@ from torch import Tensor
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import v2e_model as model
-from blinkgl.events.emulator import BLOCK
+from blinkgl.events.bands import BLOCK
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, noise_table
 from blinkgl.events.packing import MAX_CAUSE_ROWS

@@ -152,7 +152,7 @@ class Stage:
     def _lines(self, name: str, segments: np.ndarray, colour: Any) -> Any:
         return self._scene.add_line_segments(name, segments, colour, thickness=1.5, thickness_units="screen")
 
-    def _label(self, name: str, text: str, at: Sequence[float] | np.ndarray) -> Any:
+    def _label(self, name: str, text: str, at: Sequence[float] | np.ndarray) -> object:
         return self._scene.add_label(
             name, text, position=np.array(at, float), font_screen_scale=0.85, anchor="center-center"
         )

@@ -6,9 +6,9 @@ next.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -156,7 +156,7 @@ class CameraView:
                 pictures.append(Picture(view.title, self._note(k, legend, view.unit), image))
         return pictures
 
-    def _note(self, k: int, legend: dict[str, Any], unit: str) -> str:
+    def _note(self, k: int, legend: Mapping[str, object], unit: str) -> str:
         when = f"{self._label_us[k] / 1000:.1f} ms"
         if legend["kind"] == "wheel":
             return f"{when}, full colour {legend['high']:.3g} {unit}"

@@ -111,7 +111,7 @@ class Held:
         return self._samples[index]
 
 
-def held(s: SourceConfig, count: int, seed: int = 0) -> Held:
+def held(s: SourceConfig, count: int) -> Held:
     """Render ``count`` samples of a recipe's test groups into memory. Raises as :func:`open_online`."""
-    with open_online(s, seed, split="test") as source:
+    with open_online(s, 0, split="test") as source:
         return Held([source[n] for n in range(count)])

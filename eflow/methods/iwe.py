@@ -48,15 +48,15 @@ def slope_at(x: Numbers, y: Numbers, image: Numbers, out: Numbers) -> None:
         out[i, 1] = (r - p) * (1 - a) + (s - q) * a
 
 
-def warped(window: Window, flow: Flow, span_us: int | None = None) -> Numbers:
+def warped(window: Window, flow: Flow) -> Numbers:
     """Return the image (H, W) float64 of the events of a window, moved back along ``flow`` to its start.
 
-    flow : (H, W, 2) px per ``span_us`` (default: the window's length), read at each event's pixel."""
+    flow : (H, W, 2) px per length of the window, read at each event's pixel."""
     height, width = flow.shape[:2]
     image = np.zeros((height, width))
     column, row = (np.rint(np.asarray(c)).astype(np.intp) for c in (window.x, window.y))
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    share = (window.t[inside] - window.t0) / (span_us or window.t1 - window.t0)
+    share = (window.t[inside] - window.t0) / (window.t1 - window.t0)
     moved = flow[row[inside], column[inside]] * share[:, None]
     vote(window.x[inside] - moved[:, 0].astype(np.float64), window.y[inside] - moved[:, 1].astype(np.float64), image)
     return image

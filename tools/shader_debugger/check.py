@@ -46,18 +46,18 @@ def kinds() -> list[Kind]:
     return [*KINDS, *(Kind(True, True, True, shape) for shape in shapes), *surfaces]
 
 
-def lookups(program: str) -> list[dict[str, Any]]:
+def lookups(program: str) -> list[dict[str, object]]:
     """Return the defines of the variants in which a production program shows its texture lookups."""
     return _variant_defines(program, (type(pass_) for pass_ in LOOKUPS.values()))
 
 
-def variants(program: str) -> list[dict[str, Any]] | None:
+def variants(program: str) -> list[dict[str, object]] | None:
     """Return the defines of every variant of a program file, without :func:`lookups`; None for a file that no pass
     uses."""
     return _variant_defines(program, dict.fromkeys((*PASSES, Inspection, *own_passes()))) or None
 
 
-def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
+def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, object]]:
     """Return no defines for the plain light, and an example of each feature of light; one of them for shapes."""
     if kind is None or not (kind.lit and pass_.lit):
         return [{}]
@@ -72,8 +72,8 @@ def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
     return [{}, *EXAMPLES, *coloured]
 
 
-def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]:
-    variants: dict[tuple, dict[str, Any]] = {}
+def _variant_defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, object]]:
+    variants: dict[tuple, dict[str, object]] = {}
     for one in passes:
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:

@@ -31,7 +31,7 @@ class Diagnostic:
         return ":".join([self.file, *(str(n) for n in (self.line, self.column) if n)])
 
 
-def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: Any) -> list[Diagnostic]:
+def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder: object) -> list[Diagnostic]:
     """Return every message of a ShaderError. ``sources``: by stage, empty when the includes of the program could not be
     resolved."""
     diagnostics = []

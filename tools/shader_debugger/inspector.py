@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import lru_cache
@@ -125,7 +125,7 @@ ROUTES: dict[str, dict[str, Reader]] = {
 """Parameters of each route; all are optional, where a default makes sense."""
 
 
-def read_query(route: str, text: str) -> dict[str, Any]:
+def read_query(route: str, text: str) -> dict[str, object]:
     """Return the values of every parameter of a route in :data:`ROUTES`, from the text after the
     question mark. Raises ConfigError."""
     readers = ROUTES[route]
@@ -220,7 +220,7 @@ class Inspector:
 
     # ---- answers -----------------------------------------------------------------------------------------------
 
-    def state(self, q: dict[str, Any]) -> dict:
+    def state(self, q: Mapping[str, object]) -> dict:
         """Return what the page shows around the pictures."""
         scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
         return {

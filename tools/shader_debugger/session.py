@@ -165,7 +165,7 @@ class DebugPainter(Painter):
         super().__init__(gl, scene, resources, stats)
         self.unused: set[tuple[str, str]] = set()
 
-    def uniforms(self, program: Any) -> Any:
+    def uniforms(self, program: object) -> Any:
         return _Uniforms(program, self.unused)
 
     def draw(self, uniforms: Any, item: Any, t_ns: int) -> None:
@@ -192,7 +192,7 @@ class Inspection(ScenePass):
         Output("WINDOW", "RGBA32F"),
     )
 
-    def defines(self, kind: Any) -> Any:
+    def defines(self, kind: object) -> Any:
         return {f"OUT_{output.name}": i for i, output in enumerate(self.outputs)}
 
     def set(self, painter: Any, uniforms: Any, item: Any, shot: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 from rich.console import Console
 from rich.table import Column, Table
@@ -45,7 +44,7 @@ def run(
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
     half_s = None if minutes is None else minutes * 30
-    changes: dict[str, Any] = {
+    changes: dict[str, object] = {
         "limit_us": round(limit_ms * 1000),
         "sequence": template.sequence(0).output.first_index if sequence is None else sequence,
         "reference_set": tuple(reference_set or ()),

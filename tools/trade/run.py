@@ -68,7 +68,7 @@ def trade(
     cost: str = "wall_s",
     settings: tuple[Setting, ...] | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the whole measurement as plain data (the content of trade.json).
 
     cost : "wall_s" or "cpu_s", the cost axis of the front. settings : instead of the designed set.
@@ -120,7 +120,7 @@ def trade(
     }
 
 
-def _of_size(bench: Bench, levels: list[Level]) -> dict[str, Any]:
+def _of_size(bench: Bench, levels: list[Level]) -> dict[str, object]:
     """Return what is measured at one size, and how its reference converges, as plain data."""
     return {
         "width": bench.width,
@@ -159,7 +159,7 @@ def write_tables(path: Path, result: dict, columns: tuple[str, ...], rows: Itera
     return paths
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value for JSON, which has no NaN."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}

@@ -90,7 +90,7 @@ def run_suite(
     overrides: Sequence[str] = (),
     cost: str = "cpu_s",
     say: Callable[[str], None] = lambda _: None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Measure every scene and write suite.json and suite.csv to the folder ``out``, again after each scene; return the
     content of the first.
 
@@ -121,7 +121,7 @@ def _measured(
     overrides: Sequence[str],
     cost: str,
     say: Callable[[str], None],
-) -> dict[str, Any]:
+) -> dict[str, object]:
     # The scene's usual labels, previews and read-outs are left out of the measurement.
     template = load_run(scene.path, list(overrides))
     result = trade(template, options=options, cost=cost, settings=settings, say=say)
@@ -145,7 +145,7 @@ def _measured(
     }
 
 
-def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any], seconds: float) -> dict[str, Any]:
+def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any], seconds: float) -> dict[str, object]:
     measured = {c.name: done[c.name] for c in scenes if c.name in done}
     missing = [c.name for c in scenes if "settings" not in measured.get(c.name, {})]
     return {
@@ -169,17 +169,17 @@ def preset_names(names: Iterable[str]) -> dict[str, str]:
     return {quality: name for quality, wanted in presets.items() for name, meant in meanings if meant == wanted}
 
 
-def _tables(quality: str) -> list[tuple[str, Any]]:
+def _tables(quality: str) -> list[tuple[str, object]]:
     return [(table, load_quality(quality)[table]) for table in ("timeline", "render")]
 
 
-def meaning(overrides: Iterable[str]) -> dict[str, Any]:
+def meaning(overrides: Iterable[str]) -> dict[str, object]:
     """Return the timeline and render settings that overrides give, with every value filled in."""
     config = RunTemplate(apply_overrides({"quality": None}, list(overrides)), Path()).sequence(0)
     return {"timeline": config.timeline.model_dump(), "render": config.render.model_dump()}
 
 
-def standing(scenes: dict[str, dict], cost: str) -> list[dict[str, Any]]:
+def standing(scenes: dict[str, dict], cost: str) -> list[dict[str, object]]:
     """Return per setting, over the scenes where its row counts, how often nothing beats it, and its worst result.
 
     excess : 0.1 means that another setting is 10 % better in both cost and error. The largest error is over all scenes,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from blinkgl.gl.shader import Uniforms
 from blinkgl.render.antialiasing import Samples
@@ -84,7 +84,7 @@ class Pass:
         """Return the first output's value where nothing is hit; missing components and all other outputs are 0."""
         return ()
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
+    def defines(self, kind: Kind | None) -> dict[str, object]:
         """Return the defines of the program variant, for a kind of material (None: no material at all); TEXTURED, LIT
         and TWO_SIDED are added, and, for a ``lit`` pass, those of the scene's light."""
         return {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.frames import DEPTH_BUFFER, Rectangle, merged
@@ -60,7 +60,7 @@ class Edged(Pass):
         reach = -(-_REACH // self.samples.grid)  # rectangles are in pixels of the picture
         return merged([r.grown(reach, seen.width, seen.height) for r in rectangles])
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
+    def defines(self, kind: Kind | None) -> dict[str, object]:
         channels = _CHANNELS.get(self.outputs[0].format, 4)
         return {"LIGHT": "float" if channels == 1 else f"vec{channels}", "OF": "rgba"[:channels]}
 

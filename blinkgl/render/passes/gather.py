@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from moderngl import LINEAR
 
@@ -52,17 +52,15 @@ class Gather(ScreenPass):
         width, height = self.size(self.camera.width, self.camera.height)
         return [Rectangle(0, 0, width, height)] if rectangles else []
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
-        defines: dict[str, Any] = {}
+    def defines(self, kind: Kind | None) -> dict[str, object]:
+        defines: dict[str, object] = {}
         if self.smooth:
             columns, rows = steps_of(self.camera, self.of.samples.grid)
             defines = {"SMOOTH": 1, "COLUMNS": columns, "ROWS": rows}
-        for k, output in enumerate(self.outputs):
-            whole = FORMATS[output.format].numpy.kind == "u"
-            # Integer formats need integer samplers and outputs, of unsigned numbers here.
-            prefix = "u" if whole else ""
-            defines |= {f"SAMPLER_{k}": f"{prefix}sampler2D", f"TEXEL_{k}": f"{prefix}vec4"}
-        return defines
+        # Integer formats need integer samplers and outputs, of unsigned numbers here.
+        prefixes = ("u" if FORMATS[output.format].numpy.kind == "u" else "" for output in self.outputs)
+        outputs = (f"OUTPUT({k}, {prefix}sampler2D, {prefix}vec4)" for k, prefix in enumerate(prefixes))
+        return defines | {"OUTPUTS": " ".join(outputs)}
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         lens, (uniforms, array) = painter.lens, painter.cover(self.program, self.defines(None))

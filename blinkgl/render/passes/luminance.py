@@ -93,7 +93,7 @@ class Brightness(LuminancePass):
     shadows: tuple[ShadowMap, ...] = ()
     outputs: ClassVar[tuple[Output, ...]] = (Output("brightness", "RG32F"),)
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
+    def defines(self, kind: Kind | None) -> dict[str, object]:
         return {"RATE": 1} if self.every == 1 else {"RATE": 1, "EVERY": self.every}
 
     @classmethod
@@ -148,7 +148,7 @@ class Mean(ScreenPass):
     def every(self) -> int:
         return self.of.every
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
+    def defines(self, kind: Kind | None) -> dict[str, object]:
         # Samples per pixel in x and in y.
         return {"FACTOR": self.of.samples.grid}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from moderngl import LINEAR
@@ -62,7 +62,7 @@ class ShadowMap(ScenePass):
         """Return whether the lamp stands still; the camera does not matter."""
         return self.lamp.path.is_static and not self.crowd
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
+    def defines(self, kind: Kind | None) -> dict[str, object]:
         return {"PARALLEL": 1} if self.lamp.kind == "sun" else {}
 
     def seen(self, moment: Moment) -> Moment:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import moderngl
 import numpy as np
@@ -103,7 +103,7 @@ class Specks(Pass):
     def samples(self) -> Samples:  # type: ignore[bad-override]
         return self.of.samples
 
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
+    def defines(self, kind: Kind | None) -> dict[str, object]:
         return {"PORTRAIT": _TEXELS}
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:

@@ -72,7 +72,7 @@ class Builder(Protocol):
     checked: Callable[..., inspect.BoundArguments]
     at_level: Callable[..., Mesh] | None
 
-    def __call__(self, **parameters: Any) -> Mesh: ...
+    def __call__(self, **parameters: object) -> Mesh: ...
 
 
 BUILDERS: dict[str, Builder] = {}
@@ -123,7 +123,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
     keywords = [p for p in whole.parameters.values() if p.kind is not p.KEYWORD_ONLY]
     signature = whole.replace(parameters=keywords)
 
-    def checked(**parameters: Any) -> inspect.BoundArguments:
+    def checked(**parameters: object) -> inspect.BoundArguments:
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
@@ -139,7 +139,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
             bound.arguments[key] = _checked(where, key, value, signature.parameters[key].default)
         return bound
 
-    def at_level(level: int, **parameters: Any) -> Mesh:
+    def at_level(level: int, **parameters: object) -> Mesh:
         where, bound = build.__name__, checked(**parameters)
         coarse = {"level": level} if level else {}
         built = build(**bound.arguments, **coarse)

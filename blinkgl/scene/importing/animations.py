@@ -62,11 +62,11 @@ class Animation:
 
         return at
 
-    def tries(self, node: int, t0_ns: int, t1_ns: int, count: int = 32) -> list[np.ndarray]:
+    def tries(self, node: int, t0_ns: int, t1_ns: int) -> list[np.ndarray]:
         """Return the node's transforms to the file's world at irregular times in [t0, t1], which no period meets."""
         if (t0_ns, t1_ns) not in self._tries:
             # The fractional parts of multiples of the golden ratio lie evenly and never repeat.
-            times = (t0_ns + round((0.618033988749895 * k % 1) * (t1_ns - t0_ns)) for k in range(count))
+            times = (t0_ns + round((0.618033988749895 * k % 1) * (t1_ns - t0_ns)) for k in range(32))
             self._tries[t0_ns, t1_ns] = [self.skeleton.at(t)[0] for t in times]
         return [world[self._places[node]] for world in self._tries[t0_ns, t1_ns]]
 

@@ -134,7 +134,7 @@ def item(tree: dict, key: str, index: Any, where: str) -> dict:
     return items[index_of(index, len(items), key, where)]
 
 
-def index_of(index: Any, count: int, what: str, where: str) -> int:
+def index_of(index: object, count: int, what: str, where: str) -> int:
     """Return a checked reference: an index below ``count``."""
     if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < count:
         raise AssetError(

@@ -38,7 +38,7 @@ def _turned(rotation: list[float]) -> list[float]:
     return rotation
 
 
-def _part(name: str, effectless: str = "", **fields: Any) -> Any:
+def _part(name: str, effectless: str = "", **fields: object) -> Any:
     """Return the schema of a part of a file: type and default of each property, ... for one that must be there.
     effectless : names of properties that change nothing of what is drawn."""
     plain = {"name": (Any, None), "extras": (Any, None)} | dict.fromkeys(effectless.split(), (Any, None))

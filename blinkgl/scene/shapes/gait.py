@@ -110,10 +110,10 @@ class _Pose:
         for axis, value in enumerate((x, y, z)):
             self.angles[:, J[joint], axis] += np.radians(value)
 
-    def turn_both(self, joint: str, x=0.0, y=0.0, z=0.0) -> None:
+    def turn_both(self, joint: str, x=0.0, y=0.0) -> None:
         """Add degrees on both sides, mirrored."""
-        self.turn(f"{joint}_l", x, y, z)
-        self.turn(f"{joint}_r", -np.asarray(x), y, -np.asarray(z))
+        self.turn(f"{joint}_l", x, y)
+        self.turn(f"{joint}_r", -np.asarray(x), y)
 
     def plant(self, feet: dict[str, tuple[np.ndarray, ...]], reach: float = 0.985) -> None:
         """Turn legs and feet so that the ankles are at their positions, the knees in front, and lower the pelvis by the

@@ -11,7 +11,6 @@ docs/extending.md has a complete example.
 from __future__ import annotations
 
 from importlib import resources
-from typing import Any
 
 import numpy as np
 
@@ -69,12 +68,12 @@ def includes() -> dict[str, str]:
     return {"deforms.glsl": "\n".join(lines) + "\n", **own}
 
 
-def _checked(deformer: Any) -> str:
+def _checked(deformer: object) -> str:
     if not (isinstance(deformer, type) and issubclass(deformer, Deformer)):
         raise TypeError(f"{deformer!r} is not a subclass of Deformer")
     name = deformer.__name__
 
-    def unless(right: Any, part: str, problem: str) -> None:
+    def unless(right: object, part: str, problem: str) -> None:
         if not right:
             raise TypeError(f"deformer {name}: `{part}` {problem}")
 

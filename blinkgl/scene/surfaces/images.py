@@ -72,15 +72,14 @@ def photographs() -> dict[str, Path]:
     return {Path(name).stem: folder / name for name in _PHOTOGRAPHS if (folder / name).is_file()}
 
 
-def load_image(path: Path, max_size: int | None = None, where: str | None = None) -> np.ndarray:
-    """Return (h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr`` and OpenEXR; the longer side at most
-    ``max_size`` px.
+def load_image(path: Path) -> np.ndarray:
+    """Return (h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr`` and OpenEXR.
 
     HDR images are exposed so that their 90th percentile is 0.8 and clipped at :data:`HDR_WHITE`. While it is reduced,
     an image takes at most 7 bytes per pixel of the file (HDR: 25), and some 100 MB more.
     Raises :class:`AssetError` naming the file when it is missing, corrupt, truncated or beyond :data:`MAX_PIXELS`.
     """
-    return decode_image(contents(Path(path), "image", where), max_size, where or str(path))
+    return decode_image(contents(Path(path), "image"), None, str(path))
 
 
 def decode_image(data: bytes, max_size: int | None, where: str, gamma: bool = True) -> np.ndarray:

@@ -29,7 +29,7 @@ def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
         image = _pips(rng, size)
         return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
     field = _FIELDS[kind](rng, size)
-    image = _grade(field, _palette(rng), rng)
+    image = _grade(field, _palette(rng))
     return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
 
 
@@ -45,7 +45,7 @@ def _palette(rng: np.random.Generator) -> np.ndarray:
     return np.clip(colours, DARKEST, BRIGHTEST)
 
 
-def _grade(field: np.ndarray, palette: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _grade(field: np.ndarray, palette: np.ndarray) -> np.ndarray:
     """Return (h, w, 3) uint8 of a field (h, w) in [0, 1], or of (h, w) integer labels."""
     if field.dtype.kind in "iu":
         return np.round(palette).astype(np.uint8).take(field % len(palette), axis=0)

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -290,7 +289,7 @@ def _check_speeds(
             )
 
 
-def _on_body(given: Any, where: str, base: Path) -> np.ndarray:
+def _on_body(given: object, where: str, base: Path) -> np.ndarray:
     """Return T_body_sensor, (4, 4), of a matrix or of EuRoC's sensor.yaml."""
     from blinkgl.config.camchain import read_place_on_body
 
@@ -332,7 +331,7 @@ def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
         return BUILDERS[config.primitive](**config.parameters)
 
 
-def check_primitive(kind: str, parameters: Mapping[str, Any], name: str) -> None:
+def check_primitive(kind: str, parameters: Mapping[str, object], name: str) -> None:
     """Raise ConfigError for what :func:`primitive_mesh` would refuse; for living primitives, whose parameters are
     independent, without making one."""
     with _parameters_of(name):

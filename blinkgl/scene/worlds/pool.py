@@ -119,7 +119,7 @@ class Pool:
         self._sides[split] = {source: tuple(entries) for source, entries in sides.items()}
         return self._sides[split]
 
-    def load(self, entry: Entry) -> Any:
+    def load(self, entry: Entry) -> object:
         """Return the entry's content, which may be the cache's."""
         return self.cache.get((self._own, entry.source_hash), lambda: self.load_entry(entry), _bytes_of)
 
@@ -147,7 +147,7 @@ def _bytes_of(loaded: Texture | Asset) -> int:
     return loaded.image.nbytes if isinstance(loaded, Texture) else bytes_of(loaded)
 
 
-def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
+def object_pool(config: PoolConfig, base: Path, max_texture: int = 1024) -> Pool:
     """Return the pool of primitives and mesh folders. It loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
     objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for a folder that is
     missing or has no mesh."""
@@ -157,7 +157,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
             entries.append(
                 Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index)
             )
-    folders = [(resolve(folder, base), f"{where}.folders.{i}", folder) for i, folder in enumerate(config.folders)]
+    folders = [(resolve(folder, base), f"scene.pool.folders.{i}", folder) for i, folder in enumerate(config.folders)]
     limit = int(config.max_file_mb * 1e6)
     notes: list[str] = []
     dressed = config.keep_materials is not False
@@ -194,14 +194,14 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
         entries=_listed(entries),
         load_entry=load,
         test_fraction=config.test_fraction,
-        where=where,
+        where="scene.pool",
         what="meshes",
         bad_assets=config.bad_assets,
         notes=tuple(notes),
     )
 
 
-def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.textures") -> Pool:
+def texture_pool(config: TexturesConfig, base: Path) -> Pool:
     """Return the pool of procedural textures, scikit-image's photographs and image folders. It loads
     :class:`~blinkgl.scene.types.Texture`."""
     kinds = TEXTURE_KINDS if config.procedural is True else config.procedural or ()
@@ -215,7 +215,7 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
         if not bundled:
             raise ConfigError(
                 "scikit-image's photographs are not installed",
-                where=f"{where}.photographs",
+                where="scene.textures.photographs",
                 value=True,
                 accepted=f"run {install('scikit-image')}, or set it to false",
             )
@@ -227,7 +227,7 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
         return Identity({}, digest, digest)
 
     for i, folder in enumerate(config.folders):
-        listed = resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, "images"
+        listed = resolve(folder, base), f"scene.textures.folders.{i}", folder, IMAGE_SUFFIXES, "images"
         entries += _folder_entries(*listed, config.bad_assets, identity, notes)
 
     def load(entry: Entry) -> Texture:
@@ -241,7 +241,7 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
         entries=_listed(entries),
         load_entry=load,
         test_fraction=config.test_fraction,
-        where=where,
+        where="scene.textures",
         what="textures",
         bad_assets=config.bad_assets,
         notes=tuple(notes),

@@ -1,6 +1,6 @@
 #version 430 core
 // Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED,
-// LIGHTS, RGB, TINTED, EMISSIVE, GLOSSY, BUMPED, GLOSS_MAP, MASKED.
+// LIGHTS, RGB, TINTED, EMISSIVE, EMISSION_MAP, GLOSSY, BUMPED, GLOSS_MAP, MASKED, FOG.
 // SHOW_LOOKUP, for the shader debugger: also writes the texture lookups, see lookup.glsl.
 
 #include "needs.glsl"

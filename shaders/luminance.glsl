@@ -4,7 +4,8 @@
 // Variants   TEXTURED       albedo luminance from a one-channel texture, else the uniform alone
 //            LIT            Lambert, of the light of light.glsl: a white sun and sky; else unlit
 //            TAPS4          four texture lookups per pixel instead of one, each one mip level finer
-//            STRETCHED      with TAPS4: the taps lie along the direction of foreshortening
+//            STRETCHED      with TAPS4: the taps lie along the direction of foreshortening; NEAREST_LEVEL: each in one
+//                           mip level
 //            TWO_SIDED      the normal is turned towards the camera on back faces
 //            RATE           (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n        the target holds every n-th pixel of the image: textures are filtered for the whole

@@ -1,6 +1,7 @@
 #version 430 core
 // Shadow map: only depth, as a lamp sees the scene. Of closed meshes the sides that face it are drawn: the lower side
-// of a box on the ground is as far from the lamp as the ground, which would then be lit along the box's edge.
+// of a box on the ground is as far from the lamp as the ground, which would then be lit along the box's edge. PARALLEL:
+// of a sun.
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER

@@ -8,7 +8,8 @@
 //   NEEDS_TINT    in vec3 tint    the vertices' colours
 //   NEEDS_TANGENT in vec4 tangent direction of a texture's u, object frame, of any length; 1 or -1 (tangents.py)
 //
-// MASKED, a surface with holes: is_hole(), which drop_artefact() of guard.glsl calls.
+// MASKED, a surface with holes: is_hole(), which drop_artefact() of guard.glsl calls. TEXTURED, LIT: the material has a
+// texture, and is lit; programs that draw neither ignore them.
 //
 // For a deforming shape (DEFORM, deform.glsl) all of these are at the present time, and in addition, in clip space,
 // rows x, y, w:

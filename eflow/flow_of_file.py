@@ -16,6 +16,7 @@ from eflow.data.window import StreamWindow
 from eflow.infer import Predictor
 from eflow.methods.contrast import LEAST_EVENTS, ContrastMaximisation
 from eflow.methods.iwe import flow_warp_loss
+from eflow.models.contract import FlowModel
 from eflow.writers import Answer, Writer, flow_folder, flow_video
 
 
@@ -27,7 +28,7 @@ def show_flows(
     Raises BlinkGLError: the file has no events, or is shorter than its windows."""
     stream, span, factor = _windows(file, predictor, asked, say)
     predictor.unsharpened.clear()  # of the windows that were looked at to choose their length
-    count, still, before = 0, 0, None
+    count, still, before, speeds = 0, 0, None, []
     with contextlib.ExitStack() as opened:
         writers: list[Writer] = []
         if outputs.out:
@@ -42,6 +43,8 @@ def show_flows(
             flow = flow * np.float32(factor)
             count += 1
             still += not flow.any()
+            if flow.any() and len(window.new):
+                speeds.append(float(np.median(np.hypot(*flow[window.new.y, window.new.x].T))))
             say(
                 f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
@@ -60,10 +63,31 @@ def show_flows(
             )
     if still:
         say(f"  {still} of {count} flows are zero: too few events, or nothing moves")
+    if isinstance(predictor.model, FlowModel) and speeds:
+        _propose_longer(file, predictor, span, speeds, asked.whole, say)
     for why, windows in predictor.unsharpened.items():
         say(f"  {windows} of {count} flows have the network's own length: {why} (--no-sharpen for all)")
     for path in filter(None, (outputs.out, outputs.video)):
         say(f"written: {path}")
+
+
+def _propose_longer(
+    file: EventFile, predictor: Predictor, span: int, speeds: list[float], whole: bool, say: Callable[[str], None]
+) -> None:
+    """Say that the flow of most windows is too short for the networks, and which window is long enough. speeds : px a
+    window."""
+    short = sum(speed < infer.SHORTEST_PX for speed in speeds)
+    if 2 * short <= len(speeds):
+        return
+    where = f"below {infer.SHORTEST_PX:g} px, where networks are wrong by a third or more"
+    line = f"  {short} of {len(speeds)} flows are {where}"
+    ends = infer.ends_of(file)
+    longest = 0 if ends is None or whole else (ends[1] + 1 - ends[0]) // len(predictor.reads)
+    fitting = min(round(span * infer.LIKELY_PX / max(float(np.median(speeds)), 1e-3)), longest)
+    if fitting > 1.2 * span:
+        say(f"{line}: try --window-ms {fitting / 1000:.3g}")
+    else:
+        say(f"{line}; this recording is too short for longer windows")
 
 
 def _windows(

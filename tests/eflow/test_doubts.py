@@ -38,3 +38,27 @@ def test_predict_says_so_in_one_line(tmp_path, capsys):
     np.savetxt(tmp_path / "hot.txt", np.c_[e.t * 1e-6, e.x, e.y, e.p], fmt=["%.6f", "%d", "%d", "%d"])
     command = ["predict", "contrast-translation", str(tmp_path / "hot.txt"), "--size", "100x80", "--window-ms", "40"]
     assert run(command) == 0 and capsys.readouterr().err.count("hot.txt: 40 pixels") == 1
+
+
+def test_windows_of_short_flow_propose_longer_ones_that_are_not_short(tmp_path, capsys):
+    """Columns of dots that move to the right by 100 px/s: 0.8 px in 8 ms."""
+    r = np.random.default_rng(3)
+    x0, y, k = r.uniform(-40, 128, 700), r.integers(0, 96, 700), np.arange(60)
+    x = np.floor(x0)[:, None] + k
+    t = (x - x0[:, None]) / 100
+    keep = (t >= 0) & (t < 0.4) & (x >= 0) & (x < 128)
+    rows = np.c_[t[keep], x[keep], np.repeat(y, 60).reshape(700, 60)[keep], np.ones(keep.sum())]
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    np.savetxt(tmp_path / "dots.txt", rows, fmt=["%.6f", "%d", "%d", "%d"])
+
+    def lines(window_ms: str) -> list[str]:
+        command = ["predict", "real_small", str(tmp_path / "dots.txt"), "--size", "128x96", "--window-ms", window_ms]
+        assert run(command) == 0
+        return [line for line in capsys.readouterr().out.splitlines() if "below 2 px" in line]
+
+    (line,) = lines("8")
+    proposed = line.partition("try --window-ms ")[2]
+    assert 8 < float(proposed) <= 400
+    assert lines(proposed) == []
+    (line,) = lines("1")
+    assert "try --window-ms" in line or "too short" in line

@@ -41,10 +41,15 @@ class Histogram:
 
 
 def histogram(
-    values: np.ndarray, *, log: bool = False, bins: int = 36, span: tuple[float, float] | None = None
+    values: np.ndarray,
+    *,
+    log: bool = False,
+    bins: int = 36,
+    span: tuple[float, float] | None = None,
+    whole: bool = False,
 ) -> Histogram | None:
     """Return bars of ``values`` over ``span`` (default: the 0.1 … 99.9 % range); None without values. log: logarithmic
-    axis."""
+    axis.   whole : counts, whose bars stand apart, and whose ``span`` begins and ends half a count outside of them."""
     values = values[np.isfinite(values)]
     if log:
         values = values[values > 0]
@@ -62,9 +67,10 @@ def histogram(
     # Values beyond the span count in the first and the last bar.
     counts, _ = np.histogram(np.clip(scale(values), edges[0], edges[-1]), edges)
     step, room = (WIDTH - 2 * LEFT) / bins, HEIGHT - BOTTOM - 8
+    width = min(0.7 * step, 24.0) if whole else step - 1
     # The rarest values keep a bar, 1 px high.
     bars = [
-        (LEFT + i * step + 0.5, max(1.0, count / counts.max() * room))
+        (LEFT + i * step + (step - width) / 2, max(1.0, count / counts.max() * room))
         for i, count in enumerate(counts.tolist())
         if count
     ]
@@ -72,13 +78,13 @@ def histogram(
     def place(v: float) -> float:
         return LEFT + (float(scale(v)) - edges[0]) / (edges[-1] - edges[0]) * (WIDTH - 2 * LEFT)
 
-    median = float(np.median(values))
+    median = float(np.quantile(values, 0.5, method="inverted_cdf")) if whole else float(np.median(values))
     label = min(max(place(min(max(median, low), high)), LEFT + 60), WIDTH - LEFT - 60)
     return Histogram(
         bars=bars,
-        bar_width=step - 1,
-        low=float(low),
-        high=float(high),
+        bar_width=width,
+        low=float(low) + 0.5 * whole,
+        high=float(high) - 0.5 * whole,
         median=median,
         median_x=place(median) if low <= median <= high else None,
         label_x=label,

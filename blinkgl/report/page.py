@@ -125,7 +125,7 @@ def _parameter(p: Parameter) -> dict[str, Any]:
     coverage, outside = _coverage(values, low, high, p.kind)
     return {
         **shown,
-        "histogram": histogram(values, log=p.kind == "log_uniform", span=span, bins=bins),
+        "histogram": histogram(values, log=p.kind == "log_uniform", span=span, bins=bins, whole=whole),
         "coverage": coverage,
         "outside": outside,
     }

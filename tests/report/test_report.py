@@ -194,3 +194,12 @@ def test_charts_are_drawn_and_strangers_words_are_escaped(draw):
         "histogram(h)", h=None
     )
     assert draw("histogram(h)", h=histogram(np.arange(9.0))).count('class="bar"') == 9
+
+
+def test_bars_of_counts_stand_apart_and_are_labelled_by_counts():
+    h = histogram(np.array([6.0, 7.0, 7.0, 9.0]), span=(5.5, 9.5), bins=4, whole=True)
+    assert (h.low, h.median, h.high) == (6, 7, 9)
+    lefts = [x for x, _ in h.bars]
+    assert len(lefts) == 3 and min(np.diff(lefts)) > 1.3 * h.bar_width
+    middle = (h.left + h.right) / 2
+    assert lefts[0] + h.bar_width / 2 == pytest.approx(middle - 1.5 * (h.right - h.left) / 4)

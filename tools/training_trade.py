@@ -30,7 +30,7 @@ from eflow.data.sources import open_source
 from eflow.evaluate import evaluate
 
 RECIPES = resources.files("blinkgl.configs") / "eflow"
-RECIPE, NETWORK = str(RECIPES / "training_trade.yaml"), str(RECIPES / "smoke.yaml")
+RECIPE, NETWORK = str(RECIPES / "training_trade_data.yaml"), str(RECIPES / "smoke.yaml")
 V2E = {
     "emulator": "v2e",
     "contrast_threshold": {"uniform": [0.15, 0.5]},

@@ -156,7 +156,15 @@ def _sense(block, s, e, source, p, v, flags, scratch):
         # A pixel with shot noise is listed even where its signal reaches no level. Bits 42 and up: its number.
         for j in range(shots):
             flags[keys[j] >> 42] = 1
-    end = End(intensity, x, lag, noise, keys[:shots], clock_ns, clock_index)
+    end = End(
+        intensity=intensity,
+        x=x,
+        lag=lag,
+        noise=noise,
+        keys=keys[:shots],
+        clock_ns=clock_ns,
+        clock_index=clock_index,
+    )
     if farthest < _ZERO and not shots:
         return np.int64(0), end
     # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
 
-from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.errors import AssetError, BlinkGLError, EventDataError
 
 MAX_RECORD_BYTES = 512 << 20
 MAX_NAME_BYTES = 1024
@@ -50,7 +50,10 @@ def decoding(path: str | os.PathLike, problem: str, kind: type[AssetError] = Ass
     line."""
     try:
         yield
-    except BlinkGLError:
+    except BlinkGLError as error:
+        # Columns do not know the file that they come from.
+        if isinstance(error, EventDataError) and str(path) not in str(error.where):
+            raise kind(f"{problem}: {error}", where=str(path)) from error
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:160] or type(error).__name__

@@ -72,7 +72,14 @@ def register(
     unless(tolerance >= 0.0, "tolerance", "is no number of at least 0")
     unless(reference is None or callable(reference), "reference", "is no function")
     OWN[name] = OwnPass(
-        name, pass_, output or outputs[0], title or name.replace("_", " "), unit, kind, float(tolerance), reference
+        name=name,
+        pass_=pass_,
+        output=output or outputs[0],
+        title=title or name.replace("_", " "),
+        unit=unit,
+        kind=kind,
+        tolerance=float(tolerance),
+        reference=reference,
     )
     return OWN[name]
 

@@ -30,7 +30,7 @@ def _parameters():
                 yield pytest.param(door, one.name, id=f"{name}-{one.name}")
 
 
-@pytest.mark.parametrize("door, parameter", _parameters())
+@pytest.mark.parametrize("door, parameter", [*_parameters()])
 def test_a_wrong_value_is_one_line(door, parameter, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     camera = blinkgl.Camera(16, 12)

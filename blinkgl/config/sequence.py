@@ -251,8 +251,8 @@ class SequenceConfig(Config):
     quality: Quality | None = Field(
         DEFAULT,
         description="fast, balanced, accurate or reference: sets timeline and render to a measured trade-off of "
-        "speed and accuracy (docs/trade.md; for training, too, balanced is best); keys given beside it override "
-        "it. null: the defaults of each table",
+        "speed and accuracy (docs/trade.md; none was better for training than balanced); keys given beside it "
+        "override it. null: the defaults of each table",
     )
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="times of the event frames")
     scene: SceneConfig = Field(RandomSceneConfig(), description="objects, lights, camera motion")

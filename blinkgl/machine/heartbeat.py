@@ -52,6 +52,8 @@ class Heartbeat:
             yield
         finally:
             done.set()
+            if thread.is_alive():
+                thread.join()
 
 
 heartbeat = Heartbeat()

@@ -79,7 +79,7 @@ def _propose_longer(
     short = sum(speed < infer.SHORTEST_PX for speed in speeds)
     if 2 * short <= len(speeds):
         return
-    where = f"below {infer.SHORTEST_PX:g} px, where networks are wrong by a third or more"
+    where = f"below {infer.SHORTEST_PX:g} px, where the networks of the package are wrong by a third or more"
     line = f"  {short} of {len(speeds)} flows are {where}"
     ends = infer.ends_of(file)
     longest = 0 if ends is None or whole else (ends[1] + 1 - ends[0]) // len(predictor.reads)

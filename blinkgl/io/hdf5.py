@@ -461,7 +461,7 @@ def _blosc() -> ctypes.CDLL:
     return ctypes.CDLL(str(Path(_plugin().PLUGIN_PATH) / "libh5blosc.so"))
 
 
-def _plugin() -> object:
+def _plugin() -> Any:
     """Return hdf5plugin, whose import makes its filters known to HDF5. Raises ImportError."""
     import hdf5plugin
 

@@ -453,13 +453,13 @@ def decode_exr(data: bytes, where: str) -> np.ndarray:
 
 
 @functools.cache
-def _imported() -> object:
+def _imported() -> Any:
     with uninterrupted(signal.SIGINT, signal.SIGTERM):
         import av
     return av
 
 
-def _av(error: type, where: str | os.PathLike) -> object:
+def _av(error: type, where: str | os.PathLike) -> Any:
     """Return PyAV. Raises ``error`` where it is not installed."""
     try:
         return _imported()
@@ -468,7 +468,7 @@ def _av(error: type, where: str | os.PathLike) -> object:
 
 
 @contextlib.contextmanager
-def _logged(av: object) -> Iterator[list[str]]:
+def _logged(av: Any) -> Iterator[list[str]]:
     """Return the lines that FFmpeg reports from this thread, filled at the end."""
     lines: list[str] = []
     level = av.logging.get_level()

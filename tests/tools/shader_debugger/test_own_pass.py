@@ -47,6 +47,15 @@ def test_it_is_shown_probed_compared_and_checked(shader, config, mine, tmp_path)
     assert status == 0 and "1 variants" in out and "all compile and link" in out
 
 
+def test_without_a_reference_it_is_shown_and_probed_and_cannot_be_compared(shader, config, mine):
+    edit(mine, ", reference=reference)", ")")
+    rows = json.loads(shader("probe", config, "-p", "3,3", "--json", "--plugin", mine)[1])["buffers"]
+    row = next(row for row in rows if row["name"] == "outline")
+    assert row["note"] == "the plug-in gives no reference" and row["gpu"] in (0.0, 1.0) and row["ok"] is None
+    status, _, err = shader("diff", config, "--pass", "outline", "--plugin", mine)
+    assert status == 2 and "unknown pass" in err and err.count("\n") == 1
+
+
 def test_a_wrong_program_and_one_that_does_not_compile_are_shown(shader, config, mine, tmp_path):
     program = mine.with_suffix(".glsl")
     edit(program, "? 1.0 : 0.0", "? 0.0 : 1.0")

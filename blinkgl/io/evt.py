@@ -391,18 +391,20 @@ def _decode_evt3(words, state, x, y, t, p, triggers, mend):
             width = 12 if kind == 4 else 8
             # Bit k of a vector is the pixel base + k; the base then moves on by the vector's width.
             for k in range(width):
-                if (word >> k) & 1 and row >= 0:
-                    if base + k > 0x7FF:
-                        bad = i
-                        break
-                    if high < 0:
-                        untimed += 1
-                        continue
-                    x[n], y[n], p[n] = base + k, row, polarity
-                    t[n] = (((wraps << 12) | high) << 12) | low
-                    n += 1
-                elif (word >> k) & 1:
+                if not (word >> k) & 1:
+                    continue
+                if row < 0:
                     others += 1
+                    continue
+                if base + k > 0x7FF:
+                    bad = i
+                    break
+                if high < 0:
+                    untimed += 1
+                    continue
+                x[n], y[n], p[n] = base + k, row, polarity
+                t[n] = (((wraps << 12) | high) << 12) | low
+                n += 1
             base += width
             if bad >= 0:
                 break

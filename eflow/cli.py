@@ -25,8 +25,8 @@ from eflow.cli_arguments import (
     Protocol,
     Quiet,
     Sampling,
-    Sharpen,
-    Sharpened,
+    Refine,
+    Refined,
     WarmStart,
     WindowMs,
     WindowsAsked,
@@ -139,7 +139,7 @@ def evaluate(
     frames: Frames = None,
     dense: Dense = False,
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
-    sharpen: Sharpened = False,
+    refine: Refined = False,
 ) -> None:
     """Score a network or a method on a data set. Beside it stand baselines: zero flow, and global motions fitted to the
     truth. Samples with an empty window are left out and counted."""
@@ -162,7 +162,7 @@ def evaluate(
             source,
             out,
             limit=limit,
-            sharpen=sharpen,
+            refine=refine,
             warm_start=options.warm_start,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
@@ -187,7 +187,7 @@ def predict(
     asked: WindowsAsked,
     declared: Declared,
     options: Answering,
-    sharpen: Sharpen = True,
+    refine: Refine = True,
 ) -> None:
     """Compute the flow of any event file. Networks do it, and methods that need no training.
 
@@ -211,7 +211,7 @@ def predict(
         name, why = chosen(file, asked, infer.Predictor(model, height, width))
         typer.echo(f"network: {why}")
         model = answerer(name, options)
-    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, sharpen=sharpen)
+    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, refine=refine)
     show_flows(file, predictor, asked, outputs, typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)

@@ -58,16 +58,15 @@ Frames = Annotated[
     typer.Option("--frames", metavar="FIRST-LAST", help="MVSEC: images (or 20 Hz fields) to score; may be repeated."),
 ]
 Dense = Annotated[bool, typer.Option("--dense", help="MVSEC: score pixels without events, too.")]
-Sharpened = Annotated[
-    bool, typer.Option("--sharpen", help="Scale the flow of a network to the length that makes the events sharpest.")
-]
+_REFINE = (
+    "Draw the flow of a network that is near its dominant affine motion towards it, then scale it to the length that "
+    "makes the events sharpest."
+)
+Refined = Annotated[bool, typer.Option("--refine", help=_REFINE)]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
-Sharpen = Annotated[
-    bool,
-    typer.Option(help="Scale the flow of a network to the length that makes the events sharpest."),
-]
+Refine = Annotated[bool, typer.Option(help=_REFINE)]
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:

@@ -66,7 +66,7 @@ def show_flows(
     if isinstance(predictor.model, FlowModel) and speeds:
         _propose_longer(file, predictor, span, speeds, asked.whole, say)
     for why, windows in predictor.unsharpened.items():
-        say(f"  {windows} of {count} flows have the network's own length: {why} (--no-sharpen for all)")
+        say(f"  {windows} of {count} flows have the network's own length: {why} (--no-refine for all)")
     for path in filter(None, (outputs.out, outputs.video)):
         say(f"written: {path}")
 

@@ -15,9 +15,10 @@ from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
 from eflow.data.representation import VoxelGrid, grids_of
-from eflow.data.window import SIDES, RawSample, StreamWindow, Window
+from eflow.data.window import SIDES, RawSample, StreamWindow, Window, hit_pixels
 from eflow.methods import Method
 from eflow.methods.contrast import sharpest_length
+from eflow.methods.dominant import toward_dominant
 from eflow.models import FlowModel, FlowPrediction
 from eflow.ops.warp import forward_warp
 from eflow.types import Batch, Flow, Grid
@@ -231,7 +232,8 @@ class Predictor:
 
     warm_start : the refinement of each window starts from the flow of the previous one, moved along itself, where it
     follows it (networks with an iterated low-resolution flow only).   warm : number of windows that did.
-    sharpen : multiply each flow of a network by the factor that makes the events of its windows sharpest
+    refine : draw each flow of a network towards its dominant motion (:func:`eflow.methods.dominant.toward_dominant`),
+    then multiply it by the factor that makes the events of its windows sharpest
     (:func:`eflow.methods.contrast.sharpest_length`).   unsharpened : windows whose flow kept its length, by reason.
     reads : the windows of a pair that are read. A window without events, or with too few for a method, has zero
     flow."""
@@ -243,10 +245,10 @@ class Predictor:
         width: int,
         *,
         warm_start: bool = False,
-        sharpen: bool = False,
+        refine: bool = False,
     ):
         self.model, self.height, self.width = model, height, width
-        self.warm_start, self.sharpen = warm_start, sharpen
+        self.warm_start, self.refine = warm_start, refine
         self.reads = model.reads if isinstance(model, FlowModel) else SIDES
         self.unsharpened: Counter[str] = Counter()
         self.warm = 0
@@ -267,7 +269,7 @@ class Predictor:
         if not all(len(getattr(window, name)) for name in self.reads):
             return self._still(), grids["new"]
         flow = self._predicted(window, {name: torch.from_numpy(grid)[None] for name, grid in grids.items()})
-        return self._sharpened(window, flow) if self.sharpen else flow, grids["new"]
+        return self._refined(window, flow) if self.refine else flow, grids["new"]
 
     def _still(self) -> Flow:
         """Return zero flow for a window that tells none; the next one does not start from it."""
@@ -284,7 +286,9 @@ class Predictor:
             self._before = (window.scene, window.new.t1), prediction.low
         return prediction.flow[0].permute(1, 2, 0).cpu().numpy()
 
-    def _sharpened(self, window: StreamWindow | RawSample, flow: Flow) -> Flow:
+    def _refined(self, window: StreamWindow | RawSample, flow: Flow) -> Flow:
+        read = [getattr(window, name) for name in self.reads]
+        flow = toward_dominant(flow, hit_pixels(read, self.height, self.width))
         follows = len(window.old) and window.old.t1 == window.new.t0
         factor, why = sharpest_length([window.old, window.new] if follows else [window.new], flow)
         if why:

@@ -33,7 +33,7 @@ BINS = (0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 24.0)
 """Edges of the bins of true length, px."""
 LEAST_EVENTS = 50
 Judged = tuple[float, float, float, float, float]
-"""True length; predicted over true length and error over true length, of the flow as it is and sharpened."""
+"""True length; predicted over true length and error over true length, of the flow as it is and refined."""
 
 
 def of_pool(path: str) -> Iterator[tuple[RawSample, np.ndarray]]:
@@ -119,8 +119,8 @@ def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow | RawSample, np.
         size = np.hypot(*true.T)
         if not size.any():  # nothing moves: no length to compare
             continue
-        for sharpen in (False, True):
-            flow = Predictor(model, height, width, sharpen=sharpen)(pair)[0][hit]
+        for refine in (False, True):
+            flow = Predictor(model, height, width, refine=refine)(pair)[0][hit]
             row += [np.hypot(*flow.T).sum() / size.sum(), np.hypot(*(flow - true).T).sum() / size.sum()]
         share, error, sharp_share, sharp_error = map(float, row)
         yield float(np.median(size)), share, error, sharp_share, sharp_error

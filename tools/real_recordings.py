@@ -19,7 +19,7 @@ image's x axis: ``x`` is the share of its flow along it.
 
 The second line is for judging, and to be used seldom: the bursts' flow is known. AEE and cosine of the whole burst as
 one window and (``halves``) of its second half, behind its first, beside zero flow's and the best constant and affine
-flow (which know the truth); at pixels with events, and over all. ``NAME+sharp`` is a network whose flow is as long as
+flow (which know the truth); at pixels with events, and over all. ``NAME+refined`` is a network whose flow is as long as
 makes the events sharpest, which is what `eflow predict` gives. ``--changed`` adds their share of zero flow's error when
 only a part of the events is left (means of ten draws), and when the burst lies in the middle of a larger sensor.
 ``--sets`` adds the same table for data sets with labels (configs/eflow/independent_data.yaml is one): means over up to
@@ -57,7 +57,7 @@ from eflow.methods.table import METHODS, make_method
 
 TEST = "ecd_rotation"
 """Folder of the bursts whose flow is known: the networks are judged by them and not tuned on them."""
-SHARPENED = "+sharp"
+REFINED = "+refined"
 """Behind a network's name: its flow as long as makes the events sharpest, as `eflow predict` has it."""
 MOVES = 1.1
 """FWL of the affine field from which on a window is said to move."""
@@ -110,15 +110,15 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
     """A network's or method's flow (H, W, 2) of a pair of windows, zero where there is nothing to go by."""
     if name == "zero":
         return lambda window: np.zeros((height, width, 2), np.float32)
-    plain = name.removesuffix(SHARPENED)
+    plain = name.removesuffix(REFINED)
     model = make_method(name, focal) if name in METHODS else load_model(plain)
-    predictor = Predictor(model, height, width, sharpen=plain != name)
+    predictor = Predictor(model, height, width, refine=plain != name)
     return lambda window: predictor(window)[0]
 
 
 def reads_two(name: str) -> bool:
     """Whether it is a network that reads two windows, of a burst its halves."""
-    return name not in METHODS and "old" in load_model(name.removesuffix(SHARPENED)).reads
+    return name not in METHODS and "old" in load_model(name.removesuffix(REFINED)).reads
 
 
 def likely_span(events: Events, height: int, width: int) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from eflow.config import EFlowFormerConfig
 from eflow.models.contract import initialise
 from eflow.models.eraft import Correlation, Eraft
-from eflow.models.unets import Consensus, Residual, double
+from eflow.models.unets import Consensus, Residual, double, seen_cells
 from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
 from eflow.ops.correlation import channels_of, pixel_grid
 from eflow.ops.upsample import bilinear_upsample
@@ -85,7 +85,7 @@ class EnhancementLayer(nn.Module):
 class QuickContext(nn.Module):
     """A U-Net with one more scale. It reads the features of both windows at 1/8 and the correlation around zero flow,
     and returns state and context of the GRU and a first flow. An affine field fitted at the coarsest scale carries
-    motion to areas without events (:class:`~eflow.models.unets.Consensus`)."""
+    motion to areas without events (:class:`~eflow.models.unets.Consensus`); only cells near events weigh in it."""
 
     def __init__(self, features: int, taps: int, hidden: int):
         super().__init__()
@@ -96,11 +96,12 @@ class QuickContext(nn.Module):
         self.up = nn.Conv2d(deep + seen, 2 * hidden, 3, padding=1)
         self.context, self.flow = (nn.Conv2d(2 * hidden, c, 3, padding=1) for c in (2 * hidden, 2))
 
-    def forward(self, old: Tensor, new: Tensor, taps: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and context (N, 2 hidden, h, w) and flow (N, 2, h, w), px of 1/8, of features and
-        correlation."""
+    def forward(self, old: Tensor, new: Tensor, taps: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Return state and context (N, 2 hidden, h, w) and flow (N, 2, h, w), px of 1/8, of features, correlation
+        and the cells of 16 px that have events nearby, (N, 1, h / 2, w / 2) rounded up."""
         seen = torch.cat([new, old, F.relu(self.cost(taps))], 1)
-        deep = self.deep(F.relu(self.down(seen)))
+        before, consensus, after = self.deep
+        deep = after(consensus(before(F.relu(self.down(seen))), cells))
         # Half of an odd size is rounded up, so the doubled map is cut.
         deep = double(deep)[..., : seen.shape[-2], : seen.shape[-1]]
         both = F.relu(self.up(torch.cat([deep, seen], 1)))
@@ -152,7 +153,8 @@ class EFlowFormer(Eraft[EFlowFormerConfig]):
         correlation = self._correlation(*self.enhance(*self.project(both).chunk(2)))
         old, new = both.chunk(2)
         still = pixel_grid(old.shape[-2], old.shape[-1], old).expand(len(old), -1, -1, -1)
-        seen, flow = self.context(old, new, correlation.lookup(still))
+        cells = seen_cells(torch.cat([batch["old"], batch["new"]], 1), 16)
+        seen, flow = self.context(old, new, correlation.lookup(still), cells)
         first, warm = bilinear_upsample(flow) if self.training else None, batch.get("flow_init")
         return correlation, seen, flow if warm is None else warm, first
 

@@ -81,7 +81,8 @@ def seen_cells(events: Tensor, stride: int) -> Tensor:
     """Return 1 for the cells of ``stride`` px of event tensors (N, C, H, W) that have events within two cells, else 0:
     (N, 1, h, w). A few stray events do not count: such a cell has .6 of the pixels with events that the cell of a
     mean event has, or more."""
-    share = F.avg_pool2d((events != 0).any(1, keepdim=True).float(), stride)
+    # A cell that the border cuts has its share of what is inside.
+    share = F.avg_pool2d((events != 0).any(1, keepdim=True).float(), stride, ceil_mode=True)
     usual = (share**2).sum((2, 3), keepdim=True) / share.sum((2, 3), keepdim=True).clamp(min=1e-9)
     return F.max_pool2d((share >= 0.6 * usual).float(), 5, stride=1, padding=2)
 

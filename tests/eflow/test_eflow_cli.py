@@ -135,7 +135,7 @@ def test_windows_of_a_recording_that_hardly_moves_are_as_long_as_it_allows(netwo
     command = ["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]
     assert run(command) == 0
     assert "the longest window of this recording: motion in it is below 5 px" in capsys.readouterr().out
-    assert run(["predict", network, str(tmp_path / "e.h5"), "--whole", "--no-sharpen"]) == 0
+    assert run(["predict", network, str(tmp_path / "e.h5"), "--whole", "--no-refine"]) == 0
 
 
 def test_another_motion_by_contrast_maximisation_is_said(monkeypatch, tmp_path, capsys):
@@ -352,7 +352,7 @@ def test_a_silent_window(network, tmp_path, capsys):
         ("one", ["--whole"], "fewer than two events"),
         ("one", ["--window-ms", "auto"], "no events at a quarter, half and three quarters of the recording"),
         ("jump", ["--window-ms", "auto"], "no events at a quarter, half and three quarters"),
-        ("jump", ["--no-sharpen"], "event times jump by 3.6e+09 s; expected --end-ms before"),
+        ("jump", ["--no-refine"], "event times jump by 3.6e+09 s; expected --end-ms before"),
         ("pixel", [], None),
         ("pixel", ["--whole"], None),
         ("pixel", ["--window-ms", "auto"], None),

@@ -209,8 +209,8 @@ def test_real_small_in_a_larger_sensor(name, size):
     left, top = (wide - width) // 2, (high - height) // 2
     inside = Events(events.x + np.uint16(left), events.y + np.uint16(top), events.t, events.p)
     error = lambda flow: np.hypot(*(flow[judged] - truth[judged]).T).mean()
-    own = rr.answer_of("real_small+sharp", height, width)(as_one(events, t0, t1))
-    flow = rr.answer_of("real_small+sharp", high, wide)(as_one(inside, t0, t1))[top : top + height, left : left + width]
+    own = rr.answer_of("real_small+refined", height, width)(as_one(events, t0, t1))
+    flow = rr.answer_of("real_small+refined", high, wide)(as_one(inside, t0, t1))[top : top + height, left : left + width]
     assert error(flow) < 1.3 * error(own)
 
 
@@ -219,7 +219,7 @@ def test_sharpening_of_sparse_events_does_no_harm(name):
     """Of 10 and 5 % of the events: with it as right as without, but for a twentieth (three draws)."""
     events, truth, judged, (t0, t1) = burst(name)
     error = lambda flow: np.hypot(*(flow[judged] - truth[judged]).T).mean()
-    answers = [rr.answer_of(n, *truth.shape[:2]) for n in ("real_small+sharp", "real_small")]
+    answers = [rr.answer_of(n, *truth.shape[:2]) for n in ("real_small+refined", "real_small")]
     for share in (0.1, 0.05):
         errors = []
         for draw in range(3):

@@ -181,7 +181,7 @@ class Page:
         t_ms = unit["t_ns"] / 1e6
         data = (t_ms, *unit[name].T)
         low, high = float(unit[name].min(initial=0)), float(unit[name].max(initial=0))
-        series = ({"label": "ms"}, *({"label": a, "stroke": c, "width": 1.5} for a, c in zip("xyz", _XYZ)))
+        series = ({"label": "ms"}, *({"label": a, "stroke": c, "width": 1.5} for a, c in zip("xyz", XYZ)))
         plot = self.server.gui.add_uplot(
             data,
             series,
@@ -233,7 +233,8 @@ class Page:
             camera.position, camera.look_at, camera.fov = eye, at, FOV
 
 
-_XYZ = ("#d62728", "#2ca02c", "#1f77b4")
+XYZ = ("#d55e00", "#009e73", "#0072b2")
+"""Vermilion, bluish green and blue of Okabe and Ito (2008): red and green are one colour to one man in twelve."""
 
 
 def _speed(said: str) -> float:

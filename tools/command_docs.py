@@ -26,7 +26,7 @@ Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `
 sequences (`trade --suite`: scenes) that were set aside; 130 interrupted by Ctrl-C, 143 by SIGTERM (one line).
 """
 SHARED_BY = 2
-"""An option of so many commands is described once."""
+"""An argument or option of so many commands is described once."""
 HEAD = "|option|meaning|default, limits|\n|---|---|---|\n"
 REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 """What ``--help`` says last of an option, ``[default: 4; 1<=x<=1000]``."""
@@ -39,8 +39,8 @@ def page() -> str:
     commands = [row for root, app in roots for row in _commands(root, typer.main.get_command(app))]
     rows = {name: _rows(name, command) for name, command in commands}
     count = Counter(row for options in rows.values() for row in options)
-    shared = [row for row in count if count[row] >= SHARED_BY and row.startswith("|`-")]
-    table = f"\n## Options of several commands\n\n{HEAD}{''.join(shared)}"
+    shared = [row for row in count if count[row] >= SHARED_BY]
+    table = f"\n## Used by several commands\n\n{HEAD}{''.join(shared)}"
     return HEADER + table + "".join(_section(name, command, rows[name], shared) for name, command in commands)
 
 

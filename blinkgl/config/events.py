@@ -20,10 +20,9 @@ _MAX_EVENTS = Field(
     2**25,
     ge=1_000,
     le=2**31 - 1,
-    description="Most events one step may emit, divided equally among blocks of 1024 pixels (a block may always "
-    "emit one per pixel). Above its limit every pixel of a block is cut to the same number; levels "
-    "still move, and `emulator.saturated` counts the cut events. Sorting 2^25 events needs about 1 "
-    "GB.",
+    description="Most events of one step, divided equally among blocks of 1024 pixels (each may emit at least one "
+    "per pixel). Beyond it, every pixel of a block is cut to the same number; the manifest counts the "
+    "events that are cut. Sorting 2^25 events needs about 1 GB.",
 )
 _CAUSES = Field(
     False,
@@ -33,10 +32,9 @@ _CAUSES = Field(
 Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(
     "auto",
-    description="Where events are computed: `cpu`, compiled loops; `cuda`, torch on a GPU, which takes frames "
-    "rendered on the same GPU without copying them (only with straight lines between frames). The "
-    "events are the same. `auto`: `cuda` where a GPU renders the frames, torch can use it and a "
-    "short trial gives the same events; else `cpu`.",
+    description="Where events are computed, with the same result: `cpu`, compiled loops; `cuda`, torch on a GPU "
+    "(docs/simulators.md); `auto`: `cuda` where a GPU renders the frames, torch can use it and a short "
+    "trial gives the same events, else `cpu`.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
@@ -191,7 +189,7 @@ class EsimConfig(_TwoThresholds):
     contrast_threshold: float = Field(
         0.2,
         **_THRESHOLD,
-        description="C+, change of ln(intensity) per ON event. BlinkSim draws 0.18-0.25 per sequence.",
+        description="C+, change of ln(intensity) per ON event.",
     )
     contrast_threshold_off: float | None = Field(
         None, **_THRESHOLD, description="C-, for OFF events; default: equal to contrast_threshold."
@@ -207,15 +205,14 @@ class EsimConfig(_TwoThresholds):
         0.021,
         ge=0,
         le=5,
-        description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021), drawn once per "
-        "pixel; each threshold stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of "
-        "contrast_threshold.",
+        description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021); each threshold "
+        "stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of contrast_threshold.",
     )
     threshold_jitter: float = Field(
         0.0,
         ge=0,
         le=5,
-        description="Standard deviation of the threshold from event to event, ln units, drawn once per event.",
+        description="Standard deviation of the threshold from event to event, ln units.",
     )
     log_eps: float = Field(
         1e-3,
@@ -282,7 +279,7 @@ class V2eConfig(_TwoThresholds):
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
     )
-    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units (v2e: 0.2).")
+    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="OFF threshold; default: equal.")
     threshold_ratio: float | None = Field(
         None,
@@ -295,7 +292,7 @@ class V2eConfig(_TwoThresholds):
         0.03,
         ge=0,
         le=5,
-        description="Spread of the thresholds over the pixels, ln units (v2e: 0.03); each threshold stays >= 0.01.",
+        description="Spread of the thresholds over the pixels, ln units; each threshold stays >= 0.01.",
     )
     full_scale: float = Field(
         255.0,
@@ -307,36 +304,34 @@ class V2eConfig(_TwoThresholds):
         300.0,
         ge=0,
         le=1e7,
-        description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
-        "(I + 20)/275; 0: infinite bandwidth.",
+        description="Photoreceptor cut-off at full scale, Hz, scaled by (I + 20)/275; 0: infinite bandwidth.",
     )
-    leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON (v2e: 0.01).")
+    leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON.")
     leak_jitter: float = Field(
         0.1,
         ge=0,
         le=1,
-        description="Relative standard deviation of the interval between two leak "
-        "events of a pixel (v2e: leak_jitter_fraction 0.1).",
+        description="Relative standard deviation of the interval between two leak events of a pixel.",
     )
     leak_cov_decades: float = Field(
         0.1,
         ge=0,
         le=3,
-        description="Spread of the leak rate over the pixels, decades (v2e: noise_rate_cov_decades 0.1).",
+        description="Spread of the leak rate over the pixels, decades.",
     )
     shot_noise_rate_hz: float = Field(
         0.001,
         ge=0,
         le=1e4,
-        description="Noise events per second and pixel in the dark, ON and OFF together (v2e: 0.001); a quarter "
-        "of it at full scale.",
+        description="Noise events per second and pixel in the dark, ON and OFF together; a quarter of it at full "
+        "scale.",
     )
     photoreceptor_noise: bool = Field(
         False,
         description="Make noise events by low-pass filtered noise before the comparator, at the rate "
         "shot_noise_rate_hz, instead of drawing them; needs cutoff_hz > 0.",
     )
-    refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
+    refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds.")
     start: Literal["stationary", "balanced", "zero"] = Field(
         "stationary",
         description="State of the pixels between their levels at the first frame. `stationary`: as after a long "

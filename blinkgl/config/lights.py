@@ -131,9 +131,8 @@ class LightConfig(Config):
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
-        description="shadows of objects and walls from the sun, further suns and spot lights, at most four "
-        "(soft: two); hard: edges as wide as a texel of the shadow map; soft: edges depend on the "
-        "size of the light, up to 48 texels",
+        description="of objects and walls, from at most four suns and spot lights (soft: two); hard: edges a texel "
+        "of the shadow map wide; soft: wider for larger lights, up to 48 texels",
     )
     shadow_size: int = Field(1024, ge=64, le=8192, description="side of each shadow map, texels")
     unlit: bool = Field(False, description="radiance = albedo on every surface")

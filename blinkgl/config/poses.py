@@ -135,9 +135,8 @@ class TrajectoryConfig(Config):
     )
     T_body_sensor: str | Matrix | None = Field(
         None,
-        description="pose of this camera or object on the body whose poses the file has: a transform from its "
-        "axes to the body's, as EuRoC's sensor.yaml (its T_BS) or four rows of four; null: it is "
-        "that body",
+        description="pose of this camera or object on the body that the file describes: a transform from its axes "
+        "to the body's, or EuRoC's sensor.yaml (its T_BS); null: it is that body",
     )
 
     @rule("T_body_sensor")
@@ -149,7 +148,7 @@ class TrajectoryConfig(Config):
 class KeyedMotionConfig(PoseConfig):
     """A fixed pose, key frames, or a trajectory from a file. The first pose is held before its time and the last after
     it. Between key frames a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than
-    180 degrees per step; full turns need more key frames."""
+    180 degrees per step."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field(

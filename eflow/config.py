@@ -85,7 +85,7 @@ class EraftConfig(_Refined):
     """E-RAFT (Gehrig et al., 3DV 2021)."""
 
     name: Literal["eraft"] = "eraft"
-    size: Size = Field("base", description="widths: 5.33 M parameters as published; small 2.95 M; tiny 1.06 M")
+    size: Size = Field("base", description="number of parameters (docs/eflow.md); base: as published")
 
 
 class EFlowFormerConfig(_Refined):
@@ -94,8 +94,7 @@ class EFlowFormerConfig(_Refined):
     name: Literal["eflowformer"] = "eflowformer"
     size: Size = Field(
         "base",
-        description="12.76 M parameters: 4 layers as published; small 3.89 M: 2 layers; tiny 1.53 M: 1 layer; "
-        "otherwise widths of E-RAFT's sizes",
+        description="base: 4 layers, as published; small: 2; tiny: 1; otherwise widths of E-RAFT's sizes",
     )
     attention: Literal["separable", "twins"] = Field(
         "separable", description="twins: keys reduced by a dense convolution, and an MLP after each attention"
@@ -122,9 +121,7 @@ class EvFlowNetConfig(Config):
     """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
 
     name: Literal["ev_flownet"] = "ev_flownet"
-    size: Size = Field(
-        "base", description="14.13 M parameters: 64 channels as published; small 3.54 M: 32; tiny 0.89 M: 16"
-    )
+    size: Size = Field("base", description="base: 64 channels, as published; small: 32; tiny: 16")
     input: Literal["counts", "voxel"] = Field(
         "counts", description="4 channels of counts and latest times, or a voxel grid"
     )
@@ -143,9 +140,7 @@ class SpikeFlowNetConfig(Config):
     """Spike-FlowNet (Lee et al., ECCV 2020), supervised."""
 
     name: Literal["spike_flownet"] = "spike_flownet"
-    size: Size = Field(
-        "base", description="13.04 M parameters: 64 channels as published; small 3.42 M: 32; tiny 0.93 M: 16"
-    )
+    size: Size = Field("base", description="base: 64 channels, as published; small: 32; tiny: 16")
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: by size"
     )
@@ -159,8 +154,7 @@ class SteFlowNetConfig(Config):
     name: Literal["ste_flownet"] = "ste_flownet"
     size: Size = Field(
         "base",
-        description="48.33 M parameters: 64 channels as published; small 13.04 M: 32; tiny 1.24 M: 8, and a "
-        "radius of 2 cells instead of 4",
+        description="base: 64 channels, as published; small: 32; tiny: 8, and a radius of 2 cells instead of 4",
     )
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: by size"

@@ -26,8 +26,8 @@ _MAX_EVENTS = Field(
 )
 _CAUSES = Field(
     False,
-    description="Mark every event with its cause (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): 0 "
-    "signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
+    description="Mark every event with its cause (`cause` in the files): 0 signal, 1 leak, 2 shot noise, 3 hot "
+    "pixel. The events are the same.",
 )
 Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(
@@ -335,10 +335,9 @@ class V2eConfig(_TwoThresholds):
     start: Literal["stationary", "balanced", "zero"] = Field(
         "stationary",
         description="State of the pixels between their levels at the first frame. `stationary`: as after a long "
-        "time in front of a still scene, where leak has moved each pixel towards ON; short clips "
-        "then have more ON events than a moving scene. `balanced`: as after a signal that rose as "
-        "often as it fell. `zero`: every pixel has just fired, as in v2e. Without leak `stationary` "
-        "and `zero` are the same.",
+        "time before a still scene, in which leak moves pixels towards ON, so that short clips have "
+        "more ON events. `balanced`: as after a signal that rose as often as it fell. `zero`: every "
+        "pixel has just fired, as in v2e.",
     )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Fraction of pixels that fire without a signal.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
@@ -400,8 +399,8 @@ class VoltmeterConfig(EmulatorConfig):
     )
     start: Literal["stationary", "zero"] = Field(
         "stationary",
-        description="V at the first frame: as after a long time in front of a still scene, or 0 everywhere (as "
-        "in the authors' program, where the first leak events of a flat image coincide).",
+        description="V at the first frame: as after a long time before a still scene, or 0 everywhere, as in the "
+        "authors' program.",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES

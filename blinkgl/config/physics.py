@@ -43,8 +43,7 @@ class PhysicsConfig(Config):
         ge=1000,
         le=1e6,
         description="steps of the physics engine per second, Hz; computing time is proportional to it. An impact "
-        "lasts 1.6 ms, but at least 16 steps; during it a body sinks in by a third of its speed "
-        "times that time (5 m/s: 2.5 mm)",
+        "lasts 1.6 ms, but at least 16 steps; a body at 5 m/s sinks in by 2.5 mm",
     )
     max_speed: float = Field(
         200.0,

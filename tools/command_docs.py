@@ -63,16 +63,11 @@ def _rows(name: str, command) -> list[str]:
 
 
 def _section(name: str, command, rows: list[str], shared: list[str]) -> str:
-    context = typer.Context(command, info_name=name)
-    usage = " ".join([name, *(piece.strip("{}") for piece in command.collect_usage_pieces(context))])
     own = [row for row in rows if row not in shared]
     also = ", ".join(re.sub(r" [^-` ]+`$", "`", row.split("|")[1]) for row in rows if row in shared)
-    table = f"\n{HEAD}{''.join(own)}" if own else ""
-    return (
-        f"\n## {name}\n\n{' '.join((command.help or '').split())}\n\n```\n{usage}\n```\n{table}"
-        f"{f'{chr(10)}Also: {also}.{chr(10)}' if also else ''}"
-        + "".join(("\nExamples:\n\n```\n", *(f"{line}\n" for line in EXAMPLES[name]), "```\n"))
-    )
+    parts = [f"## {name}", " ".join((command.help or "").split()), "\n".join(["```", *EXAMPLES[name], "```"])]
+    parts += [HEAD + "".join(own).rstrip("\n")] * bool(own) + [f"Also: {also}."] * bool(also)
+    return "".join(f"\n{part}\n" for part in parts)
 
 
 def _row(names: str, meaning: str) -> str:

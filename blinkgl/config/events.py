@@ -328,8 +328,8 @@ class V2eConfig(_TwoThresholds):
     )
     photoreceptor_noise: bool = Field(
         False,
-        description="Make noise events by low-pass filtered noise before the comparator, at the rate "
-        "shot_noise_rate_hz, instead of drawing them; needs cutoff_hz > 0.",
+        description="Make noise events, at the rate shot_noise_rate_hz, by low-pass filtered noise before the "
+        "comparator; needs cutoff_hz > 0.",
     )
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds.")
     start: Literal["stationary", "balanced", "zero"] = Field(

@@ -79,8 +79,7 @@ class FramesConfig(Config):
         17.0,
         gt=0,
         le=1e4,
-        description="99th percentile of the given flow, px, above which frames are too far apart to interpolate "
-        "and their sequence is skipped; null: no check",
+        description="99th percentile of the flow, px, above which a sequence is set aside; null: no check",
     )
     former: ClassVar[dict[str, Former]] = {
         "qualify": Former("max_displacement", lambda value: value is None or isinstance(value, dict)),

@@ -117,15 +117,14 @@ class TrajectoryConfig(Config):
         0.0,
         ge=0,
         le=60,
-        description="replaces each pose by the mean of the poses within this time before and after, s, with "
-        "triangular weights; 0: the spline passes through all poses",
+        description="averages the poses within this time before and after each, s, with triangular weights",
     )
     speed_limit: float = Field(
         100.0,
         gt=0,
         le=1e9,
-        description="largest speed from one pose to the next, world units/s; a higher one is refused as a jump, "
-        "or as poses in mm",
+        description="largest speed from one pose to the next, world units/s; a higher one is refused, as a jump or "
+        "as poses in mm",
     )
     turn_limit: float = Field(
         7200.0,

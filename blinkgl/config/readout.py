@@ -53,8 +53,7 @@ class PixelsConfig(Config):
         0.0,
         ge=0,
         le=1e6,
-        description="Dead time of a pixel's noise after its own noise event, microseconds; the rates are those "
-        "without dead time.",
+        description="Dead time of a pixel's noise after its own noise event, microseconds; rates are without it.",
     )
 
 

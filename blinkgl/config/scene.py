@@ -123,8 +123,8 @@ class SkyConfig(Config):
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
         (),
-        description="equirectangular images or folders of them (jpg, png, hdr, exr), drawn at infinity instead "
-        "of the box; size then applies only to the ground",
+        description="equirectangular images or folders of them (jpg, png, hdr, exr), drawn at infinity instead of "
+        "the box",
     )
     lights: bool = Field(
         False,

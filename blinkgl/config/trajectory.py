@@ -39,8 +39,7 @@ class MotionConfig(Config):
         None,
         gt=0,
         le=1000,
-        description="waypoints per second, instead of waypoints: a short sequence is then a part of a smooth "
-        "motion, like a recording",
+        description="waypoints per second, instead of waypoints: a short sequence is then a part of a smooth motion",
     )
     pauses: float = Field(
         0.0,
@@ -81,8 +80,8 @@ class CameraMotion(MotionConfig):
     )
     heading: Literal["any", "view", "across"] = Field(
         "any",
-        description="initial direction: view: along its line of sight, forwards or backwards (a zoom); across: "
-        "perpendicular to it. smoothness decides how long it is kept",
+        description="initial direction; view: along its line of sight, forwards or backwards; across: perpendicular"
+        " to it. smoothness decides how long it is kept",
     )
     roll: float = Field(20.0, ge=0, le=180, description="largest roll of the horizon at the waypoints, deg")
     shake: float = Field(

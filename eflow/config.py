@@ -49,15 +49,15 @@ class _Refined(Config):
         None,
         ge=0,
         le=64,
-        description="largest number of preceding iterations without gradients (none in half of the steps, else "
-        "random), so that further iterations converge; null: iterations - train_iterations",
+        description="largest number of preceding iterations without gradients, random in half of the steps and none "
+        "in the others, so that further iterations converge; null: iterations - train_iterations",
     )
     damping: float = Field(
         0.5,
         ge=0,
         le=1,
-        description="in evaluation, the step of iteration k beyond train_iterations and burn_in is multiplied by "
-        "this to the power of k, so that untrained iterations converge",
+        description="in evaluation, factor on the step of iteration k beyond train_iterations and burn_in, to the "
+        "power of k",
     )
     context_norm: Literal["batch", "instance"] = Field(
         "batch", description="norm of the context CNN; instance for batches of one or two"
@@ -85,7 +85,7 @@ class EraftConfig(_Refined):
     """E-RAFT (Gehrig et al., 3DV 2021)."""
 
     name: Literal["eraft"] = "eraft"
-    size: Size = Field("base", description="widths: 5.33 M parameters as published; small 2.95 M; tiny 1.06 M")
+    size: Size = Field("base", description="number of parameters (docs/eflow.md); base: as published")
 
 
 class EFlowFormerConfig(_Refined):
@@ -94,16 +94,15 @@ class EFlowFormerConfig(_Refined):
     name: Literal["eflowformer"] = "eflowformer"
     size: Size = Field(
         "base",
-        description="12.76 M parameters: 4 layers as published; small 3.89 M: 2 layers; tiny 1.53 M: 1 layer; "
-        "otherwise widths of E-RAFT's sizes",
+        description="base: 4 layers, as published; small: 2; tiny: 1; otherwise widths of E-RAFT's sizes",
     )
     attention: Literal["separable", "twins"] = Field(
         "separable", description="twins: keys reduced by a dense convolution, and an MLP after each attention"
     )
     quick: bool = Field(
         False,
-        description="for trainings of minutes, not the paper's: three convolutions replace each CNN, a U-Net's flow "
-        "starts the GRU (init, match_prior and context_norm are not used), no enhancement layers by default",
+        description="for trainings of minutes (docs/eflow.md); init, match_prior and context_norm are not used, "
+        "layers is 0 by default",
     )
     layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: by size")
     init: Literal["match", "zero"] = Field(
@@ -122,9 +121,7 @@ class EvFlowNetConfig(Config):
     """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
 
     name: Literal["ev_flownet"] = "ev_flownet"
-    size: Size = Field(
-        "base", description="14.13 M parameters: 64 channels as published; small 3.54 M: 32; tiny 0.89 M: 16"
-    )
+    size: Size = Field("base", description="base: 64 channels, as published; small: 32; tiny: 16")
     input: Literal["counts", "voxel"] = Field(
         "counts", description="4 channels of counts and latest times, or a voxel grid"
     )
@@ -134,8 +131,8 @@ class EvFlowNetConfig(Config):
     )
     consensus: bool = Field(
         False,
-        description="fits an affine field to each feature of the coarsest scale and adds it, which gives global "
-        "motion to areas without events (not in the paper)",
+        description="adds an affine field fitted to each feature of the coarsest scale: global motion for areas "
+        "without events (not in the paper)",
     )
 
 
@@ -143,9 +140,7 @@ class SpikeFlowNetConfig(Config):
     """Spike-FlowNet (Lee et al., ECCV 2020), supervised."""
 
     name: Literal["spike_flownet"] = "spike_flownet"
-    size: Size = Field(
-        "base", description="13.04 M parameters: 64 channels as published; small 3.42 M: 32; tiny 0.93 M: 16"
-    )
+    size: Size = Field("base", description="base: 64 channels, as published; small: 32; tiny: 16")
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: by size"
     )
@@ -159,8 +154,7 @@ class SteFlowNetConfig(Config):
     name: Literal["ste_flownet"] = "ste_flownet"
     size: Size = Field(
         "base",
-        description="48.33 M parameters: 64 channels as published; small 13.04 M: 32; tiny 1.24 M: 8, and a "
-        "radius of 2 cells instead of 4",
+        description="base: 64 channels, as published; small: 32; tiny: 8, and a radius of 2 cells instead of 4",
     )
     width: int | None = Field(
         None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: by size"
@@ -217,8 +211,8 @@ class SourceConfig(Config):
         None,
         gt=0,
         lt=1,
-        description="instead of a folder, for validation: this share of the sequences of the training folders, which "
-        "are then not trained on; their names decide, so that further sequences move none",
+        description="for validation, instead of a folder: this share of the training folders' sequences, which are "
+        "then not trained on; their names decide",
     )
     recipe: str | None = Field(
         None, description="YAML file of `blinkgl generate`, instead of a folder; relative to the YAML file"
@@ -233,8 +227,7 @@ class SourceConfig(Config):
         1,
         ge=1,
         le=1000,
-        description="times that each rendered sample is used, hundreds of samples apart and each time augmented "
-        "otherwise, where rendering is slower than training",
+        description="times that each rendered sample is used, far apart and each time augmented otherwise",
     )
     window_ms: tuple[float, float] | None = Field(
         None,
@@ -246,8 +239,8 @@ class SourceConfig(Config):
         0.0,
         ge=0,
         le=1e3,
-        description="fewest events per pixel of the new window and per px of its mean flow (at least 0.3 px): "
-        "below 0.01 the flow can hardly be estimated",
+        description="fewest events per pixel of the new window and per px of its mean flow (at least 0.3 px); below"
+        " 0.01 flow can hardly be estimated",
     )
 
     @rule("path", "recipe", "share", "online")
@@ -359,20 +352,20 @@ class OptimConfig(Config):
         1,
         ge=1,
         le=4096,
-        description="parts in which a step's batch is processed: less memory, the same gradient, but batch norm "
-        "(context_norm: batch) takes its statistics from each part, and burn_in is drawn for each",
+        description="parts in which a step's batch is processed, to save memory; batch norm takes its statistics "
+        "from each part, and burn_in is drawn for each",
     )
     freeze_norm: bool = Field(
         False,
-        description="batch norm keeps the statistics of init_from, for fine-tuning: they then depend on no batch",
+        description="for fine-tuning: batch norm keeps the statistics of init_from",
     )
     minutes: float | None = Field(
         None,
         gt=0,
         le=1e6,
-        description="minutes after which training ends, if before the last step; the schedule then follows time "
-        "or steps, whichever is nearer to the end (resumed parts included; such a run is not exactly "
-        "repeatable); null: only steps",
+        description="minutes after which training ends, resumed parts included, if before the last step; the "
+        "schedule follows whichever is nearer to its end. Such a run is not exactly repeatable. null: "
+        "only steps",
     )
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
     warmup: float = Field(0.05, ge=0, lt=1, description="fraction of the training in which the rate rises")
@@ -413,8 +406,8 @@ class RunConfig(Config):
     time_limit: float | None = Field(
         None,
         gt=0,
-        description="minutes after which this call stops with a checkpoint, to be resumed; null: none (optim.minutes "
-        "is the length of the training)",
+        description="minutes after which this call stops with a checkpoint, to be resumed (optim.minutes is the "
+        "length of the training)",
     )
 
 

@@ -36,7 +36,7 @@ def test_example(name, tmp_path):
     shown = example_docs.section(name, output, EXAMPLES)
     text = PAGE[PAGE.index(f"## {name}\n") :]
     text = text[: text.find("\n## ", 1) + 1 or None]
-    assert shown.partition("It prints:")[0] == text.partition("It prints:")[0], (
+    assert shown.partition("\n```\n\n```\n")[0] == text.partition("\n```\n\n```\n")[0], (
         "run: python -m blinkgl.tools.example_docs"
     )
     assert example_docs.without_numbers(shown) == example_docs.without_numbers(text), (

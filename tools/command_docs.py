@@ -26,7 +26,7 @@ Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `
 sequences (`trade --suite`: scenes) that were set aside; 130 interrupted by Ctrl-C, 143 by SIGTERM (one line).
 """
 SHARED_BY = 2
-"""An option of so many commands is described once."""
+"""An argument or option of so many commands is described once."""
 HEAD = "|option|meaning|default, limits|\n|---|---|---|\n"
 REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 """What ``--help`` says last of an option, ``[default: 4; 1<=x<=1000]``."""
@@ -39,8 +39,8 @@ def page() -> str:
     commands = [row for root, app in roots for row in _commands(root, typer.main.get_command(app))]
     rows = {name: _rows(name, command) for name, command in commands}
     count = Counter(row for options in rows.values() for row in options)
-    shared = [row for row in count if count[row] >= SHARED_BY and row.startswith("|`-")]
-    table = f"\n## Options of several commands\n\n{HEAD}{''.join(shared)}"
+    shared = [row for row in count if count[row] >= SHARED_BY]
+    table = f"\n## Used by several commands\n\n{HEAD}{''.join(shared)}"
     return HEADER + table + "".join(_section(name, command, rows[name], shared) for name, command in commands)
 
 
@@ -63,16 +63,11 @@ def _rows(name: str, command) -> list[str]:
 
 
 def _section(name: str, command, rows: list[str], shared: list[str]) -> str:
-    context = typer.Context(command, info_name=name)
-    usage = " ".join([name, *(piece.strip("{}") for piece in command.collect_usage_pieces(context))])
     own = [row for row in rows if row not in shared]
     also = ", ".join(re.sub(r" [^-` ]+`$", "`", row.split("|")[1]) for row in rows if row in shared)
-    table = f"\n{HEAD}{''.join(own)}" if own else ""
-    return (
-        f"\n## {name}\n\n{' '.join((command.help or '').split())}\n\n```\n{usage}\n```\n{table}"
-        f"{f'{chr(10)}Also: {also}.{chr(10)}' if also else ''}"
-        + "".join(("\nExamples:\n\n```\n", *(f"{line}\n" for line in EXAMPLES[name]), "```\n"))
-    )
+    parts = [f"## {name}", " ".join((command.help or "").split()), "\n".join(["```", *EXAMPLES[name], "```"])]
+    parts += [HEAD + "".join(own).rstrip("\n")] * bool(own) + [f"Also: {also}."] * bool(also)
+    return "".join(f"\n{part}\n" for part in parts)
 
 
 def _row(names: str, meaning: str) -> str:

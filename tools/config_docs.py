@@ -8,6 +8,7 @@ A test fails when a page and its models differ.
 
 from __future__ import annotations
 
+import re
 import sys
 import types
 import typing
@@ -28,17 +29,18 @@ HEADER = """# Every key of the YAML
 
 Made from the configuration models by `python -m blinkgl.tools.config_docs`; do not edit.
 
-Keys that are left out have the default, and a table may say only what it changes: without `kind` (or `emulator`) it is
-of the default one. Where a plain value stands, a distribution may stand instead and is drawn once per sequence:
-`{uniform: [a, b]}`, `{log_uniform: [a, b]}`, `{integer: [a, b]}` (both ends included), `{choice: [x, y, …]}`,
-`{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (dealt out, not rolled). Every sequence's own
-`config.yaml` records what was drawn. When the file is read, everything that can be drawn is checked: every choice and
-both ends of every range, in all combinations of those that are looked at together.
-`seed`, `output` and `gl` belong to the whole run and cannot be drawn.
+A key that is left out has its default, a table without `kind` (or `emulator`) is of the default kind. `null` as a
+default may also be written; where the row does not explain it, it means none. A range of two numbers may
+be a single number.
 
-`groups: {name: {…}}` at the top level makes a recipe of several groups of sequences: each is what stands at the top
-level with the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/run.py`,
-`configs/blinkflow.yaml`).
+In place of a value, a distribution may stand, which is drawn once per sequence: `{uniform: [a, b]}`,
+`{log_uniform: [a, b]}`, `{normal: [mean, deviation, lowest, highest]}`, `{integer: [a, b]}` (both ends included),
+`{choice: [x, y, …]}`, `{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (any ten sequences in a row
+have eight, give or take a few). Every sequence's `config.yaml` records what was drawn. All choices and both ends of
+all ranges are checked when the file is read. `seed`, `output` and `gl` belong to the run and cannot be drawn.
+
+`groups: {name: {…}}` at the top level makes several groups of sequences. Each has the keys of the top level with its
+own over them; `enabled: false` leaves one out (`configs/blinkflow.yaml`).
 """
 
 
@@ -46,8 +48,9 @@ EFLOW_HEADER = """# Every key of eflow's YAML
 
 Made from the configuration models by `python -m blinkgl.tools.config_docs eflow`; do not edit.
 
-What `eflow train CONFIG` reads; `--set a.b=c` overrides any of it. Keys that are left out have the default; unknown
-keys are refused with the nearest known one. Paths start from the YAML file's folder. Examples: `configs/eflow/`.
+`eflow train CONFIG` reads these keys; `--set a.b=c` overrides them. A key that is left out has its default; an unknown
+key is refused with the nearest known one. `null` as a default may also be written; where the row does not explain it,
+it means none. Paths start from the YAML file's folder. Examples: `configs/eflow/`.
 """
 
 
@@ -62,8 +65,8 @@ def _primitives() -> str:
         "\n## Primitives\n\n",
         (
             "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, "
-            "parameters: {radius: 0.2, height: 2}}`. All stand upright (z is their axis) and are centred on the "
-            "origin; sizes are in the world's units (m), before the object's `scale`.\n\n"
+            "parameters: {radius: 0.2, height: 2}}`. Their axis is z, their centre the origin; sizes are in world "
+            "units (m), before the object's `scale`.\n\n"
         ),
         "|kind|parameters and defaults|what it is|\n|---|---|---|\n",
     ]
@@ -123,8 +126,8 @@ class _Page:
         meaning = (info.description or _about(info)).replace("``", "`").replace("|", "\\|")
         default = _default(info)
         if known is not None:
-            default = default.replace("see below", f"see {known}")
-            meaning += f"; keys: {known}" if "see" not in default else ""
+            meaning += f"; keys: {known}"
+            default = default.replace("below", "")
         return f"|`{name}`|{_type(info)}|{default}|{meaning}|\n"
 
     def _shown(self, title: str, rows: dict[str, str]) -> list[str]:
@@ -145,8 +148,9 @@ class _Page:
 
 
 def _about(info: FieldInfo) -> str:
+    """Return what a table is, for a key without a description: how its section begins."""
     return "; ".join(
-        " ".join((m.__doc__ or "").split()).split(". ")[0].rstrip(".") for m in _models(info.annotation)[:1]
+        re.split(r"[,:.] |\.$", " ".join((m.__doc__ or "").split()))[0] for m in _models(info.annotation)[:1]
     )
 
 
@@ -157,7 +161,7 @@ def _models(annotation: object) -> list[type[BaseModel]]:
 
 
 def _type(info: FieldInfo) -> str:
-    """ "number 0 … 1", "integer ≥ 1", "text"."""
+    """ "number 0…1", "integer ≥ 1", "text". A null that is the default is not said again."""
     low = high = ""
     for m in info.metadata:
         for attribute, sign in (("gt", "> "), ("ge", "≥ "), ("lt", "< "), ("le", "≤ ")):
@@ -165,26 +169,31 @@ def _type(info: FieldInfo) -> str:
                 limit = f"{getattr(m, attribute):g}".replace("e+0", "e").replace("e+", "e")
                 low, high = (low, sign + limit) if attribute in ("lt", "le") else (sign + limit, high)
     limits = f"{low[2:]}…{high[2:]}" if low[:1] == "≥" and high[:1] == "≤" else ", ".join(filter(None, (low, high)))
-    return " ".join(filter(None, (_name(info.annotation), limits))).replace("|", "\\|")
+    return " ".join(filter(None, (_name(info.annotation, null=info.default is not None), limits)))
 
 
-def _name(annotation: object) -> str:
+def _name(annotation: object, null: bool = True) -> str:
+    """Return a type in words: "number", "3 numbers", "`a`, `b` or list of text". ``null``: whether to name it."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return _name(arguments[0])
     if origin is typing.Literal:
-        return " | ".join(f"`{str(a).lower() if isinstance(a, bool) else a}`" for a in arguments)
+        return ", ".join(f"`{str(a).lower() if isinstance(a, bool) else a}`" for a in arguments)
     if origin in (typing.Union, types.UnionType):
-        names = dict.fromkeys(_name(a) for a in arguments)
-        return " | ".join(names)
+        names = dict.fromkeys(_name(a) for a in arguments if null or a is not type(None))
+        return " or ".join(names)
     if origin is tuple and arguments and arguments[-1] is not Ellipsis:
-        return "[" + ", ".join(_name(a) for a in arguments) + "]"
+        (element,) = {_name(a) for a in arguments}
+        rows = element.partition(" ")[0].isdigit()
+        return f"{len(arguments)} {'rows of ' + element if rows else element + 's'}"
     if origin in (tuple, list):
         return f"list of {_name(arguments[0])}"
     if origin is dict:
         return f"table of {_name(arguments[1])}"
     if annotation is type(None):
         return "null"
+    if annotation is typing.Any:
+        return "any value"
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "table"
     return {"float": "number", "int": "integer", "str": "text", "bool": "true/false"}.get(
@@ -198,7 +207,7 @@ def _default(info: FieldInfo) -> str:
     value = info.get_default(call_default_factory=True)
     if isinstance(value, BaseModel):
         tag = tag_of(type(value))
-        return f"`{tag[0]}: {tag[1]}`" if tag and len(_models(info.annotation)) > 1 else "see below"
+        return f"`{tag[0]}: {tag[1]}`" if tag and len(_models(info.annotation)) > 1 else "below"
     if isinstance(value, tuple):
         return "`[" + ", ".join(str(v) for v in value) + "]`"
     return "`null`" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"

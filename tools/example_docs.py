@@ -70,17 +70,15 @@ ORDER = (
 
 HEADER = """# Examples
 
-Each is a program of its own in `examples/`, does one thing, and ends with a check (`test_final`) that the tests run.
-Copy one and change it:
+Each is a program in `examples/`, with what it prints, and ends with a check (`test_final`) that the tests run. Copy one
+and change it:
 
 ```
 python examples/scene_in_python.py        # writes below out/examples/
 ```
 
-This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit.
-`examples/demo.ipynb` is a notebook that walks through the demo, `examples/flow.ipynb` one that lets a network say how
-things move. All names come from `import blinkgl`; what they take is
-in their docstrings (`help(blinkgl.Scene)`).
+This page is made by `python -m blinkgl.tools.example_docs`; do not edit. `examples/demo.ipynb` is a notebook that walks
+through the demo; `examples/flow.ipynb` lets a network estimate how things move.
 """
 
 
@@ -119,9 +117,8 @@ def section(name: str, output: str, root: Path = ROOT) -> str:
     title = docstring[1].strip()
     picture = f"\n![{PICTURES[name][2]}](images/{PICTURES[name][1]})\n" if name in PICTURES else ""
     return (
-        f'## {name}\n\n{title}\n\n???+ example "examples/{name}.py"\n\n    ``` {{.python}}\n'
-        f'    --8<-- "examples/{name}.py"\n'
-        f"    ```\n\nIt prints:\n\n```\n{output.rstrip()}\n```\n{picture}"
+        f'## {name}\n\n{title}\n\n``` {{.python title="examples/{name}.py"}}\n--8<-- "examples/{name}.py"\n```\n'
+        f"\n```\n{output.rstrip()}\n```\n{picture}"
     )
 
 

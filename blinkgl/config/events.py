@@ -20,23 +20,21 @@ _MAX_EVENTS = Field(
     2**25,
     ge=1_000,
     le=2**31 - 1,
-    description="Most events one step may emit, divided equally among blocks of 1024 pixels (a block may always "
-    "emit one per pixel). Above its limit every pixel of a block is cut to the same number; levels "
-    "still move, and `emulator.saturated` counts the cut events. Sorting 2^25 events needs about 1 "
-    "GB.",
+    description="Most events of one step, divided equally among blocks of 1024 pixels (each may emit at least one "
+    "per pixel). Beyond it, every pixel of a block is cut to the same number; the manifest counts the "
+    "events that are cut. Sorting 2^25 events needs about 1 GB.",
 )
 _CAUSES = Field(
     False,
-    description="Mark every event with its cause (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): 0 "
-    "signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
+    description="Mark every event with its cause (`cause` in the files): 0 signal, 1 leak, 2 shot noise, 3 hot "
+    "pixel. The events are the same.",
 )
 Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(
     "auto",
-    description="Where events are computed: `cpu`, compiled loops; `cuda`, torch on a GPU, which takes frames "
-    "rendered on the same GPU without copying them (only with straight lines between frames). The "
-    "events are the same. `auto`: `cuda` where a GPU renders the frames, torch can use it and a "
-    "short trial gives the same events; else `cpu`.",
+    description="Where events are computed, with the same result: `cpu`, compiled loops; `cuda`, torch on a GPU "
+    "(docs/simulators.md); `auto`: `cuda` where a GPU renders the frames, torch can use it and a short "
+    "trial gives the same events, else `cpu`.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
@@ -191,7 +189,7 @@ class EsimConfig(_TwoThresholds):
     contrast_threshold: float = Field(
         0.2,
         **_THRESHOLD,
-        description="C+, change of ln(intensity) per ON event. BlinkSim draws 0.18-0.25 per sequence.",
+        description="C+, change of ln(intensity) per ON event.",
     )
     contrast_threshold_off: float | None = Field(
         None, **_THRESHOLD, description="C-, for OFF events; default: equal to contrast_threshold."
@@ -207,15 +205,14 @@ class EsimConfig(_TwoThresholds):
         0.021,
         ge=0,
         le=5,
-        description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021), drawn once per "
-        "pixel; each threshold stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of "
-        "contrast_threshold.",
+        description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021); each threshold "
+        "stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of contrast_threshold.",
     )
     threshold_jitter: float = Field(
         0.0,
         ge=0,
         le=5,
-        description="Standard deviation of the threshold from event to event, ln units, drawn once per event.",
+        description="Standard deviation of the threshold from event to event, ln units.",
     )
     log_eps: float = Field(
         1e-3,
@@ -282,7 +279,7 @@ class V2eConfig(_TwoThresholds):
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
     )
-    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units (v2e: 0.2).")
+    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="OFF threshold; default: equal.")
     threshold_ratio: float | None = Field(
         None,
@@ -295,7 +292,7 @@ class V2eConfig(_TwoThresholds):
         0.03,
         ge=0,
         le=5,
-        description="Spread of the thresholds over the pixels, ln units (v2e: 0.03); each threshold stays >= 0.01.",
+        description="Spread of the thresholds over the pixels, ln units; each threshold stays >= 0.01.",
     )
     full_scale: float = Field(
         255.0,
@@ -307,43 +304,40 @@ class V2eConfig(_TwoThresholds):
         300.0,
         ge=0,
         le=1e7,
-        description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
-        "(I + 20)/275; 0: infinite bandwidth.",
+        description="Photoreceptor cut-off at full scale, Hz, scaled by (I + 20)/275; 0: infinite bandwidth.",
     )
-    leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON (v2e: 0.01).")
+    leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON.")
     leak_jitter: float = Field(
         0.1,
         ge=0,
         le=1,
-        description="Relative standard deviation of the interval between two leak "
-        "events of a pixel (v2e: leak_jitter_fraction 0.1).",
+        description="Relative standard deviation of the interval between two leak events of a pixel.",
     )
     leak_cov_decades: float = Field(
         0.1,
         ge=0,
         le=3,
-        description="Spread of the leak rate over the pixels, decades (v2e: noise_rate_cov_decades 0.1).",
+        description="Spread of the leak rate over the pixels, decades.",
     )
     shot_noise_rate_hz: float = Field(
         0.001,
         ge=0,
         le=1e4,
-        description="Noise events per second and pixel in the dark, ON and OFF together (v2e: 0.001); a quarter "
-        "of it at full scale.",
+        description="Noise events per second and pixel in the dark, ON and OFF together; a quarter of it at full "
+        "scale.",
     )
     photoreceptor_noise: bool = Field(
         False,
-        description="Make noise events by low-pass filtered noise before the comparator, at the rate "
-        "shot_noise_rate_hz, instead of drawing them; needs cutoff_hz > 0.",
+        description="Make noise events, at the rate shot_noise_rate_hz, by low-pass filtered noise before the "
+        "comparator; needs cutoff_hz > 0.",
     )
-    refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
+    refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds.")
     start: Literal["stationary", "balanced", "zero"] = Field(
         "stationary",
         description="State of the pixels between their levels at the first frame. `stationary`: as after a long "
-        "time in front of a still scene, where leak has moved each pixel towards ON; short clips "
-        "then have more ON events than a moving scene. `balanced`: as after a signal that rose as "
-        "often as it fell. `zero`: every pixel has just fired, as in v2e. Without leak `stationary` "
-        "and `zero` are the same.",
+        "time before a still scene, in which leak moves pixels towards ON, so that short clips have "
+        "more ON events. `balanced`: as after a signal that rose as often as it fell. `zero`: every "
+        "pixel has just fired, as in v2e.",
     )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Fraction of pixels that fire without a signal.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
@@ -405,8 +399,8 @@ class VoltmeterConfig(EmulatorConfig):
     )
     start: Literal["stationary", "zero"] = Field(
         "stationary",
-        description="V at the first frame: as after a long time in front of a still scene, or 0 everywhere (as "
-        "in the authors' program, where the first leak events of a flat image coincide).",
+        description="V at the first frame: as after a long time before a still scene, or 0 everywhere, as in the "
+        "authors' program.",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES

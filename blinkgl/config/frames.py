@@ -72,16 +72,14 @@ class FramesConfig(Config):
     max_px: float = Field(1.0, gt=0, le=1e3, description="for motion: largest displacement per step, px")
     keep_noise: bool = Field(
         False,
-        description="make events of the images' noise, too; otherwise the noise is estimated all along "
-        "and changes that it explains cause no events (images without noise are used "
-        "unchanged)",
+        description="make events of the images' noise, too; otherwise the noise is estimated, and changes that it "
+        "explains cause no events",
     )
     max_displacement: float | None = Field(
         17.0,
         gt=0,
         le=1e4,
-        description="99th percentile of the given flow, px, above which frames are too far apart to interpolate "
-        "and their sequence is skipped; null: no check",
+        description="99th percentile of the flow, px, above which a sequence is set aside; null: no check",
     )
     former: ClassVar[dict[str, Former]] = {
         "qualify": Former("max_displacement", lambda value: value is None or isinstance(value, dict)),

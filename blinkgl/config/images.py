@@ -77,7 +77,7 @@ class ImagesConfig(Config):
 
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
         "plain",
-        description="gives the other keys the values of a use (docs/cameras.md); keys given beside it override it",
+        description="values of the other keys (docs/cameras.md); keys beside it override it",
     )
     rate: float | None = Field(
         30.0,
@@ -109,7 +109,7 @@ class ImagesConfig(Config):
         0.0,
         ge=0,
         le=60,
-        description="gain, dB: white then equals full_well / gain electrons, so a higher gain gives more noise",
+        description="gain, dB: white is then full_well / gain electrons, so noise grows",
     )
     full_well: float = Field(10000.0, ge=1, le=1e9, description="electrons at which a pixel saturates")
     photon_noise: bool = Field(False, description="Poisson distributed electrons")
@@ -134,8 +134,8 @@ class ImagesConfig(Config):
     auto_exposure: AutoExposureConfig | None = Field(None, description="null: constant exposure and gain")
     also: tuple[Literal["sharp", "clean"], ...] = Field(
         (),
-        description="further pictures written for each image. sharp: at the middle of the exposure, global "
-        "shutter, pinhole, no noise. clean: the same image without noise",
+        description="further pictures of each image. sharp: an instant in the middle of the exposure, no noise; "
+        "clean: the same image without noise",
     )
 
     @model_validator(mode="before")

@@ -83,14 +83,13 @@ class LabelsConfig(Config, extra="allow"):
 
     events: bool = Field(
         False,
-        description="source of each event: instance, depth and image velocity of the surface, and the cause "
-        "(sets `events.causes` to true unless it is given), in event_labels.h5, a row per event; "
-        "docs/formats.md",
+        description="source of each event: instance, depth and image velocity of the surface, and the cause (sets "
+        "`events.causes` unless it is given), in event_labels.h5; docs/labels.md",
     )
     pixels: Literal["sensor", "rectified"] = Field(
         "sensor",
-        description="for a lens with distortion: labels at label times and tracks use the sensor's pixels, as "
-        "events do, or those of the rectified pinhole image (docs/cameras.md)",
+        description="for a lens with distortion: labels and tracks use the sensor's pixels, as events do, or those "
+        "of the rectified image (docs/cameras.md)",
     )
     images: bool = Field(True, description="sRGB PNG of the colour pass")
     flow: Annotated[
@@ -108,23 +107,20 @@ class LabelsConfig(Config, extra="allow"):
     depth: bool = Field(False, description="float32 .npy, world units along the optical axis")
     disparity: bool = Field(
         False,
-        description="float32 .npy, px: x in the left image minus x in the right image of a stereo pair, 0 where "
-        "nothing is hit (docs/rigs.md)",
+        description="of a stereo pair, px, float32 .npy (docs/rigs.md)",
     )
     ids: bool = Field(False, description="instance ids, 16-bit PNG")
     normals: bool = Field(False, description="unit normals in camera axes, float32 .npy")
     velocity: bool = Field(False, description="instantaneous image velocity, px/s, float32 .npy")
     scene_flow: bool = Field(
         False,
-        description="3-D motion of the surface to the next label, world units in the camera's axes at the "
-        "label's time, 0 for static surfaces, float32 .npy",
+        description="3-D motion of the surface to the next label, float32 .npy (docs/labels.md)",
     )
     semantics: Annotated[bool | dict[str, int], BeforeValidator(_a_table)] = Field(
         False,
-        description="category of each pixel, 16-bit PNG. Table: patterns such as "
-        '`{"wall-*": 1, "chair*": 7, "*": 0}`; the first that matches an object\'s name, mesh or '
-        "category counts, 0 where none matches. true: by kind of shape, sky 1, ground 2, wall 3, "
-        "cuboid 4 … (docs/labels.md)",
+        description='category of each pixel, 16-bit PNG. Table: patterns such as `{"wall-*": 1, "chair*": 7, "*": '
+        "0}`; the first that matches an object's name, mesh or category counts. true: by kind of shape "
+        "(docs/labels.md)",
     )
     boxes: bool = Field(
         False,

@@ -26,8 +26,7 @@ MAX_LIGHTS = 31  # plus the sun
 class _LampConfig(Config):
     strength: Radiance = Field(
         1.0,
-        description="radiance of a white surface that faces it; for point and spot lights at a distance of 1 m, "
-        "falling with the square of the distance",
+        description="radiance of a white surface that faces it; for point and spot lights at a distance of 1 m",
     )
     color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
     over_time: WaveformConfig | None = OVER_TIME
@@ -46,8 +45,7 @@ class _PlacedLampConfig(_LampConfig):
     position: Position | None = Field(None, description="m; or a motion")
     motion: KeyedMotionConfig | None = Field(
         None,
-        description="its pose, key frames or trajectory, instead of position and look_at; it shines along the z "
-        "axis, as a camera looks",
+        description="pose, key frames or trajectory, instead of position and look_at; it shines along z",
     )
     reach: Positive | None = Field(
         None,
@@ -131,9 +129,8 @@ class LightConfig(Config):
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
-        description="shadows of objects and walls from the sun, further suns and spot lights, at most four "
-        "(soft: two); hard: edges as wide as a texel of the shadow map; soft: edges depend on the "
-        "size of the light, up to 48 texels",
+        description="of objects and walls, from at most four suns and spot lights (soft: two); hard: edges a texel "
+        "of the shadow map wide; soft: wider for larger lights, up to 48 texels",
     )
     shadow_size: int = Field(1024, ge=64, le=8192, description="side of each shadow map, texels")
     unlit: bool = Field(False, description="radiance = albedo on every surface")

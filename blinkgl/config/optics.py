@@ -15,14 +15,14 @@ _Row = Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], Field(min_leng
 
 
 class GaussianPsfConfig(Config):
-    """A normal law, integrated over pixels, to four standard deviations."""
+    """A normal law, integrated over pixels."""
 
     kind: Literal["gaussian"]
     sigma: float = Field(gt=0, le=12, description="standard deviation, px")
 
 
 class AiryPsfConfig(Config):
-    """The diffraction of a round aperture, sampled at 7 x 7 places of a pixel, to its third dark ring."""
+    """The diffraction of a round aperture, to its third dark ring."""
 
     kind: Literal["airy"]
     radius: float = Field(

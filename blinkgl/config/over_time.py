@@ -32,17 +32,13 @@ class ImuConfig(Config):
 
     preset: Literal["ideal", "adis16448"] = Field(
         "ideal",
-        description="noise values: ideal has none, adis16448 those of EuRoC's sensor.yaml; keys given beside it "
-        "override them",
+        description="noise values: ideal: none; adis16448: EuRoC's; keys beside it override them",
     )
     rate: float = Field(200.0, gt=0, le=1000, description="measurements per second, Hz, from the sequence's start")
-    position: _Vector = Field(
-        (0.0, 0.0, 0.0), description="position, m, in the camera's axes: x right, y down, z forward"
-    )
+    position: _Vector = Field((0.0, 0.0, 0.0), description="m, in the camera's axes: x right, y down, z forward")
     rotation: _Vector = Field(
         (0.0, 0.0, 0.0),
-        description="rotation, degrees about x, y and z of the camera's axes, in this order; 0, 0, 0: the "
-        "camera's axes",
+        description="degrees about the camera's x, y and z axes, in this order",
     )
     gravity: _Vector = Field((0.0, 0.0, -9.81), description="gravitational acceleration, m/s², world axes")
     accelerometer_noise_density: float = Field(0.0, **_NOISE, description="white noise, m/s²/√Hz")
@@ -98,8 +94,8 @@ class TracksConfig(Config):
     points: int = Field(256, ge=1, le=1_000_000, description="largest number of points")
     choose: Literal["grid", "surface"] = Field(
         "grid",
-        description="grid: the surface points at the pixels of a regular grid at the first time; surface: points "
-        "drawn uniformly on the surfaces, of which those that are visible at some time are kept",
+        description="grid: what a regular grid of pixels shows at the first time; surface: points drawn uniformly "
+        "on surfaces, if visible at some time",
     )
     rate: float | None = Field(
         None,

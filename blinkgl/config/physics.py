@@ -43,8 +43,7 @@ class PhysicsConfig(Config):
         ge=1000,
         le=1e6,
         description="steps of the physics engine per second, Hz; computing time is proportional to it. An impact "
-        "lasts 1.6 ms, but at least 16 steps; during it a body sinks in by a third of its speed "
-        "times that time (5 m/s: 2.5 mm)",
+        "lasts 1.6 ms, but at least 16 steps; a body at 5 m/s sinks in by 2.5 mm",
     )
     max_speed: float = Field(
         200.0,
@@ -64,21 +63,19 @@ class RandomPhysicsConfig(PhysicsConfig):
         0.5, ge=0, le=1, description="fraction of the objects that fall; the others follow object_motion"
     )
     thrown: float = Field(0.5, ge=0, le=1, description="fraction of those that is thrown; the others are dropped")
-    speed: SpeedRange = Field((1.0, 6.0), description="speed of thrown objects, m/s: a number or [low, high]; uniform")
-    spin: RateRange = Field(
-        (0.0, 540.0), description="rotation rate of thrown objects, deg/s: a number or [low, high]; uniform"
+    speed: SpeedRange = Field((1.0, 6.0), description="speed of thrown objects, m/s; uniform")
+    spin: RateRange = Field((0.0, 540.0), description="rotation rate of thrown objects, deg/s; uniform")
+    density: _range_of(_Density) = Field((100.0, 2000.0), description="kg/m³; log-uniform")
+    friction: _range_of(_Friction) = Field((0.2, 0.9), description="coefficient of Coulomb friction; uniform")
+    restitution: _range_of(_Restitution) = Field(
+        (0.1, 0.8), description="speed kept at an impact, as a fraction; uniform"
     )
-    density: _range_of(_Density) = Field((100.0, 2000.0), description="kg/m³: a number or [low, high]; log-uniform")
-    friction: _range_of(_Friction) = Field((0.2, 0.9), description="a number or [low, high]; uniform")
-    restitution: _range_of(_Restitution) = Field((0.1, 0.8), description="a number or [low, high]; uniform")
     former: ClassVar[dict[str, Former]] = {"rolling": always(0.01)}
 
 
 class BodyConfig(Config):
-    """Physics of one object. Each part collides as its convex hull, so hollows are filled (a box and a ball are exact,
-    a flat ground is infinite). Where two surfaces meet, the larger friction and the smaller restitution count. An
-    object without this table, in a scene with physics, is an obstacle, and the friction and restitution of the other
-    body count. The sky never collides."""
+    """Physics of one object (docs/scenes.md). An object without this table is an obstacle, and the friction and
+    restitution of the body that meets it count."""
 
     kind: Literal["dynamic", "fixed", "none"] = Field(
         "dynamic",

@@ -117,15 +117,14 @@ class TrajectoryConfig(Config):
         0.0,
         ge=0,
         le=60,
-        description="replaces each pose by the mean of the poses within this time before and after, s, with "
-        "triangular weights; 0: the spline passes through all poses",
+        description="averages the poses within this time before and after each, s, with triangular weights",
     )
     speed_limit: float = Field(
         100.0,
         gt=0,
         le=1e9,
-        description="largest speed from one pose to the next, world units/s; a higher one is refused as a jump, "
-        "or as poses in mm",
+        description="largest speed from one pose to the next, world units/s; a higher one is refused, as a jump or "
+        "as poses in mm",
     )
     turn_limit: float = Field(
         7200.0,
@@ -135,9 +134,8 @@ class TrajectoryConfig(Config):
     )
     T_body_sensor: str | Matrix | None = Field(
         None,
-        description="pose of this camera or object on the body whose poses the file has: a transform from its "
-        "axes to the body's, as EuRoC's sensor.yaml (its T_BS) or four rows of four; null: it is "
-        "that body",
+        description="pose of this camera or object on the body that the file describes: a transform from its axes "
+        "to the body's, or EuRoC's sensor.yaml (its T_BS); null: it is that body",
     )
 
     @rule("T_body_sensor")
@@ -149,7 +147,7 @@ class TrajectoryConfig(Config):
 class KeyedMotionConfig(PoseConfig):
     """A fixed pose, key frames, or a trajectory from a file. The first pose is held before its time and the last after
     it. Between key frames a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than
-    180 degrees per step; full turns need more key frames."""
+    180 degrees per step."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field(

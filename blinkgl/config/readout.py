@@ -53,15 +53,14 @@ class PixelsConfig(Config):
         0.0,
         ge=0,
         le=1e6,
-        description="Dead time of a pixel's noise after its own noise event, microseconds; the rates are those "
-        "without dead time.",
+        description="Dead time of a pixel's noise after its own noise event, microseconds; rates are without it.",
     )
 
 
 class LightNoiseConfig(Config):
-    """Noise events whose rate depends on the light, as those of photons do: published curves of a camera. Emulators
-    with noise of their own (``v2e``, ``voltmeter``) have it; ESIM, which has none, leaves it out and says so. A
-    Poisson process per pixel; between the given lights logarithms of rates are linear in that of the light."""
+    """Noise events whose rate depends on the light, by published curves of a camera: with ``v2e`` and ``voltmeter``;
+    ESIM, which models no noise, leaves them out and says so. A Poisson process per pixel; between the given lights,
+    log(rate) is linear in log(light)."""
 
     lux: tuple[Annotated[float, Field(gt=0, le=1e7)], ...] = Field(
         min_length=1, max_length=256, description="Light on the scene, lux, increasing."
@@ -88,7 +87,7 @@ class LightNoiseConfig(Config):
 
 class FrameResetsConfig(Config):
     """A camera of events and frames: each reset of the frame's pixels makes the signal of all event pixels jump and
-    return, and pixels near their threshold fire; see :mod:`blinkgl.events.resets`."""
+    return, and pixels near their threshold fire."""
 
     interval_ms: float = Field(gt=2, le=10_000, description="Time between resets, ms: the frame interval.")
     kick: float = Field(
@@ -101,8 +100,7 @@ class FrameResetsConfig(Config):
 
 
 class ReadoutConfig(Config):
-    """The bus between pixels and time stamps (:mod:`blinkgl.events.camera`), and before it the pixels' noise
-    (:mod:`blinkgl.events.pixels`)."""
+    """The bus between pixels and time stamps, and before it the pixels' noise."""
 
     former: ClassVar[dict[str, Former]] = {
         "filters": Former("events filtered after they were written", lambda value: not value),
@@ -128,7 +126,7 @@ class ReadoutConfig(Config):
         description="Events that may wait for the bus; an event that finds the queue full is lost.",
     )
     roi: tuple[_Px, _Px, _Px, _Px] | None = Field(
-        None, description="[x, y, width, height], px: pixels outside of it are switched off; null: none are."
+        None, description="[x, y, width, height], px: pixels outside of it are switched off."
     )
     max_rate: float | None = Field(
         None,
@@ -143,13 +141,11 @@ class ReadoutConfig(Config):
         le=1_000_000,
         description="Resolution of time stamps, microseconds: they are rounded down to multiples of this.",
     )
-    pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels; null: none.")
+    pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels.")
     light_noise: LightNoiseConfig | None = Field(
-        None, description="Noise events by the light, of emulators with noise of their own; null: none."
+        None, description="Noise events by the light, of emulators with noise of their own."
     )
-    frame_resets: FrameResetsConfig | None = Field(
-        None, description="Bursts of events caused by the camera's frames; null: none."
-    )
+    frame_resets: FrameResetsConfig | None = Field(None, description="Bursts of events caused by the camera's frames.")
 
     @rule("events_per_second", "row_ns", "queue_events")
     def _queue_empties(rate: float | None, row_ns: float, queue: int):

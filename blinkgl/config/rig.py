@@ -54,8 +54,8 @@ class PlaceConfig(Config):
     )
     matrix: Matrix | None = Field(
         None,
-        description="T_rig_sensor, four rows of four, instead of the others. Rounded rotations are made exact. "
-        "(Kalibr's T_cn_cnm1 is the inverse of a camera's pose relative to the previous one)",
+        description="T_rig_sensor, instead of the others. Rounded rotations are made exact. (Kalibr's T_cn_cnm1 is "
+        "the inverse of a camera's pose relative to the previous one)",
     )
 
     _one_orientation = at_most_one("euler", "quaternion", "matrix")
@@ -108,16 +108,14 @@ class RigSensorConfig(Config):
     )
     camera: CameraConfig = Field(CameraConfig(), description="as at the top level, whose keys it inherits")
     sensor: Sensor | None = Field(None, description="as at the top level")
-    events: EmulatorConfig | None = Field(None, description="as at the top level, whose keys it inherits; null: none")
+    events: EmulatorConfig | None = Field(None, description="as at the top level, whose keys it inherits")
     readout: ReadoutConfig | None = Field(None, description="as at the top level")
     labels: LabelsConfig = Field(
         default_factory=LabelsConfig,
         description="as at the top level; a camera without events has only those given here",
     )
-    images: ImagesConfig | None = Field(None, description="a frame camera (docs/cameras.md); null: none")
-    imu: ImuConfig | None = Field(
-        None, description="an inertial unit, with position and rotation in the sensor's axes; null: none"
-    )
+    images: ImagesConfig | None = Field(None, description="a frame camera (docs/cameras.md)")
+    imu: ImuConfig | None = Field(None, description="an inertial unit, with position and rotation in the sensor's axes")
     tracks: TracksConfig | None = Field(None, description="points on surfaces, followed through this camera")
 
     @property

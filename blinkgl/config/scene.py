@@ -67,8 +67,7 @@ class PoolConfig(Config):
         Literal["all"] | tuple[Literal[POOLED], ...], word_or_list(("all",), POOLED)  # type: ignore[invalid-literal]
     ] = Field(
         "all",
-        description="all: the rigid ones; or a list of kinds; []: none. A figure walks, runs, dances or waves, a "
-        "fish swims, a flag flies",
+        description="all: the rigid ones; []: none. Figures walk, run, dance or wave, fish swim, flags fly",
     )
     variants: int = Field(24, ge=1, le=10_000, description="random shapes per primitive kind (aspect ratios, sides)")
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, off, 3mf, glb, gltf")
@@ -98,7 +97,7 @@ class TexturesConfig(Config):
     """Source of the random world's textures."""
 
     procedural: Annotated[bool | tuple[TextureKind, ...], word_or_list((True, False), TEXTURE_KINDS)] = Field(
-        True, description="true, false or a list of kinds"
+        True, description="true: all kinds"
     )
     variants: int = Field(40, ge=1, le=100_000, description="textures per procedural kind")
     photographs: bool = Field(True, description="the photographs bundled with scikit-image")
@@ -124,8 +123,8 @@ class SkyConfig(Config):
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
         (),
-        description="equirectangular images or folders of them (jpg, png, hdr, exr), drawn at infinity instead "
-        "of the box; size then applies only to the ground",
+        description="equirectangular images or folders of them (jpg, png, hdr, exr), drawn at infinity instead of "
+        "the box",
     )
     lights: bool = Field(
         False,
@@ -240,8 +239,8 @@ class MeshConfig(Config):
     file: str | None = Field(None, description="obj, ply, stl, off, 3mf, glb or gltf file")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="upward axis of the file, which becomes the world's z: with y, the file's (x, y, z) is drawn "
-        "at (x, -z, y). auto: y for glb and gltf, by their standard; z (unchanged coordinates) for others",
+        description="upward axis of the file: with y, its (x, y, z) is drawn at (x, -z, y); auto: y for glb and "
+        "gltf, else z",
     )
     uv_size: ClassVar[float] = 1.0
     """Edge of one repeat of projected texture coordinates, m."""
@@ -388,9 +387,8 @@ class ExplicitSceneConfig(Config):
 
 
 class FileSceneConfig(Config):
-    """A complete glTF/GLB scene with cameras, materials and node animations. The file's y axis points up, by its
-    standard, and becomes the world's z: the file's (x, y, z) is at (x, -z, y). Poses given here are in that z-up
-    world."""
+    """A complete glTF/GLB scene with cameras, materials and node animations. The file's y axis becomes the world's z,
+    so its (x, y, z) is at (x, -z, y); poses given here are in that world."""
 
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")

@@ -63,8 +63,8 @@ class SensorConfig(Config):
     )
     frame_gamma: Literal["linear", "srgb"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
         None,
-        description="Curve from the codes of the camera's own frames to light: `linear`, `srgb` or an exponent. "
-        "Grey images of the sensor's size are taken as its own unless specified.",
+        description="Curve from the codes of the camera's own frames to light, or its exponent. Grey images of the "
+        "sensor's size are taken as its own unless specified.",
     )
     contrast_threshold: float | None = Field(None, ge=0.001, le=10, description="Nominal ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(

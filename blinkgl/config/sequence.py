@@ -36,10 +36,10 @@ from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 
 
 class GLConfig(Config):
-    """The OpenGL implementation (see :func:`blinkgl.gl.create_context`)."""
+    """The OpenGL implementation."""
 
     backend: Literal["auto", "egl", "osmesa"] = Field(
-        "auto", description="auto: EGL, or OSMesa (software) if EGL is missing; egl or osmesa: only that one"
+        "auto", description="auto: EGL, or OSMesa (software) if EGL is missing"
     )
     device: int = Field(0, ge=0, description="number of the EGL device in `blinkgl doctor`; not used by osmesa")
 
@@ -148,11 +148,9 @@ class RenderConfig(Config):
 
     antialiasing: Antialiasing = Field(
         "none",
-        description="event frames. taps4: filters textures (4 lookups per pixel); edges: filters silhouettes, "
-        "too, by surface area, and its lookups follow the foreshortening; edges2: edges at 2 x 2 "
-        "resolution; in a scene whose outlines crowd they are ssaa4 and ssaa8; ssaa2, ssaa4, ssaa8: averages of "
-        "2 x 2, 4 x 4, 8 x 8 samples. Labels are never filtered. "
-        "Costs: docs/trade.md",
+        description="event frames. taps4: filters textures (4 lookups per pixel); edges: silhouettes, too, by their"
+        " area; edges2: the same at 2 x 2 resolution (both become ssaa4 or ssaa8 where outlines crowd);"
+        " ssaa2, ssaa4, ssaa8: means of 2 x 2, 4 x 4, 8 x 8 samples. Costs: docs/trade.md",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(
@@ -209,8 +207,8 @@ class OutputConfig(Config):
     )
     compression: Literal["zstd", "lz4", "gzip"] = Field(
         "zstd",
-        description="for events.h5 and event_labels.h5: zstd in Blosc, as DSEC's files; lz4 is faster to write "
-        "and some percent larger; gzip is slower to write, but h5py reads it without hdf5plugin",
+        description="of events.h5 and event_labels.h5. zstd: in Blosc, as DSEC's files; lz4: faster to write, some "
+        "percent larger; gzip: slower to write, read by h5py without hdf5plugin",
     )
     label: str | None = Field(
         None,
@@ -246,13 +244,12 @@ class SequenceConfig(Config):
     camera: CameraConfig = Field(CameraConfig(), description="resolution, intrinsics and lens")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
     optics: OpticsConfig | None = Field(
-        None, description="lens, point spread and colour filters of the event camera (docs/cameras.md); null: none"
+        None, description="lens, point spread and colour filters of the event camera (docs/cameras.md)"
     )
     quality: Quality | None = Field(
         DEFAULT,
-        description="fast, balanced, accurate or reference: sets timeline and render to a measured trade-off of "
-        "speed and accuracy (docs/trade.md; none was better for training than balanced); keys given beside it "
-        "override it. null: the defaults of each table",
+        description="sets timeline and render to a measured trade-off of speed and accuracy (docs/trade.md); keys "
+        "beside it override it. null: the defaults of each table",
     )
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="times of the event frames")
     scene: SceneConfig = Field(RandomSceneConfig(), description="objects, lights, camera motion")
@@ -271,15 +268,13 @@ class SequenceConfig(Config):
     readout: ReadoutConfig | None = Field(
         None,
         description="after the pixels: defects and latency, the bus (events above its rate are late, then lost), "
-        "its clock, filters; null: none",
+        "its clock, filters",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="ground truth to write")
-    images: ImagesConfig | None = Field(
-        None, description="a frame camera beside the event camera (docs/cameras.md); null: none"
-    )
-    imu: ImuConfig | None = Field(None, description="an inertial unit on the camera (docs/labels.md); null: none")
+    images: ImagesConfig | None = Field(None, description="a frame camera beside the event camera (docs/cameras.md)")
+    imu: ImuConfig | None = Field(None, description="an inertial unit on the camera (docs/labels.md)")
     tracks: TracksConfig | None = Field(
-        None, description="points on surfaces, followed through the sequence (docs/labels.md); null: none"
+        None, description="points on surfaces, followed through the sequence (docs/labels.md)"
     )
     rig: Literal["davis", "dsec", "mvsec", "stereo"] | None = Field(
         None, description="sensors of a known rig (docs/rigs.md); `sensors` given beside it override them by name"

@@ -74,9 +74,8 @@ class DisplacementTimeline(_AdaptiveTimeline):
 
 
 class BrightnessTimeline(_AdaptiveTimeline):
-    """Event frames between which the signal changes by at most a fraction of the contrast threshold, by |dL/dt| from
-    the shader at times between which nothing moves faster, and edges of at least a threshold move by at most that many
-    pixels."""
+    """Event frames between which the signal changes by at most a fraction of the contrast threshold, and edges of at
+    least a threshold move by at most as many pixels."""
 
     kind: Literal["brightness"] = "brightness"
     sample_every: ClassVar[int] = 4

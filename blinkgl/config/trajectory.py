@@ -39,8 +39,7 @@ class MotionConfig(Config):
         None,
         gt=0,
         le=1000,
-        description="waypoints per second, instead of waypoints: a short sequence is then a part of a smooth "
-        "motion, like a recording",
+        description="waypoints per second, instead of waypoints: a short sequence is then a part of a smooth motion",
     )
     pauses: float = Field(
         0.0,
@@ -48,13 +47,11 @@ class MotionConfig(Config):
         le=1,
         description="fraction of the bodies that stop smoothly once, for 10 to 50 % of the sequence",
     )
-    speed: SpeedRange = Field(
-        (0.2, 1.5), description="mean speed of the body's origin, world units/s: a number or [low, high]"
-    )
+    speed: SpeedRange = Field((0.2, 1.5), description="mean speed of the body's origin, world units/s")
     rotation_rate: RateRange = Field(
         (20.0, 120.0),
-        description="mean angular rate, deg/s: a number or [low, high]; key frames are added where two waypoints "
-        "differ by more than 115 degrees",
+        description="mean angular rate, deg/s; key frames are added where two waypoints differ by more than 115 "
+        "degrees",
     )
     smoothness: float = Field(
         0.5, ge=0, le=1, description="0: each leg starts in a random direction; 1: it continues in the last one's"
@@ -76,19 +73,15 @@ class ObjectMotion(MotionConfig):
 class CameraMotion(MotionConfig):
     """Motion of the camera: as of an object, but it looks approximately at the scene's centre."""
 
-    speed: SpeedRange = Field(
-        (0.3, 1.5), description="mean speed of the camera centre, world units/s: a number or [low, high]"
-    )
-    rotation_rate: RateRange = Field(
-        (10.0, 60.0), description="mean angular rate without shake, deg/s: a number or [low, high]"
-    )
+    speed: SpeedRange = Field((0.3, 1.5), description="mean speed of the camera centre, world units/s")
+    rotation_rate: RateRange = Field((10.0, 60.0), description="mean angular rate without shake, deg/s")
     view_cone: float = Field(
         20.0, ge=1, le=180, description="largest angle between viewing direction and target at the waypoints, deg"
     )
     heading: Literal["any", "view", "across"] = Field(
         "any",
-        description="initial direction: view: along its line of sight, forwards or backwards (a zoom); across: "
-        "perpendicular to it. smoothness decides how long it is kept",
+        description="initial direction; view: along its line of sight, forwards or backwards; across: perpendicular"
+        " to it. smoothness decides how long it is kept",
     )
     roll: float = Field(20.0, ge=0, le=180, description="largest roll of the horizon at the waypoints, deg")
     shake: float = Field(

@@ -16,8 +16,10 @@ MOST_PIXELS = 20_000
 LEAST_PIXELS = 20
 """With events, for a field of six numbers to say anything."""
 NEAR = 0.4
-"""Share of the median length of the dominant motion by which flow may be off it to be drawn half of the way there. On
-simulated windows (real_data.yaml with bodies, 600) the error is the same from 0.3 to 0.5."""
+"""Share of the median length of the dominant motion by which flow may be off it to be drawn half of the way there."""
+AFFINE, OTHER = 0.2, 0.4
+"""Mean distance from the dominant motion, as a share of the mean length: up to the first the flow is taken for that of a
+camera alone, from the second on for that of depth and bodies, and is not drawn anywhere."""
 QUANTUM_PX = 0.1
 """Added to that distance: flow of a still camera is never exactly zero."""
 _ROUNDS = 8
@@ -46,13 +48,14 @@ def dominant_motion(flow: Flow, hit: Mask) -> tuple[Numbers, float]:
 
 
 def toward_dominant(flow: Flow, hit: Mask) -> Flow:
-    """Return the flow (H, W, 2) px with each vector drawn towards the dominant motion, the more the nearer it is: a
-    share of 1 / (1 + (distance / d)²) of the way, where d is :data:`NEAR` of that motion's median length. What moves
-    its own way is far off and stays. hit : (H, W) pixels with events; of fewer than :data:`LEAST_PIXELS` the flow is
-    returned as it is."""
+    """Return the flow (H, W, 2) px with each vector drawn towards the dominant motion: by a share of
+    1 / (1 + (distance / d)²), where d is :data:`NEAR` of that motion's median length, times 1 where all of the flow is
+    nearly affine, falling to 0 where it is not (:data:`AFFINE`, :data:`OTHER`). What moves its own way is far off and
+    stays. hit : (H, W) pixels with events; of fewer than :data:`LEAST_PIXELS` the flow is returned as it is."""
     if np.count_nonzero(hit) < LEAST_PIXELS:
         return flow
-    affine, _ = dominant_motion(flow, hit)
+    affine, off = dominant_motion(flow, hit)
+    alone = np.clip((OTHER - off) / (OTHER - AFFINE), 0, 1)
     near = NEAR * np.median(np.hypot(*affine[hit].T)) + QUANTUM_PX
-    share = 1 / (1 + ((flow - affine) ** 2).sum(-1, keepdims=True) / near**2)
+    share = alone / (1 + ((flow - affine) ** 2).sum(-1, keepdims=True) / near**2)
     return (flow + share * (affine - flow)).astype(np.float32)

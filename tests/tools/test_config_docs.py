@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 from pinned import only_with_pinned
 
+from blinkgl.config import draw
 from blinkgl.config.reader import to_yaml
 from blinkgl.errors import BlinkGLError
 from blinkgl.tools import command_docs, fuzz_configurations
@@ -27,6 +29,11 @@ def test_the_page_is_up_to_date(name):
     made, command = PAGES[name]
     written = (Path(__file__).parents[2] / name).read_text()
     assert written == made(), f"run: {command} > {name}"
+
+
+def test_the_page_of_keys_lists_every_distribution():
+    shown = re.findall(r"`\{(\w+):", page().partition("\n## ")[0])
+    assert set(draw._KINDS) <= set(shown)
 
 
 # --- The fuzz of file formats: a short seeded run, and that it tells defects from refusals.

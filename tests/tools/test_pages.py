@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import errno
 import os
 import re
@@ -151,6 +152,28 @@ def test_the_summary_of_sensors_is_that_of_the_measured_tables():
                 assert [min(values), max(values)] == pytest.approx(
                     [float(word) for word in (re.findall(r"[\d.]+", line[1 + emulator]) * 2)[:2]]
                 ), (camera, name, emulator)
+
+
+def test_costs_of_qualities_are_those_of_the_measured_table():
+    """docs/sensors.md rounds docs/trade.md, relative to `balanced`."""
+    trade = (REPOSITORY / "docs/trade.md").read_text("utf-8").partition("\n## What accuracy is worth")[0]
+    rows = {row[0].strip("*"): row for row in table(trade)}
+    sensors = (REPOSITORY / "docs/sensors.md").read_text("utf-8")
+    shown = {row[0].partition(",")[0].strip("`"): row for row in table(sensors)}
+    for quality in ("fast", "accurate", "reference"):
+        for column, measured in ((1, 2), (2, 3)):
+            value = float(rows[quality][measured].partition(" ")[0])
+            assert float(shown[quality][column]) == pytest.approx(value, abs=0.051), quality
+
+
+def test_extras_that_pages_name_can_be_installed():
+    config = configparser.ConfigParser()
+    config.read(REPOSITORY / "setup.cfg")
+    known = set(config["options.extras_require"])
+    for path in (*PAGES, REPOSITORY / "docs/configuration.md", REPOSITORY / "docs/commands.md"):
+        text = path.read_text("utf-8")
+        named = re.findall(r"\bextra `?\[?(\w+)[`\]]", text) + re.findall(r"EXTRAS=([\w,]+)", text)
+        assert {extra for names in named for extra in names.split(",")} <= known, path.name
 
 
 def test_the_programs_that_read_without_blinkgl_read_what_blinkgl_reads(tmp_path):

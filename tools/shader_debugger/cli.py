@@ -16,7 +16,7 @@ app = App(
     help="Inspect what every pass wrote at a pixel, and why.",
 )
 
-Config = Annotated[str, typer.Argument(help="YAML file, or the name of a shipped one, as for `blinkgl generate`.")]
+Config = Annotated[str, typer.Argument(help="YAML file, or the name of a shipped one (blinkgl configs).")]
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")]
 Sequence = Annotated[
     int | None, typer.Option("--sequence", "-n", min=0, help="Number of the sequence (default: the run's first).")

@@ -37,7 +37,7 @@ def figure(
     level: int = 0,
 ) -> tuple[Surface, Deformer]:
     """A person on z = 0, facing along x, who walks, runs, dances, waves or stands, in place (an object's `way` moves
-    it). The texture is an atlas in which each part of the body has its place, all in one scale."""
+    it). The texture is an atlas of the body's parts."""
     if height > 1000:
         raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
     proportions = Proportions(height, build, legs, arms, head)

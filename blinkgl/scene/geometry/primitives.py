@@ -41,8 +41,7 @@ PARAMETERS = {
     "head": "figure: see legs",
     "clip": "figure: what it does, one of " + ", ".join(CLIPS),
     "variant": "figure: which of many dances, and how it walks, runs, stands, waves; 0 is the plain one",
-    "tempo": "1 is the natural one of a body of this size, 0.1 to 4; a figure that walks or runs, and a fish, also go "
-    "on faster",
+    "tempo": "0.1 to 4; 1 is natural for a body of this size. Figures on a `way`, and fish, also move faster",
     "phase": "0 to 1, of a round, where it is at time 0",
     "wind": "flag: 1 is a breeze, up to 4; more of it lifts the cloth higher, and faster",
     "coat": "figure, flag, fish: which colours they wear where the object names no material",

@@ -40,7 +40,7 @@ _DEVICE: Any = Field(
     "short trial gives the same events; else `cpu`.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
-_THRESHOLD_MAP: Any = Field(
+_THRESHOLD_MAP: str | None = Field(
     None,
     description="Measured thresholds of each pixel, ln units from 0.001 to 10: a .npy file of floats of the camera's "
     "size, (H, W), or (2, H, W) with C+ and C-; a relative path starts from the YAML file. `threshold_sigma` is then "

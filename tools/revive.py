@@ -57,7 +57,9 @@ def dead_units(model: FlowModel, pool: Path, samples: int) -> dict[str, tuple[in
 
         return count
 
-    watched = [n for n, m in model.named_modules() if isinstance(m, nn.Conv2d)] + [f"context.deep.{k}" for k in range(3)]
+    watched = [n for n, m in model.named_modules() if isinstance(m, nn.Conv2d)] + [
+        f"context.deep.{k}" for k in range(3)
+    ]
     handles = [model.get_submodule(name).register_forward_hook(hook(name)) for name in watched]
     source = open_source(pool)
     for i in np.linspace(0, len(source) - 1, samples).astype(int):

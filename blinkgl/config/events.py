@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -37,6 +38,12 @@ _DEVICE: Any = Field(
     "trial gives the same events, else `cpu`.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
+_THRESHOLD_MAP: str | None = Field(
+    None,
+    description="Measured thresholds of each pixel, ln units from 0.001 to 10: a .npy file of floats of the camera's "
+    "size, (H, W), or (2, H, W) with C+ and C-; a relative path starts from the YAML file. `threshold_sigma` is then "
+    "not used; `contrast_threshold` stays the nominal threshold, to which noise and `timeline: brightness` refer.",
+)
 
 
 class Fitted(NamedTuple):
@@ -110,6 +117,11 @@ class EmulatorConfig(Config):
     one_threshold: ClassVar[bool] = False
     """Whether ON and OFF events cannot be weighted separately: a calibration then uses their sum."""
 
+    def beside(self, base: Path) -> Self:
+        """Return the configuration whose files are found from anywhere: ``base`` is the folder that relative paths
+        start from."""
+        return self
+
     @classmethod
     @abstractmethod
     def from_sensor(cls, sensor: object) -> dict[str, Any]:
@@ -137,6 +149,12 @@ class _TwoThresholds(EmulatorConfig):
     if TYPE_CHECKING:
         contrast_threshold: float
         contrast_threshold_off: float | None
+        threshold_map: str | None
+
+    def beside(self, base: Path) -> Self:
+        if self.threshold_map is None:
+            return self
+        return self.model_copy(update={"threshold_map": str(base / Path(self.threshold_map).expanduser())})
 
     @property
     def thresholds(self) -> tuple[float, float]:
@@ -208,6 +226,7 @@ class EsimConfig(_TwoThresholds):
         description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021); each threshold "
         "stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of contrast_threshold.",
     )
+    threshold_map: str | None = _THRESHOLD_MAP
     threshold_jitter: float = Field(
         0.0,
         ge=0,
@@ -294,6 +313,7 @@ class V2eConfig(_TwoThresholds):
         le=5,
         description="Spread of the thresholds over the pixels, ln units; each threshold stays >= 0.01.",
     )
+    threshold_map: str | None = _THRESHOLD_MAP
     full_scale: float = Field(
         255.0,
         gt=0,

@@ -64,6 +64,7 @@ PROBLEMS = {
     "string_unicode": "not text",
     "string_too_short": "too short",
     "string_too_long": "too long",
+    "string_pattern_mismatch": "not accepted characters, or too many",
     "literal_error": "unknown choice",
     "none_required": "not null",
     "greater_than": "too small",

@@ -15,10 +15,11 @@ from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSce
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.events.thresholds import measured_thresholds
 from blinkgl.scene.build import check_assets as check_scene, panorama_of
 from blinkgl.scene.importing.mesh_files import border_of, identity_of
 from blinkgl.scene.motion.dynamics import engine_version
-from blinkgl.scene.reading import contents, resolve
+from blinkgl.scene.reading import contents, existing, resolve
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below
 from blinkgl.scene.worlds.random_world import forget_pools, pools
@@ -55,6 +56,7 @@ _ASSET_CORNERS = 48
 
 def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
+    _hash_thresholds(group.template, base, hashes)
     if _falls(group.template.tree):
         engine_version()
     for config in _asset_corners(group.template):
@@ -89,6 +91,22 @@ def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
         if recipe not in seen:
             seen.add(recipe)
             yield config
+
+
+def _hash_thresholds(template: RunTemplate, base: Path, hashes: dict[str, str]) -> None:
+    """Note the measured thresholds of the pixels of all cameras. Raises AssetError and EventDataError; for recorded
+    frames, whose size is not known yet, only AssetError."""
+    used = {
+        (name, camera.config.camera.height, camera.config.camera.width, config.frames is None)
+        for config in template.corners()[:_ASSET_CORNERS]
+        for camera in config.cameras()
+        if camera.gives_events and (name := getattr(camera.config.events, "threshold_map", None)) is not None
+    }
+    for name, height, width, drawn in sorted(used):
+        file = existing(name, base, "events.threshold_map", "a .npy file of thresholds")
+        if drawn:
+            measured_thresholds(str(file), height, width)
+        _note(hashes, without_places(name), content_hash(contents(file, "threshold map")))
 
 
 def _falls(tree: object) -> bool:

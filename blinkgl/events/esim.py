@@ -30,6 +30,7 @@ from blinkgl.events.packing import T_SHIFT, copy_block, lookup_block
 from blinkgl.events.philox import Stream, in_blocks, normal2, pixel_counters
 from blinkgl.events.response import Response
 from blinkgl.events.table import register
+from blinkgl.events.thresholds import MIN_THRESHOLD, pixel_thresholds
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 
@@ -40,8 +41,6 @@ _U1000 = np.uint64(1000)
 _JITTER = np.uint64(Stream.JITTER)
 # Intervals of this length or more take the long division of crossing_ns.
 _LONG_NS = 2**31
-# Smallest threshold in ln units that spread and jitter may draw.
-MIN_THRESHOLD = 0.01
 
 
 class Levels(NamedTuple):
@@ -209,20 +208,6 @@ def to_q25(value: float | np.ndarray) -> np.ndarray:
     return np.floor(np.asarray(value, np.float64) * Q_ONE + 0.5).astype(np.int64)
 
 
-def draw_thresholds(
-    height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
-
-    For nominal thresholds under 0.02 the floor is half the nominal one.
-    """
-    # Draw 0 of the stream, one pair of normals per pixel: thresholds never change.
-    spread = lambda pixels: normal2(seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
-    a, b = in_blocks(spread, pixel_counters(height, width))
-    clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
-    return clip(on, a), clip(off, b)
-
-
 @register
 class Esim(Emulator):
     """The ESIM emulator, see the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel;
@@ -243,6 +228,7 @@ class Esim(Emulator):
             contrast_threshold=config.contrast_threshold,
             contrast_threshold_off=config.contrast_threshold_off,
             threshold_sigma=config.threshold_sigma,
+            threshold_map=config.threshold_map,
         )
 
     def __init__(self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0):
@@ -254,10 +240,9 @@ class Esim(Emulator):
         self._on_all, self._off_all = int(to_q25(on)), int(to_q25(off))
         self._on = self._off = np.empty(0, np.int32)
         smallest = min(self._on_all, self._off_all)
-        if config.threshold_sigma:
+        if config.threshold_sigma or config.threshold_map is not None:
             self._on, self._off = (
-                to_q25(c).astype(np.int32)
-                for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
+                to_q25(c).astype(np.int32) for c in pixel_thresholds(height, width, config, self.seed)
             )
             smallest = int(min(self._on.min(), self._off.min()))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))

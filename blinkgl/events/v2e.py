@@ -29,11 +29,11 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.bands import BLOCK, driver
 from blinkgl.events.emulator import NEVER_NS, Emulator, Source
-from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import copy_block, lookup_block, scale_block
 from blinkgl.events.response import Response
 from blinkgl.events.table import register
+from blinkgl.events.thresholds import pixel_thresholds
 from blinkgl.events.v2e_blocks import (
     DRAWS,
     End,
@@ -240,6 +240,7 @@ class V2e(Emulator):
             contrast_threshold=config.contrast_threshold,
             contrast_threshold_off=config.contrast_threshold_off,
             threshold_sigma=config.threshold_sigma,
+            threshold_map=config.threshold_map,
         )
 
     def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0):
@@ -249,9 +250,7 @@ class V2e(Emulator):
         # Arrays of features that are off have size 0, which the kernels test.
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
         on, off = config.thresholds
-        self._on, self._off = (
-            c.astype(np.float32) for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
-        )
+        self._on, self._off = (c.astype(np.float32) for c in pixel_thresholds(height, width, config, self.seed))
         self._x, self._upper, self._lower = (frame() for _ in range(3))
         self._intensity = frame(config.cutoff_hz > 0 or config.shot_noise_rate_hz > 0)
         noisy = config.photoreceptor_noise and config.shot_noise_rate_hz > 0

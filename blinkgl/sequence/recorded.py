@@ -297,7 +297,7 @@ class RecordedSequence(SensorSimulation):
         )
         camera = (
             EventCamera(
-                config.events,
+                config.events.beside(request.base),
                 config.readout,
                 size[0],
                 size[1],

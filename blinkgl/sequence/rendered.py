@@ -94,7 +94,7 @@ class RenderedSequence(SensorSimulation):
             pictures_hz = request.pictures_hz
             truth = SurfaceTruth(reach=int(samples_of(config.render.antialiasing).shared))
             camera = EventCamera(
-                config.events,
+                config.events.beside(request.base),
                 config.readout,
                 *size,
                 kernel_seed(config.seed, request.index, Role.EVENTS, of.number),

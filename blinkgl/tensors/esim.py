@@ -19,8 +19,9 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE
 from blinkgl.events.bands import BLOCK
 from blinkgl.events.emulator import NEVER_NS
-from blinkgl.events.esim import MIN_THRESHOLD, draw_thresholds, to_q25
+from blinkgl.events.esim import to_q25
 from blinkgl.events.philox import Stream
+from blinkgl.events.thresholds import MIN_THRESHOLD, pixel_thresholds
 from blinkgl.tensors.arith import log_q25_, normal2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, configured, places
 
@@ -107,10 +108,10 @@ class TensorEsim(Batch):
         self._on: Any = int(to_q25(on))
         self._off: Any = int(to_q25(off))
         smallest = min(self._on, self._off)
-        self._spread = config.threshold_sigma > 0
+        self._spread = config.threshold_sigma > 0 or config.threshold_map is not None
         if self._spread:
             self._on, self._off = zeros(torch.int32), zeros(torch.int32)
-            smallest = min(self._draw(k, on, off) for k in range(self.envs))
+            smallest = min(self._draw(k) for k in range(self.envs))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
         # With jitter every event may draw the smallest threshold, which bounds the number of events.
         self._jitter = config.threshold_jitter * Q_ONE
@@ -132,10 +133,10 @@ class TensorEsim(Batch):
         self._scratch = torch.empty((3, len(self._now[self._chunks()[0]])), device=self.device)
         self._state = ("_log", "_upper", "_lower", "_fired", "_last_ns")
 
-    def _draw(self, k: int, on: float, off: float) -> int:
-        """Draw the thresholds of environment k, which stay fixed, and return the smallest."""
-        c, here = self.config, self._rows(k)
-        drawn = draw_thresholds(self.height, self.width, on, off, c.threshold_sigma, np.uint64(self.seeds[k]))
+    def _draw(self, k: int) -> int:
+        """Set the thresholds of environment k, which stay fixed, and return the smallest."""
+        here, seed = self._rows(k), np.uint64(self.seeds[k])
+        drawn = pixel_thresholds(self.height, self.width, self.config, seed)
         for tensor, values in zip((self._on, self._off), map(to_q25, drawn)):
             tensor[here] = torch.from_numpy(values.astype(np.int32)).to(self.device)
         return int(min(to_q25(one.min()) for one in drawn))

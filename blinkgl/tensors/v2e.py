@@ -22,10 +22,10 @@ from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import v2e_model as model
 from blinkgl.events.bands import BLOCK
-from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, noise_table
 from blinkgl.events.packing import MAX_CAUSE_ROWS
 from blinkgl.events.philox import Stream
+from blinkgl.events.thresholds import pixel_thresholds
 from blinkgl.events.v2e import V2e
 from blinkgl.tensors.arith import exp_f32, horner, log_f32, log_f64, normal2, sqrt, uniform2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, configured, places, stable_order
@@ -165,7 +165,7 @@ class TensorV2e(Batch):
     def _draw(self, k: int, c: V2eConfig) -> None:
         """Draw the constant properties of environment k's sensor."""
         seed, size = np.uint64(self.seeds[k]), (self.height, self.width)
-        on, off = (one.astype(np.float32) for one in draw_thresholds(*size, *c.thresholds, c.threshold_sigma, seed))
+        on, off = (one.astype(np.float32) for one in pixel_thresholds(*size, c, seed))
         leak = model.draw_leaks(*size, c, on, seed)
         drawn = {"_on": on, "_off": off, "_mean_leak": leak}
         if leak.size and leak.max() > 0:

@@ -366,6 +366,7 @@ ELSEWHERE = {
     "optics": "tests/imaging/test_optics.py: every point spread and pattern; here what is written and read",
     "frames.flow_direction": "tests/sequence/test_flow_of_others.py: it has to go with `labels.flow`",
     "events.device": "tests/tensors/test_device_emulator.py: either device writes the same files",
+    "events.threshold_map": "tests/dataset/test_threshold_maps.py: the file has the camera's size",
     "imu": "tests/sequence/test_inertial.py, tests/dataset/test_over_time.py; here what is written and read",
     **RUN_LEVEL,
 }

@@ -210,7 +210,9 @@ def test_real_small_in_a_larger_sensor(name, size):
     inside = Events(events.x + np.uint16(left), events.y + np.uint16(top), events.t, events.p)
     error = lambda flow: np.hypot(*(flow[judged] - truth[judged]).T).mean()
     own = rr.answer_of("real_small+refined", height, width)(as_one(events, t0, t1))
-    flow = rr.answer_of("real_small+refined", high, wide)(as_one(inside, t0, t1))[top : top + height, left : left + width]
+    flow = rr.answer_of("real_small+refined", high, wide)(as_one(inside, t0, t1))[
+        top : top + height, left : left + width
+    ]
     assert error(flow) < 1.3 * error(own)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from blinkgl import Camera, Keyframes, Light as Sun, Pose, Primitive, Scene as BlinkScene, record
 from blinkgl.camera import PinHole
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig
@@ -352,3 +353,26 @@ def test_a_sequence_of_81_small_models(gl, tmp_path, seed, count):
             np.load(report.path / f"{name}/{k:06d}.npy") for name in ("depth", "normals", "velocity")
         )
         assert np.isfinite(depth).mean() > 0.9 and np.isfinite(normals).all() and np.isfinite(velocity).all()
+
+
+@pytest.mark.parametrize("antialiasing", ["none", "edges", "edges2", "ssaa4"])
+@pytest.mark.parametrize("normal", [(1, 0, 0), (0, 0, 1)], ids=["upright", "level"])
+def test_a_plate_seen_exactly_edge_on_changes_no_pixel(gl, antialiasing, normal):
+    """A plane through the camera's centre has no area in the picture, whatever its lines are."""
+    turned = Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_matrix()
+    plate = mesh(quad(0.5, 0.5).vertices @ turned.T, quad().faces, np.tile(np.float64(normal), (4, 1)), quad().uvs)
+    glowing = Material(base_color=(0, 0, 0), emission=(3.0, 3.0, 3.0), both_sides=True)
+    wall = SceneObject("wall", 1, (Part(quad(9, 9), Material(emission=(0.5, 0.5, 0.5))),), still((0, 9, 0), LEVEL))
+    there = SceneObject("plate", 2, (Part(plate, glowing),), still((0, 3, 0)))
+    pictures = []
+    for bodies in ([wall], [wall, there]):
+        with Renderer(gl, scene(bodies, rig()), RenderConfig(antialiasing=antialiasing)) as renderer:
+            pictures.append(renderer.luminance(0).read().copy())
+    assert pictures[0].min() > 0.4 and np.abs(pictures[1] - pictures[0]).max() < 1e-6
+
+
+def test_without_light_a_moving_picture_is_black_and_makes_no_event():
+    camera = Camera(32, 24, pose=Keyframes({0.0: Pose((-3, 0, 0)), 0.1: Pose((-3, 1, 0))}))
+    dark = BlinkScene(camera, light=Sun(0, 0), background=0.0, duration=0.1) + Primitive("cuboid")
+    made = record(dark, emulator={"emulator": "esim"}, labels=["images"])
+    assert len(made.events) == 0 and len(made.images) and not np.any(made.images)

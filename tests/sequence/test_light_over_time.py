@@ -93,6 +93,25 @@ def test_every_edge_of_a_pulse_width_makes_its_events_at_its_microsecond():
     assert {bool(v) for v in p[np.isin(t, jumps[0::2])]} == {False}
 
 
+def test_the_light_of_an_event_at_a_jump_is_read_from_the_table():
+    """The lines of docs/data.md, against the edges by the formula: two lamps at 1000 and 700 Hz."""
+    lamp = {"kind": "sun", "azimuth": 180, "elevation": 0, "strength": 0.4}
+    slow = {"kind": "pwm", "frequency": 700, "duty": 0.5}
+    lights = [{**lamp, "over_time": PWM}, {**lamp, "over_time": slow}]
+    t, _, _, _, sequence = events_of(config_of({"light": {"sun": 0, "sky": 0.1, "lights": lights}}))
+    table = sequence.lights()
+    at = np.searchsorted(table["jump_t_ns"] // 1000, t, "right") - 1
+    light = np.where((at >= 0) & (table["jump_t_ns"][at] // 1000 == t), table["jump_light"][at], -1)
+    ends = lambda wave: {
+        int(1e6 * (k + part) / wave["frequency"] + 1e-6) for k in range(50) for part in (0, wave["duty"])
+    }
+    both = ends(PWM) & ends(slow)
+    for number, wave in enumerate((PWM, slow)):
+        mine = np.isin(t, sorted(ends(wave) - both))
+        assert mine.sum() > 5000 and (light[mine] == number).all()
+    assert (light >= 0).all()
+
+
 def test_a_code_is_read_from_the_events():
     bits = "1011001110001011"
     code = {"kind": "code", "bits": bits, "rate": 2000, "low": 0.1}

@@ -294,7 +294,7 @@ class Bench:
                 "nothing is rendered from recorded frames, so there are no settings to compare", where="frames"
             )
         # Labels and previews are not measured; noise, and a bus that delays events, would hide the errors of interest.
-        self.emulator = emulator_of(base.events).noiseless(base.events)
+        self.emulator = emulator_of(base.events).noiseless(base.events).beside(template.base)
         sized = [] if SIZES[size] == 1 else ["camera=" + json.dumps(base.camera.scaled(SIZES[size]))]
         tree = apply_overrides(template.tree, ["quality=null", *sized])  # the field of view stays
         self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)

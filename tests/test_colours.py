@@ -1,5 +1,5 @@
-"""Colours that tell things apart do so for colour-blind readers: distances in CIELAB of what they see, by the matrices of
-Machado, Oliveira and Fernandes (2009, severity 1) on linear sRGB."""
+"""Colours that tell things apart do so for colour-blind readers: distances in CIELAB of what they see, by the matrices
+of Machado, Oliveira and Fernandes (2009, severity 1) on linear sRGB."""
 
 import itertools
 import re

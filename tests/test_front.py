@@ -473,3 +473,24 @@ def test_sides_are_what_the_file_says_unless_overruled(tmp_path):
         blinkgl.ConfigError, match="double_sided: this key was removed .got True.; expected both_sides: true"
     ):
         blinkgl.Material(double_sided=True)
+
+
+def test_a_scene_that_grows_checks_each_body_once(monkeypatch):
+    checked = []
+    own = blinkgl.Scene._checked
+    monkeypatch.setattr(
+        blinkgl.Scene,
+        "_checked",
+        lambda self, model, tree, **names: (
+            checked.append(len(tree.get("objects", ()))) or own(self, model, tree, **names)
+        ),
+    )
+    bodies = [
+        blinkgl.Primitive("cuboid", pose=(k, 0, 5), material=blinkgl.Material(procedural="bricks")) for k in range(30)
+    ]
+    grown = blinkgl.Scene(blinkgl.Camera(64, 48), fog=(0.1, 0.2), gravity=(0, 0, -1))
+    for body in bodies:
+        grown += body
+    assert max(checked) == 1
+    assert grown.tree == blinkgl.Scene(blinkgl.Camera(64, 48), bodies, fog=(0.1, 0.2), gravity=(0, 0, -1)).tree
+    assert grown.template().tree["scene"]["objects"][29]["name"] == "cuboid#29"

@@ -3,10 +3,10 @@
     python -m blinkgl.tools.revive real_bodies --out out/revived.safetensors
     eflow train … --set init_from=out/revived.safetensors
 
-Units whose rectifier is never above zero get no gradient and stay dead. In ``real_bodies`` those are the U-Net's coarsest
-scale, which carries motion over the image, and the head of the refinement (``--look POOL`` counts them). They begin anew
-here, as in ReDo (Sokar et al., "The dormant neuron phenomenon", ICML 2023): fresh weights into them, zeros out of them, so
-that the network answers as before until it has learnt what they are good for.
+Units whose rectifier is never above zero get no gradient and stay dead. In the first ``real_bodies`` those were the
+U-Net's coarsest scale, which carries motion over the image, and the head of the refinement (``--look POOL`` counts
+them). They begin anew here, as in ReDo (Sokar et al., "The dormant neuron phenomenon", ICML 2023): fresh weights into
+them, zeros out of them, so that the network answers as before until it has learnt what they are good for.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def revived(model: FlowModel, seed: int) -> FlowModel:
     new = EFlowFormer(model.config)
     state = model.state_dict()
     state |= {name: value for name, value in new.state_dict().items() if name.startswith(FRESH)}
-    deep, narrow = new.context.deep[0].conv1.out_channels, new.update.motion.flow2.out_channels
+    deep, narrow = (len(state[f"{name}.weight"]) for name in ("context.deep.0.conv1", "update.motion.flow2"))
     state["context.up.weight"] = state["context.up.weight"].clone()
     state["context.up.weight"][:, :deep] = 0
     state["update.motion.join.weight"] = state["update.motion.join.weight"].clone()

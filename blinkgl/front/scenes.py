@@ -12,6 +12,7 @@ is created.
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -346,18 +347,6 @@ class Scene(Piece):
             },
         }
         self._checked(SequenceConfig, self._run, time="")
-        self._memory = InMemory()
-        falls = any(body.tree.get("physics", {}).get("kind") == "dynamic" for body in self.objects)
-        foggy = {} if self.fog is None else {"fog": dict(zip(("density", "radiance"), check.plain(self.fog)))}
-        self.tree = {
-            "kind": "explicit",
-            **self._listed(falls),
-            "camera": self.camera.motion,
-            "light": self.light.tree,
-            **self._plain,
-            **foggy,
-            **({"physics": self._gravity} if falls else {}),
-        }
         if self.objects:  # a scene without bodies is refused at its use, because `scene + body` begins with one
             self._checked(ExplicitSceneConfig, self.tree)
 
@@ -379,10 +368,12 @@ class Scene(Piece):
         keys.setdefault("background", theirs.background)
         return cls(camera, bodies, **keys)
 
-    def _listed(self, falls: bool) -> dict[str, Any]:
-        """Return meshes, materials and objects by name; those made of arrays are kept in memory. falls : a body is
-        dynamic."""
-        named, meshes, materials = [], {}, {}
+    @functools.cached_property
+    def _listed(self) -> tuple[dict[str, Any], InMemory]:
+        """The scene as plain data, with meshes, materials and objects by name, and those parts that are made of
+        arrays."""
+        falls = any(body.tree.get("physics", {}).get("kind") == "dynamic" for body in self.objects)
+        named, meshes, materials, memory = [], {}, {}, InMemory()
         taken: set[str] = set()
         for k, body in enumerate(self.objects):
             item = {**body.tree, "mesh": f"mesh{k}"}
@@ -392,22 +383,38 @@ class Scene(Piece):
             taken.add(item["name"])
             meshes[f"mesh{k}"] = body.mesh
             if body.triangles is not None:
-                self._memory.meshes[f"mesh{k}"] = body.triangles
+                memory.meshes[f"mesh{k}"] = body.triangles
             if body.material is not None:
                 item["material"] = f"material{k}"
                 materials[f"material{k}"] = body.material.tree
                 if body.material.maps:
-                    self._memory.maps[f"material{k}"] = body.material.maps
+                    memory.maps[f"material{k}"] = body.material.maps
                 if body.material.image is not None:
-                    self._memory.textures[f"material{k}"] = body.material.image
+                    memory.textures[f"material{k}"] = body.material.image
             named.append(item)
-        return {"meshes": meshes, "materials": materials, "objects": named}
+        tree = {
+            "kind": "explicit",
+            "meshes": meshes,
+            "materials": materials,
+            "objects": named,
+            "camera": self.camera.motion,
+            "light": self.light.tree,
+            **self._plain,
+            **({} if self.fog is None else {"fog": dict(zip(("density", "radiance"), check.plain(self.fog)))}),
+            **({"physics": self._gravity} if falls else {}),
+        }
+        return tree, memory
+
+    @property
+    def tree(self) -> dict[str, Any]:  # pyrefly: ignore [bad-override]
+        return self._listed[0]
 
     def __add__(self, body: Primitive | Mesh) -> Scene:
         check.one_of(body, "Scene + …", _Object, "a Primitive or a Mesh")
-        return Scene(
+        # Only the new body is checked: to check all of them at each step takes minutes for thousands.
+        scene = Scene(
             self.camera,
-            (*self.objects, body),
+            (body,),
             light=self.light,
             fog=self.fog,
             gravity=self._gravity["gravity"],
@@ -415,6 +422,9 @@ class Scene(Piece):
             **self._plain,
             **self._run["time"],
         )
+        del scene._listed
+        scene.objects = (*self.objects, body)
+        return scene
 
     def __repr__(self) -> str:
         return f"<Scene of {len(self.objects)} objects>"
@@ -431,14 +441,15 @@ class Scene(Piece):
     @property
     def on_disk(self) -> bool:
         """Whether a YAML file could describe it: no part is made of arrays."""
-        return not (self._memory.meshes or self._memory.textures or self._memory.maps)
+        memory = self._listed[1]
+        return not (memory.meshes or memory.textures or memory.maps)
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """Return the scene for the renderer. Raises ConfigError and AssetError: files."""
         from blinkgl.scene.build import equipped, in_fog, seen_by
 
         span_ns = config.time.t0_ns, config.time.t1_ns
-        made = explicit_scene(config.scene, seen_by(config).model, *span_ns, Path.cwd(), self._memory)
+        made = explicit_scene(config.scene, seen_by(config).model, *span_ns, Path.cwd(), self._listed[1])
         if notes := dict.fromkeys(note for body in self.objects for note in body.notes):
             made = replace(made, omissions=(*made.omissions, f"pyrender's scene is drawn without: {'; '.join(notes)}"))
         return equipped(in_fog(made, config.scene), config)

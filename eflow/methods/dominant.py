@@ -18,11 +18,11 @@ LEAST_PIXELS = 20
 NEAR = 0.4
 """Share of the median length of the dominant motion by which flow may be off it to be drawn half of the way there."""
 AFFINE, OTHER = 0.2, 0.4
-"""Mean distance from the dominant motion, as a share of the mean length: up to the first the flow is taken for that of a
-camera alone, from the second on for that of depth and bodies, and is not drawn anywhere."""
+"""Mean distance from the dominant motion, as a share of the mean length: up to the first the flow is taken for that of
+a camera alone, from the second on for that of depth and bodies, and is not drawn anywhere."""
 QUANTUM_PX = 0.1
 """Added to that distance: flow of a still camera is never exactly zero."""
-_ROUNDS = 8
+_ROUNDS = 7
 
 
 def dominant_motion(flow: Flow, hit: Mask) -> tuple[Numbers, float]:
@@ -36,12 +36,12 @@ def dominant_motion(flow: Flow, hit: Mask) -> tuple[Numbers, float]:
     y, x = y[::n], x[::n]
     # Coordinates of about 1 condition the least squares.
     basis = np.stack([np.ones(len(x)), x / larger - 0.5, y / larger - 0.5], axis=1)
-    field, weight = flow[y, x].astype(np.float64), np.ones(len(x))
+    field = flow[y, x].astype(np.float64)
+    fit = np.linalg.lstsq(basis, field, rcond=None)[0]
     for _ in range(_ROUNDS):
-        root = np.sqrt(weight)[:, None]
+        root = np.sqrt(1 / np.maximum(np.hypot(*(field - basis @ fit).T), QUANTUM_PX))[:, None]
         fit = np.linalg.lstsq(basis * root, field * root, rcond=None)[0]
-        distance = np.hypot(*(field - basis @ fit).T)
-        weight = 1 / np.maximum(distance, QUANTUM_PX)
+    distance = np.hypot(*(field - basis @ fit).T)
     rows, columns = (np.arange(size)[:, None] / larger - 0.5 for size in (height, width))
     affine = fit[0] + columns[None] * fit[1] + rows[:, None] * fit[2]
     return affine, float(distance.mean() / max(np.hypot(*field.T).mean(), 1e-9))

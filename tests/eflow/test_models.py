@@ -217,7 +217,7 @@ def test_sizes_of_every_network(name):
         parameters = [parameters_of(build(name=name, size=size)) for size in SIZES]
     page = (Path(__file__).parents[2] / "docs/eflow.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith(f"|`{name}`|"))
-    assert row.split("|")[3].split(", ") == [f"{n / 1e6:.3g}" for n in parameters]
+    assert row.split("|")[3].split(", ") == [f"{n / 1e6:.{1 if n > 1e7 else 2}f}" for n in parameters]
     assert parameters[0] > parameters[1] > parameters[2] and 0.8e6 < parameters[2] < 1.6e6
     model = build(name=name, size="tiny")
     assert predict(model, batch_for(model, 1, model.least, model.least + 4)).flow.shape[-2:] == (

@@ -54,7 +54,7 @@ _PHOTOGRAPHS = (
 )
 
 
-def content_hash(*chunks: bytes) -> str:
+def content_hash(*chunks: bytes | memoryview) -> str:
     """Return 32 hex digits of the content's hash."""
     digest = hashlib.blake2b(digest_size=16)
     for chunk in chunks:

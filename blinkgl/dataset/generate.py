@@ -145,6 +145,9 @@ def generate_sequence(
                 else folder
                 for member in sequence.members
             }
+            if progress is not None:  # notes come before anything is drawn
+                report.count(sequence)
+                progress(report, 0.0)
             for member, item in sequence.by_sensor():
                 write_item(writers[member.name], member, item)
                 preview.take(member, item)

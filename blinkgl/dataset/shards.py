@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.errors import AssetError
+from blinkgl.io.atomic import atomic_folder, output_errors, refuse_existing
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
@@ -54,14 +54,13 @@ def export_shards(
     seed: int = 0,
     note: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[int]]:
-    """Write ``<out>/<split>-000000.tar`` …, each completely or not at all; return the samples per shard of each split.
+    """Write ``<out>/<split>-000000.tar`` …, all or none; return the samples per shard of each split.
 
     Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially.
     note : called with a line for each sequence that is left out. Raises
-    AssetError (no labels, a damaged sequence), OutputError (existing shards, disk full)."""
+    AssetError (no labels, a damaged sequence), OutputError (an existing folder, disk full)."""
     root, out = Path(root), Path(out)
-    if out.is_dir() and any(out.glob("*-*.tar")):
-        raise OutputError("holds shards", where=str(out), accepted="a new folder name")
+    refuse_existing(out)
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
     labels: dict[str, list[tuple[Path, int]]] = {}
@@ -75,9 +74,10 @@ def export_shards(
     if not any(labels.values()):
         raise AssetError("no flow labels found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
     written = {}
-    for split, entries in sorted(labels.items()):
-        order = np.random.default_rng(seed).permutation(len(entries))
-        written[split] = _write(out, split, (entries[i] for i in order), shard_bytes)
+    with atomic_folder(out) as folder:
+        for split, entries in sorted(labels.items()):
+            order = np.random.default_rng(seed).permutation(len(entries))
+            written[split] = _write(folder, split, (entries[i] for i in order), shard_bytes)
     return written
 
 
@@ -85,7 +85,8 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
     counts: list[int] = []
     pending = next(entries, None)
     while pending is not None:
-        with atomic_file(out / f"{split}-{len(counts):06d}.tar", overwrite=False) as path, output_errors(path):
+        path = out / f"{split}-{len(counts):06d}.tar"
+        with output_errors(path):
             counts.append(0)
             with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
                 while pending is not None and (counts[-1] == 0 or shard.offset < shard_bytes):

@@ -33,12 +33,15 @@ def output_errors(where: str | os.PathLike) -> Iterator[None]:
     :class:`OutputError` of one line."""
     try:
         yield
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
+        # HDF5 raises a RuntimeError where it closes a file.
+        if not isinstance(error, OSError) and "errno = " not in str(error):
+            raise
         raise OutputError(f"cannot write: {_reason(error)}", where=str(where)) from error
 
 
-def _reason(error: OSError) -> str:
-    code = error.errno
+def _reason(error: Exception) -> str:
+    code = getattr(error, "errno", None)
     if code is None and (number := re.search(r"errno = (\d+)", str(error))):
         code = int(number.group(1))
     # NumPy's tofile and HDF5 say it in words only.

@@ -337,7 +337,8 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray, codec: s
     """Write ``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A pinhole camera's is the identity;
     loaders such as E-RAFT's require the file. codec : "gzip", which h5py alone reads, or another, which is Blosc's
     zstd."""
-    with output_errors(path), h5py.File(path, "w") as file:
+    # Without a cache: HDF5 that meets a full disk as it closes ends the process.
+    with output_errors(path), h5py.File(path, "w", rdcc_nbytes=0) as file:
         packed = packing("gzip" if codec == "gzip" else "zstd", SHUFFLE)
         file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False, **packed)
 

@@ -13,14 +13,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from blinkgl.config.reader import to_yaml
-from blinkgl.io.atomic import output_errors
 from blinkgl.io.flow import encode_flow_npy
 from blinkgl.io.images import encode_npy
-from blinkgl.layouts.layout import BEFORE, Layout, Missing, append, forward_flow, growing, need, write_bytes
+from blinkgl.layouts.layout import BEFORE, Layout, Missing, append, forward_flow, growing, need, new_hdf5, write_bytes
 from blinkgl.layouts.source import Source
 
 
@@ -78,23 +76,21 @@ def _interval_us(source: Source) -> int:
 
 
 def _write_events(source: Source, path: Path) -> None:
-    with output_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5py.File(path, "w") as file:
-            columns = {
-                name: growing(file, f"events/{name}", dtype)
-                for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.uint64), ("p", np.uint8))
-            }
-            table, count, next_ms = growing(file, "ms_to_idx", np.uint64), 0, 0
-            for events in source.events():
-                t = events.t - source.start_us
-                for name, column in columns.items():
-                    append(column, t if name == "t" else getattr(events, name))
-                if len(t):
-                    # ms whose first event cannot come in a later chunk.
-                    settled = np.arange(next_ms, int(t[-1]) // 1000 + 1) * 1000
-                    append(table, count + np.searchsorted(t, settled, side="left"))
-                    count, next_ms = count + len(t), next_ms + len(settled)
-            # One entry past the last ms, which published files lack: their loader then cuts the last window short.
-            last_ms = -(-(source.end_us - source.start_us) // 1000)
-            append(table, np.full(max(0, last_ms + 1 - next_ms), count))
+    with new_hdf5(path) as file:
+        columns = {
+            name: growing(file, f"events/{name}", dtype)
+            for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.uint64), ("p", np.uint8))
+        }
+        table, count, next_ms = growing(file, "ms_to_idx", np.uint64), 0, 0
+        for events in source.events():
+            t = events.t - source.start_us
+            for name, column in columns.items():
+                append(column, t if name == "t" else getattr(events, name))
+            if len(t):
+                # ms whose first event cannot come in a later chunk.
+                settled = np.arange(next_ms, int(t[-1]) // 1000 + 1) * 1000
+                append(table, count + np.searchsorted(t, settled, side="left"))
+                count, next_ms = count + len(t), next_ms + len(settled)
+        # One entry past the last ms, which published files lack: their loader then cuts the last window short.
+        last_ms = -(-(source.end_us - source.start_us) // 1000)
+        append(table, np.full(max(0, last_ms + 1 - next_ms), count))

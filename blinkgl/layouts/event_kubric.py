@@ -12,13 +12,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from blinkgl.io.atomic import output_errors
 from blinkgl.io.images import encoded
 from blinkgl.io.tracks import TRACKS, read_tracks
-from blinkgl.layouts.layout import Layout, Missing, append, growing, images, write_bytes
+from blinkgl.layouts.layout import Layout, Missing, append, growing, images, new_hdf5, write_bytes
 from blinkgl.layouts.source import Source
 
 TIMES, SECONDS = 96, 2.0
@@ -48,7 +46,7 @@ class EventKubric(Layout):
     def write(self, source: Source, folder: Path) -> list[str]:
         start_us = source.image_times[0]
         self._write_annotations(source, folder)
-        with output_errors(folder), h5py.File(folder / "data.hdf5", "w") as file:
+        with new_hdf5(folder / "data.hdf5") as file:
             rgba = growing(file, "rgba", np.uint8, (source.height, source.width, 4), rows=1)
             for k in range(TIMES):
                 image = source.image(k)

@@ -15,14 +15,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from blinkgl.events.grids import voxel_grid
-from blinkgl.io.atomic import output_errors
 from blinkgl.io.images import encoded
 from blinkgl.layouts.frames import Frames, frames_of, picture, two_frames, write_frames
-from blinkgl.layouts.layout import GZIP, Layout, write_bytes, write_lines
+from blinkgl.layouts.layout import GZIP, Layout, keep, new_hdf5, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 from blinkgl.types.events import Events
 
@@ -46,9 +44,9 @@ class Intervals(Layout):
         write_lines(own / "images/timestamp.txt", frames.t_us.tolist())
         write_frames(source, frames, own)
         path = folder / f"{source.name}.h5"
-        with output_errors(path), h5py.File(path, "w") as grids:
+        with new_hdf5(path) as grids:
             for k, file in enumerate(frames.files):
-                grids.create_dataset(f"images/{k:06d}", data=_bgr(source, file), track_times=False, **GZIP)
+                keep(grids, f"images/{k:06d}", _bgr(source, file), **GZIP)
             for k, events in enumerate(between(source, frames)):
                 columns = {"x": events.x, "y": events.y, "t": events.t, "p": events.p}
                 write_bytes(own / f"events_aligned/{k:06d}.npz", encoded(np.savez_compressed, **columns))
@@ -58,7 +56,7 @@ class Intervals(Layout):
                 grid = normalised(_voxels(events, source))
                 # Backwards in time both the order and the polarities of events turn round.
                 for name, voxels in (("voxels_f", grid), ("voxels_b", -grid[::-1])):
-                    grids.create_dataset(f"{name}/{k:06d}", data=voxels, track_times=False, **GZIP)
+                    keep(grids, f"{name}/{k:06d}", voxels, **GZIP)
         width, height = _BS_ERGB_SIZE
         fits = source.width <= width and source.height <= height
         size = f"{source.width}x{source.height}"

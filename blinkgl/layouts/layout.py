@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import errno
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -99,6 +103,35 @@ def growing(
     return growing_dataset(file, name, (0, *shape), dtype, (rows, *shape), "gzip")
 
 
+_SPARE_BYTES = 1 << 24
+"""What HDF5 keeps in memory of a file: a megabyte of each data set, and its tables."""
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Give a new HDF5 file, for :func:`growing`, :func:`append` and :func:`keep`. Raises OutputError, also where less
+    than 16 MB would stay free."""
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _check_space(path.parent, 0)
+        with h5py.File(path, "w") as file:
+            yield file
+
+
+def _check_space(place: Path, size: int) -> None:
+    """Raise OSError where ``size`` bytes and what HDF5 has not yet written have no space: HDF5 that meets a full disk
+    leaves a damaged file without an error, or ends the process."""
+    if shutil.disk_usage(place).free < size + _SPARE_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def keep(file: h5py.File, name: str, array: np.ndarray, **packed: Any) -> None:
+    """Store a whole array. packed : as of :func:`~blinkgl.io.hdf5.packing`."""
+    _check_space(Path(file.filename), array.nbytes)
+    file.create_dataset(name, data=array, track_times=False, **packed)
+
+
 def append(data: h5py.Dataset, rows: np.ndarray) -> None:
     """Append ``rows``."""
+    _check_space(Path(data.file.filename), rows.nbytes)
     write_rows(data, len(data), rows)

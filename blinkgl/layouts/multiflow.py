@@ -14,12 +14,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from blinkgl.camera import PinHole
-from blinkgl.io.atomic import output_errors
-from blinkgl.layouts.layout import GZIP, Layout, append, growing, images, need, write_bytes
+from blinkgl.layouts.layout import GZIP, Layout, append, growing, images, keep, need, new_hdf5, write_bytes
 from blinkgl.layouts.source import Source
 
 LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000
@@ -99,22 +97,18 @@ def _clock_us(interval_ns: np.ndarray) -> list[int | None]:
 
 
 def _write_flow(flow: np.ndarray, path: Path) -> None:
-    with output_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5py.File(path, "w") as file:
-            file.create_dataset("flow", data=flow.astype(np.float32), track_times=False, **GZIP)
+    with new_hdf5(path) as file:
+        keep(file, "flow", flow.astype(np.float32), **GZIP)
 
 
 def _write_events(source: Source, label_us: int, path: Path) -> None:
     start = label_us - LABEL_US
-    with output_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5py.File(path, "w") as file:
-            columns = {
-                name: growing(file, name, dtype)
-                for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.uint8), ("t", np.int64))
-            }
-            for events in source.events():
-                part = events.window(start, start + END_US)
-                for name, column in columns.items():
-                    append(column, part.t - start if name == "t" else getattr(part, name))
+    with new_hdf5(path) as file:
+        columns = {
+            name: growing(file, name, dtype)
+            for name, dtype in (("x", np.uint16), ("y", np.uint16), ("p", np.uint8), ("t", np.int64))
+        }
+        for events in source.events():
+            part = events.window(start, start + END_US)
+            for name, column in columns.items():
+                append(column, part.t - start if name == "t" else getattr(part, name))

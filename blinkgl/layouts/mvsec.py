@@ -19,7 +19,7 @@ import numpy as np
 
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.imu import read_imu
-from blinkgl.layouts.layout import Layout, append, forward_flow, growing, images
+from blinkgl.layouts.layout import Layout, append, forward_flow, growing, images, keep, new_hdf5
 from blinkgl.layouts.source import Source
 
 _ALMOST_NOTHING = np.float32(1e-6)
@@ -40,7 +40,7 @@ class Mvsec(Layout):
         eyes = {"left": source, **({} if source.right is None else {"right": source.right})}
         for ending, write in (("data", _data), ("gt", _truth)):
             path = folder / f"{source.name}_{ending}.hdf5"
-            with output_errors(path), h5py.File(path, "w") as file:
+            with new_hdf5(path) as file:
                 for eye, one in eyes.items():
                     write(one, file, f"davis/{eye}")
         times, flow = np.array([a * 1e-6 for a, _ in source.flow_times("forward")]), _flow(source)
@@ -60,12 +60,12 @@ def _data(source: Source, file: h5py.File, group: str) -> None:
     pictures = growing(file, f"{group}/image_raw", np.uint8, (source.height, source.width), rows=1)
     for k in range(len(taken)):
         append(pictures, source.grey(k)[None])
-    _keep(file, f"{group}/image_raw_ts", taken * 1e-6)
-    _keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
+    keep(file, f"{group}/image_raw_ts", taken * 1e-6)
+    keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
     if source.unit is not None:
         imu = read_imu(source.unit)
-        _keep(file, f"{group}/imu", np.hstack([imu["acceleration"], imu["rate"]]))
-        _keep(file, f"{group}/imu_ts", imu["t_ns"] * 1e-9)
+        keep(file, f"{group}/imu", np.hstack([imu["acceleration"], imu["rate"]]))
+        keep(file, f"{group}/imu_ts", imu["t_ns"] * 1e-9)
 
 
 def _truth(source: Source, file: h5py.File, group: str) -> None:
@@ -76,13 +76,13 @@ def _truth(source: Source, file: h5py.File, group: str) -> None:
             for k in range(len(times)):
                 depth = source.value("depth", k)
                 append(maps, np.where(np.isfinite(depth), depth, np.float32(np.nan))[None])
-            _keep(file, f"{group}/{name}_ts", np.array([a * 1e-6 for a, _ in times]))
-    _keep(file, f"{group}/flow_dist", _flow(source))
-    _keep(file, f"{group}/flow_dist_ts", np.array([a * 1e-6 for a, _ in times]))
+            keep(file, f"{group}/{name}_ts", np.array([a * 1e-6 for a, _ in times]))
+    keep(file, f"{group}/flow_dist", _flow(source))
+    keep(file, f"{group}/flow_dist_ts", np.array([a * 1e-6 for a, _ in times]))
     if "T_world_cam" in source.poses:
         poses = source.poses["T_world_cam"]
-        _keep(file, f"{group}/pose", np.linalg.inv(poses[0]) @ poses)  # of the camera, in its first one's axes
-        _keep(file, f"{group}/pose_ts", source.poses["t_ns"] * 1e-9)
+        keep(file, f"{group}/pose", np.linalg.inv(poses[0]) @ poses)  # of the camera, in its first one's axes
+        keep(file, f"{group}/pose_ts", source.poses["t_ns"] * 1e-9)
 
 
 def _flow(source: Source) -> np.ndarray:
@@ -94,7 +94,3 @@ def _flow(source: Source) -> np.ndarray:
         flows[k, 0] = np.where(still, _ALMOST_NOTHING, np.where(valid, flow[..., 0], 0))
         flows[k, 1] = np.where(valid, flow[..., 1], 0)
     return flows
-
-
-def _keep(file: h5py.File, name: str, array: np.ndarray) -> None:
-    file.create_dataset(name, data=array, track_times=False)

@@ -23,6 +23,9 @@ from blinkgl.scene.worlds.from_file import scene_from_file
 from blinkgl.scene.worlds.pool import SPLITS
 from blinkgl.scene.worlds.random_world import pools, random_world
 
+_MANY_CHANGES = 10_000
+"""Of the light: a note says what they cost before anything is drawn."""
+
 
 def build_scene(
     config: SceneConfig,
@@ -57,8 +60,10 @@ def build_scene(
     return in_fog(scene, config)
 
 
-def _refuse_too_many_changes(scene: Scene) -> None:
-    seconds = (scene.t1_ns - scene.t0_ns) * 1e-9
+def _counted_changes(scene: Scene) -> Scene:
+    """Return the scene with a note where its light changes so often that this decides the number of frames. Raises
+    ConfigError: more than :data:`MAX_CHANGES` times."""
+    seconds, notes = (scene.t1_ns - scene.t0_ns) * 1e-9, scene.log
     for name, wave in scene.waveforms.items():
         if (changes := wave.per_second() * seconds) > MAX_CHANGES:
             raise ConfigError(
@@ -67,6 +72,9 @@ def _refuse_too_many_changes(scene: Scene) -> None:
                 value=f"{changes:.3g} times in {seconds:g} s",
                 accepted=f"at most {MAX_CHANGES:,} times: a lower frequency, or a shorter time",
             )
+        if changes > _MANY_CHANGES:
+            notes += (f"{name}: its light changes {changes:,.0f} times, and each change needs up to two frames",)
+    return replace(scene, log=notes)
 
 
 def in_fog(scene: Scene, config: SceneConfig) -> Scene:
@@ -95,7 +103,7 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
 
 def equipped(scene: Scene, config: SequenceConfig) -> Scene:
     """Return the scene with the sensors of the configuration, and a note on what its times leave out."""
-    _refuse_too_many_changes(scene)
+    scene = _counted_changes(scene)
     scene = replace(scene, omissions=scene.omissions + config.time.cut)
     if config.sensors is None:
         return scene

@@ -5,7 +5,6 @@ import itertools
 import json
 import os
 import signal
-import subprocess
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -135,36 +134,6 @@ def test_ctrl_c_stops_the_workers_and_leaves_only_whole_sequences(reference, tmp
     )
     outcome = run_dataset(load_run(recipe), out, resume=True)
     assert outcome.found == found.sequences
-    assert_same(out, reference)
-
-
-# ---- the disk ----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of a megabyte; sizes are changed by remounting."""
-    mount = tmp_path / "disk"
-    mount.mkdir()
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", mount], capture_output=True, text=True)
-    if made.returncode:
-        pytest.skip(f"this machine does not let tests mount a small disk: {made.stderr.strip()}")
-    yield mount
-    subprocess.run(["umount", mount], check=True)
-
-
-def test_full_disk_stops_the_run_and_a_larger_one_goes_on(reference, small_disk, tmp_path, capsys):
-    recipe, out = recipe_file(tmp_path), small_disk / "out"
-    # Small files take a page each.
-    pages = sum(-(-p.stat().st_size // 4096) for p in reference.rglob("*") if p.is_file())
-    # Four of six, two at work.
-    subprocess.run(["mount", "-o", f"remount,size={pages * 2 // 3 * 4096}", small_disk], check=True)
-    assert run(["generate", str(recipe), "--out", str(out), "--workers", "2", "--quiet"]) == 2
-    error = capsys.readouterr().err
-    assert "no space left" in error and "--resume" in error and error.count("\n") == 1
-    assert temporaries(out) == [] and 0 < sum((out / name).is_dir() for name in NAMES) < 6
-    subprocess.run(["mount", "-o", "remount,size=64m", small_disk], check=True)
-    assert run(["generate", str(recipe), "--out", str(out), "--resume", "--quiet"]) == 0
     assert_same(out, reference)
 
 

@@ -83,7 +83,7 @@ def test_bad_input(data, tmp_path):
     with pytest.raises(AssetError, match="no flow labels"):
         export_shards(tmp_path, tmp_path / "x")
     export_shards(data / "train", tmp_path / "a")
-    with pytest.raises(OutputError, match="holds shards"):
+    with pytest.raises(OutputError, match="output folder exists"):
         export_shards(data, tmp_path / "a")
 
 

@@ -205,6 +205,13 @@ def test_a_scene_in_python_has_the_same_limit():
         record(scene + Primitive("cuboid"), labels=[])
 
 
+def test_many_changes_are_said_before_anything_is_drawn(tmp_path):
+    """Two a period: up and down."""
+    scene = sequence_scene(config_of({"light": {"over_time": {**PWM, "frequency": 1e6}}}), 0)
+    seconds = (scene.t1_ns - scene.t0_ns) * 1e-9
+    assert f"light: its light changes {2e6 * seconds:,.0f} times" in " ".join(scene.log)
+
+
 @pytest.mark.parametrize(
     ("scene", "words"),
     [

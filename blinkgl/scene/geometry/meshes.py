@@ -69,14 +69,18 @@ def make_mesh(
         log.append(f"{label}: the texture coordinates are {wrong}, projected new ones")
         uvs = None
 
-    # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    if normals is None:
-        corner_normals = crease_normals(vertices, faces, weld(vertices, faces)[1], crease_degrees)
-    else:
-        corner_normals = normals[faces]
-    corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     corners = None if source is None else origin[faces]
-    mesh, first = _from_corners(vertices[faces], corner_normals, corner_uvs, corners, name=name)
+    # Attributes of corners, (F, 3, …), which become vertices; without names here, so that each is freed as soon as it
+    # can be.
+    mesh, first = _from_corners(
+        normals=crease_normals(vertices, faces, weld(vertices, faces)[1], crease_degrees)
+        if normals is None
+        else normals[faces],
+        uvs=box_project(vertices, faces, uv_size) if uvs is None else uvs[faces],
+        positions=vertices[faces],
+        origin=corners,
+        name=name,
+    )
     if source is not None and corners is not None:
         source.append(corners.ravel()[first])
     return mesh
@@ -262,12 +266,25 @@ def crease_normals(
     """Return (F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point
     that are joined by edges bent less than ``crease_degrees``; with (F,) ``groups`` instead by edges between two faces
     of one smoothing group, 0: of none."""
-    cross = _face_cross(vertices, faces)
-    unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
+    unit = _face_cross(vertices, faces)
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-300)
+    fan = _fans(welded, unit, crease_degrees, groups)
     angle = corner_angles(vertices[faces])
+    # Sums over the corners of each fan, given back to every corner of it.
+    weighted = ((unit[:, i, None] * angle).ravel() for i in range(3))
+    total = np.stack([np.bincount(fan, weights=w, minlength=fan.max() + 1) for w in weighted], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    total /= np.maximum(length, 1e-300)
+    made = total[fan]
+    flat = np.flatnonzero(~(length[fan, 0] > 1e-9))
+    made[flat] = unit[flat // 3]
+    return made.reshape(len(faces), 3, 3)
 
+
+def _fans(welded: np.ndarray, unit: np.ndarray, crease_degrees: float, groups: np.ndarray | None) -> np.ndarray:
+    """Return (3 F,) int32, the number of the fan that each corner belongs to; ``unit`` are the (F, 3) normals of faces,
+    the other arguments those of :func:`crease_normals`."""
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
-    count = len(faces)
     a, b = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
     edge = np.minimum(a, b) * (welded.max() + 1) + np.maximum(a, b)
     # The sort makes equal edges neighbours; of more than two at one edge each is paired with the next.
@@ -285,15 +302,7 @@ def crease_normals(
     direct = a[first] == a[second]
     left = np.concatenate([first, f_next])
     right = np.concatenate([np.where(direct, second, s_next), np.where(direct, s_next, second)])
-    _, fan = _components(left, right, 3 * count)
-    # Sums over the corners of each fan, given back to every corner of it.
-    weighted = ((unit[:, i, None] * angle).ravel() for i in range(3))
-    total = np.stack([np.bincount(fan, weights=w, minlength=fan.max() + 1) for w in weighted], axis=1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    made = (total / np.maximum(length, 1e-300))[fan]
-    flat = np.flatnonzero(~(length[fan, 0] > 1e-9))
-    made[flat] = unit[flat // 3]
-    return made.reshape(count, 3, 3)
+    return _components(left, right, len(a))[1]
 
 
 # Seen from outside, with z (for ±z: y) up: (axis, sign) -> the axis and sign that point right, the axis that points up.

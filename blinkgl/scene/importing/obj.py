@@ -74,6 +74,12 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
 
     max_texture : None leaves materials out. Raises AssetError with file and line: indices that do not exist,
     coordinates that are not numbers, too many faces."""
+    polygons, materials = _polygons(data, near, max_texture)
+    return raw_meshes(polygons, materials, max_faces, str(near.path), near.log)
+
+
+def _polygons(data: bytes, near: Neighbours, max_texture: int | None) -> tuple[Polygons, list[Material | None]]:
+    """Return the polygons of an OBJ file, and their materials by their numbers."""
     path, log, where = near.path, near.log, str(near.path)
     statements = _statements(data, where, near.omissions)
     # Four numbers a face, as _statements appends them; ``sizes`` are the corners of each face.
@@ -94,7 +100,8 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
             raise _beyond(index[wrong[0], k] + 1, len(table) - 1, f"{where}, line {line}")
     vertices, coordinates, directions = tables
     uvs, normals = (None if len(table) == 1 else table[index[:, k]] for k, table in ((1, coordinates), (2, directions)))
-    at, materials, colours = index[:, 0].copy(), [None], None
+    at, colours = index[:, 0].copy(), None
+    materials: list[Material | None] = [None]
     del index
     if max_texture is not None:
         worn = _materials(data, near, statements.materials, max_texture)
@@ -122,7 +129,7 @@ def read_obj(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
         smoothing=groups,
         lines=lines,
     )
-    return raw_meshes(polygons, materials, max_faces, where, log)
+    return polygons, materials
 
 
 def _rows(values: array, counts: array, width: int) -> np.ndarray:

@@ -110,7 +110,7 @@ def part_of(
         return mesh, origin[0] if origin else None, lines
 
     arrays = (np.zeros(0) if a is None else a for a in (raw.vertices, raw.faces, raw.normals, raw.uvs))
-    key = content_hash(*(np.ascontiguousarray(a).tobytes() for a in arrays)), indexed, *options.values()
+    key = content_hash(*(np.ascontiguousarray(a).data for a in arrays)), indexed, *options.values()
     mesh, index, lines = RECENT.get(key, make, lambda made: 2 * made[0].vertices.nbytes)
     log += lines
     mesh = replace(mesh, source_hash=source_hash)

@@ -59,16 +59,19 @@ def raw_meshes(
     if repeated or lost:
         log.append(f"{Path(where).stem}: {repeated} repeated corners and {lost} faces of fewer than three left out")
     at = given.places[triangles]
-    normals = np.zeros((len(triangles), 3, 3)) if given.normals is None else given.normals[triangles]
-    missing = ~(np.linalg.norm(normals, axis=2) > 0)  # NaN compares false
+    normals = None if given.normals is None else given.normals[triangles]
+    # NaN compares false.
+    missing = np.ones(at.shape, bool) if normals is None else ~(np.linalg.norm(normals, axis=2) > 0)
     if missing.any():
         groups = None if given.smoothing is None else given.smoothing[owner]
         used = np.zeros(len(given.points), bool)  # a point that no face has may lie anywhere
         used[at] = True
         points, inner = given.points[used], (np.cumsum(used) - 1)[at]
         welded = weld(points, inner)[1] if groups is None else inner
-        normals = np.where(missing[..., None], crease_normals(points, inner, welded, groups=groups), normals)
-        del inner, welded, points
+        made = crease_normals(points, inner, welded, groups=groups)
+        normals = made if normals is None else np.where(missing[..., None], made, normals)
+        del inner, welded, points, made
+    assert normals is not None
     # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
     a, b, c = (given.points[at[:, k]] for k in range(3))
     behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0

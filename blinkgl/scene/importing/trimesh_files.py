@@ -8,7 +8,6 @@ import re
 import zipfile
 from array import array
 from collections.abc import Sequence
-from itertools import islice, takewhile
 
 import numpy as np
 import trimesh
@@ -29,7 +28,7 @@ def read_meshes(data: bytes, near: Neighbours, max_faces: int, max_texture: int 
     where, kind = str(near.path), near.path.suffix.lower()[1:]
     check_kind(data, max_faces, where)
     if kind == "off":
-        return _off(data, max_faces, max_texture is not None, near)
+        return raw_meshes(_off(data, max_texture is not None, near), [None], max_faces, where, near.log)
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     raws = []
     for node in loaded.graph.nodes_geometry:
@@ -99,34 +98,44 @@ def off_counts(data: bytes, where: str) -> tuple[str, int, int, str]:
     return head[1].upper() if head else "", int(counts[1]), int(counts[2]), text[begin + counts.end() :]
 
 
-def _off(data: bytes, max_faces: int, wanted: bool, near: Neighbours) -> list[RawMesh]:
-    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces.
-    Numbers stand in free form; only the end of a line ends the colour of a face."""
-    where = str(near.path)
-    kind, number, count, text = off_counts(data, where)
+def _off(data: bytes, wanted: bool, near: Neighbours) -> Polygons:
+    """Return the polygons of an OFF file (Geomview), which trimesh would fan, with the colours of vertices or faces if
+    they are ``wanted``. Numbers stand in free form; only the end of a line ends the colour of a face."""
+    kind, number, count, text = off_counts(data, str(near.path))
     # The numbers of a vertex: x y z, normal, colour, texture coordinates. A colour may lack its opacity.
     first, width = (6 if "N" in kind else 3), 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
     tints = 0 if "C" not in kind else 3 if len(text.lstrip().split("\n")[0].split()) == width + 3 else 4
-    stream = (match[0] for match in re.finditer(r"\n|[^\s]+", text + "\n"))
-    words = (word for word in stream if word != "\n")
-    rows = [list(islice(words, width + tints)) for _ in range(number)]
+    lines, words = (match[0] for match in re.finditer(r"[^\n]+", text)), []
+
+    def take(size: int) -> list[str]:
+        """Take the next ``size`` words, on as many lines as they need; fewer where the file ends."""
+        while len(words) < size and (line := next(lines, None)) is not None:
+            words.extend(line.split())
+        taken, words[:size] = words[:size], ()
+        return taken
+
+    rows = take(number * (width + tints))
     sizes, places, specs = array("q"), array("q"), []
     for _ in range(count):
-        sizes.append(int(next(words, "-1")))
-        places.extend(map(int, islice(words, max(sizes[-1], 0))))
-        specs.append(tuple(takewhile(lambda word: word != "\n", stream)))
-    if any(len(row) < width + tints for row in rows[-1:]) or sum(map(abs, sizes)) != len(places):
-        raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=where)
+        size = int(word) if (word := "".join(take(1))) else -1
+        corners = take(max(size, 0))
+        sizes.append(size)
+        places.extend(map(int, corners))
+        specs.append(tuple(words))  # what is left of the line
+        words.clear()
+    if len(rows) < number * (width + tints) or sum(map(abs, sizes)) != len(places):
+        raise AssetError(f"the mesh is truncated: {number} vertices and {count} faces", where=str(near.path))
     points = np.array(rows, np.float64).reshape(number, width + tints)
     polygons = Polygons(points[:, :3], np.array(places, np.int64), np.array(sizes, np.int64))
     corner = polygons.places.clip(0, max(number - 1, 0))
     polygons.normals = points[corner, 3:6] if "N" in kind else None
     polygons.uvs = points[corner, -2:] if "ST" in kind else None
     if wanted and tints:
-        polygons.colours = _off_colours([row[first : first + tints] for row in rows], near)[corner]
+        own = [rows[k + first : k + first + tints] for k in range(0, len(rows), width + tints)]
+        polygons.colours = _off_colours(own, near)[corner]
     elif wanted and any(specs):
         polygons.colours = np.repeat(_off_colours(specs, near), polygons.sizes, axis=0)
-    return raw_meshes(polygons, [None], max_faces, where, near.log)
+    return polygons
 
 
 def _off_colours(specs: Sequence[Sequence[str]], near: Neighbours) -> np.ndarray:

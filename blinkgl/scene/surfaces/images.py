@@ -12,6 +12,7 @@ import io
 import math
 import re
 import struct
+import zlib
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,6 +23,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from blinkgl.errors import AssetError
+from blinkgl.io.images import png_chunks
 from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, LUMA, to_srgb8
 
@@ -54,7 +56,7 @@ _PHOTOGRAPHS = (
 )
 
 
-def content_hash(*chunks: bytes) -> str:
+def content_hash(*chunks: bytes | memoryview) -> str:
     """Return 32 hex digits of the content's hash."""
     digest = hashlib.blake2b(digest_size=16)
     for chunk in chunks:
@@ -154,6 +156,10 @@ def _decode_ldr(data: bytes, where: str, gamma: bool = False) -> np.ndarray:
     with _open(data, where) as image:
         _check_size(*image.size, where)
         image.load()
+        if _is_short(data, image):
+            accepted = "a file with all the pixels that its header states"
+            value = "{}x{}".format(*image.size)
+            raise AssetError("the image is truncated or has another size", where=where, value=value, accepted=accepted)
         ImageOps.exif_transpose(image, in_place=True)
         if image.mode.startswith("I") or image.mode == "F":
             return _codes(image.info if gamma else {})[_sixteen_bits(np.asarray(image), where)]
@@ -163,6 +169,24 @@ def _decode_ldr(data: bytes, where: str, gamma: bool = False) -> np.ndarray:
             block = image.crop((0, rows.start, width, rows.stop))
             pixels[rows] = np.asarray(block if block.mode == "RGB" else block.convert("RGB"))
         return _codes(image.info)[pixels] if gamma and "gamma" in image.info else pixels
+
+
+def _is_short(data: bytes, image: Image.Image) -> bool:
+    """Return whether a PNG or JPEG file ends before its last pixel; Pillow leaves the rest black or grey in silence."""
+    width, height = image.size
+    if image.format == "JPEG":
+        # Each block of 8x8 px has a bit at least: the shortest code of Huffman's (ITU-T T.81, F.1.2).
+        return width * height > 64 * 8 * len(data)
+    bottom = image.crop((0, height - 1, width, height)) if image.format == "PNG" else None
+    if bottom is None or np.asarray(bottom).any():
+        return False
+    # Bits of a sample; samples of a pixel by IHDR's type of colour: grey, RGB, palette, grey and RGB with alpha.
+    bits = data[24] * {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[data[25]]
+    # A byte before each row names its filter; interlaced files have more rows.
+    unpacker, left = zlib.decompressobj(), height * (1 + math.ceil(width * bits / 8))
+    for _, kind, body in png_chunks(data):
+        left -= len(unpacker.decompress(body)) if kind == b"IDAT" else 0
+    return left > 0
 
 
 def _codes(info: Mapping[Any, Any]) -> np.ndarray:

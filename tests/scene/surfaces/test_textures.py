@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -133,11 +135,58 @@ def test_bad_images_are_named(tmp_path, data, problem, capfd):
     assert str(error.value).startswith(str(path)) and problem in str(error.value) and "\n" not in str(error.value)
 
 
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+
+
+def png_of(width: int, height: int, rows: int, colour: int = 2, bits: int = 8, value: int = 0) -> bytes:
+    """A PNG whose header states ``height`` rows and which has ``rows``, in chunks of 100 bytes."""
+    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour]
+    packed = zlib.compress((b"\0" + bytes([value]) * -(-width * channels * bits // 8)) * rows)
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([bits, colour, 0, 0, 0])
+    palette = chunk(b"PLTE", bytes(6)) if colour == 3 else b""
+    parts = b"".join(chunk(b"IDAT", packed[k : k + 100]) for k in range(0, len(packed), 100))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + palette + parts + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("colour, bits", [(0, 1), (0, 8), (0, 16), (2, 8), (2, 16), (3, 1), (3, 4), (4, 8), (6, 8)])
+@pytest.mark.parametrize("value", [0, 255])
+def test_a_png_has_the_rows_that_it_states(tmp_path, colour, bits, value):
+    for rows in (37, 36, 1):
+        (tmp_path / "a.png").write_bytes(png_of(53, 37, rows, colour, bits, value if colour != 3 else 0))
+        if rows == 37:
+            assert I.load_image(tmp_path / "a.png").shape == (37, 53, 3)
+        else:
+            with pytest.raises(AssetError, match=r"truncated or has another size \(got '53x37'\)"):
+                I.load_image(tmp_path / "a.png")
+
+
+def test_8k_textures_of_another_size_than_they_state(tmp_path):
+    """One line each, whatever the format; a picture of one colour is packed as tightly as its format can."""
+    stream = io.BytesIO()
+    Image.new("RGB", (8192, 8192)).save(stream, "JPEG", optimize=True, quality=5)
+    assert I.decode_image(stream.getvalue(), 64, "a").shape == (64, 64, 3)
+    spoiled = {"a.png": png_of(8192, 8192, 16)}
+    for ending, kind, at, number in (
+        ("jpg", "JPEG", lambda data: data.index(b"\xff\xc0") + 5, ">HH"),
+        ("bmp", "BMP", lambda data: 18, "<ii"),
+        ("webp", "WEBP", lambda data: data.index(b"\x9d\x01\x2a") + 3, "<HH"),
+    ):
+        stream = io.BytesIO()
+        Image.new("RGB", (64, 64), (10, 20, 30)).save(stream, kind)
+        data = bytearray(stream.getvalue())
+        struct.pack_into(number, data, at(data), 8192, 8192)
+        spoiled[f"a.{ending}"] = bytes(data)
+    for name, data in spoiled.items():
+        with pytest.raises(AssetError) as error:
+            I.decode_image(data, 2048, name)
+        line = str(error.value)
+        assert line.startswith(f"{name}: the image is ") and "truncated" in line + "truncated" * (name == "a.webp")
+
+
 def test_a_huge_claim_is_refused_before_decoding(tmp_path):
     data = bytearray(png(format="PNG"))
     data[16:24] = (200_000).to_bytes(4, "big") * 2  # IHDR width and height
-    import zlib
-
     data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
     (tmp_path / "a.png").write_bytes(bytes(data))
     with pytest.raises(AssetError, match="too large|corrupt"):

@@ -177,6 +177,23 @@ def test_colours_of_obj(folder, rows, expected, words):
     assert words in said(asset)
 
 
+@pytest.mark.parametrize(
+    "code, expected, words",
+    [
+        ("204 51 26", linear(np.array([204, 51, 26]) / 255), "taken as parts of 255"),
+        ("-1 0.2 0.1", linear([0, 0.2, 0.1]), "colours down to -1 are drawn as 0"),
+        ("nan 0.2 0.1", (1, 1, 1), "1 of 1 colours are missing or NaN"),
+        ("1.2 0.5 0", linear([1, 0.5, 0]), "colours up to 1.2 are drawn as 1"),
+        ("0.8 0.2 0.1", linear(ORANGE), ""),
+    ],
+)
+def test_colours_of_mtl(folder, code, expected, words):
+    (folder / "m.mtl").write_text(f"newmtl m\nKd {code}\n")
+    asset = load(folder, "a.obj", f"mtllib m.mtl\n{SQUARE}usemtl m\nf 1 2 3 4\n")
+    np.testing.assert_allclose(colours_of(asset), np.tile(expected, (6, 1)), atol=1e-6)
+    assert words in said(asset) and bool(words) == bool(said(asset))
+
+
 # ---- PLY
 TYPES = {"char": 127, "uchar": 255, "short": 255, "ushort": 65535, "int": 255, "uint": 255, "float": 1, "double": 1}
 
@@ -201,6 +218,13 @@ def test_colours_of_ply_of_every_type(folder, kind, element):
     asset = load(folder, "a.ply", text)
     np.testing.assert_allclose(colours_of(asset), np.tile(linear(codes / most), (6, 1)), atol=1e-6)
     assert ("taken as parts of 255" in said(asset)) == (kind not in ("uchar", "ushort", "float", "double"))
+
+
+def test_colours_of_vertices_and_faces_of_ply(folder):
+    names = "".join(f"property uchar {channel}\n" for channel in ("red", "green", "blue"))
+    asset = load(folder, "a.ply", ply(names, ["204 51 26"] * 4, face=names, tail="0 255 0"))
+    np.testing.assert_allclose(colours_of(asset), np.tile(linear(np.array([204, 51, 26]) / 255), (6, 1)), atol=1e-6)
+    assert "colours of faces, beside those of vertices" in said(asset)
 
 
 def test_float_colours_of_ply_up_to_255(folder):

@@ -23,7 +23,6 @@ from blinkgl.scene.importing.parts import INVISIBLE, RawMesh
 from blinkgl.scene.importing.polygons import Polygons, linear_colours, raw_meshes, texture_beside
 from blinkgl.scene.reading import Omissions, contents
 from blinkgl.scene.types import REPEAT, Material, Wrap
-from blinkgl.srgb import linear_from_srgb
 
 _WITHOUT_EFFECT = (
     "o g mg vp mtllib bevel c_interp d_interp lod maplib cstype deg bmat step parm trim hole scrv sp end con".split()
@@ -333,7 +332,7 @@ def _surface(
         near.omissions.add(f"the material '{name}' of opacity 0" if opacity <= 0 else _CLEAR)
     if opacity <= 0:
         return INVISIBLE, scale, offset
-    material = Material(base_color=_colour(*entries.get("kd", ("1", "", 0)), near.omissions))
+    material = Material(base_color=_colour(*entries.get("kd", ("1", "", 0)), near))
     if (entry := entries.get("map_kd", entries.get("map_ka"))) is not None:
         image, settings = _picture(entry, near)
         # -s is the scale and -o the offset; what they leave out keeps its default.
@@ -373,11 +372,11 @@ def _options(text: str, settings: dict[str, list[str]]) -> str:
     return text
 
 
-def _colour(rest: str, file: str, line: int, omissions: Omissions) -> tuple[float, float, float]:
+def _colour(rest: str, file: str, line: int, near: Neighbours) -> tuple[float, float, float]:
     """Return the linear colour of a Kd: an sRGB code, or one number for a grey."""
     if rest.startswith(("spectral", "xyz")):
-        omissions.add("colours given as a spectrum or as XYZ (drawn white)")
+        near.omissions.add("colours given as a spectrum or as XYZ (drawn white)")
         return 1.0, 1.0, 1.0
     code = _numbers(rest, 1, file, line)
-    r, g, b = linear_from_srgb(np.clip(np.nan_to_num(code[:3] if len(code) > 2 else code[:1] * 3), 0, 1)).tolist()
+    r, g, b = linear_colours(np.array([code[:3] if len(code) > 2 else code[:1] * 3], np.float64), near)[0].tolist()
     return r, g, b

@@ -66,6 +66,8 @@ def read_ply(data: bytes, near: Neighbours, max_faces: int, max_texture: int | N
         of_faces, of_vertices = _colours(face, near), _colours(vertex, near)
         polygons.colours = np.repeat(of_faces, sizes, axis=0) if of_faces is not None else None
         polygons.colours = of_vertices[inside] if of_vertices is not None else polygons.colours
+        if of_faces is not None and of_vertices is not None:
+            near.omissions.add("colours of faces, beside those of vertices")
         textures = [file for _, file in files_of_ply(data, near)]
         for file in textures if polygons.uvs is not None else ():
             texture = texture_beside(file, max_texture, near.omissions)

@@ -156,6 +156,8 @@ def linear_colours(
             near.log.append(f"{near.path.stem}: colours up to {largest:g} are taken as parts of {most:g}")
     if largest > most:
         near.log.append(f"{near.path.stem}: colours up to {largest:g} are drawn as {most:g}")
+    if (smallest := float(codes[~unknown].min(initial=0))) < 0:
+        near.log.append(f"{near.path.stem}: colours down to {smallest:g} are drawn as 0")
     if np.size(opacity) and float(np.min(opacity)) < (most if np.ndim(opacity) else 1):
         near.omissions.add(OPACITY)
     return linear_from_srgb(np.where(unknown.reshape(-1, 1), 1.0, codes / most).clip(0, 1))

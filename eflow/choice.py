@@ -11,7 +11,7 @@ from blinkgl.io.formats import EventFile
 from eflow import infer
 from eflow.cli_arguments import WindowsAsked
 from eflow.data.window import StreamWindow, hit_pixels
-from eflow.types import Flow, Mask
+from eflow.methods.dominant import dominant_motion
 
 AUTO = "auto"
 CAMERA, BODIES = "real_small", "real_bodies"
@@ -29,7 +29,7 @@ def chosen(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> 
     for pair in _pairs(file, asked, predictor):
         if len(pair.old) and len(pair.new):
             flow, _ = predictor(pair)
-            distances.append(from_affine(flow, hit_pixels((pair.old, pair.new), height, width)))
+            distances.append(dominant_motion(flow, hit_pixels((pair.old, pair.new), height, width))[1])
     if not distances:
         return CAMERA, f"{CAMERA}, since there is no pair of windows with events ({BODIES} needs two)"
     distance = float(np.median(distances))
@@ -48,17 +48,3 @@ def _pairs(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> 
     first, last = max(first, start or first), min(last, end or last)
     span = asked.span_us or infer.likely_span(file, predictor)[0]
     yield from infer.at_places(file, span, first, last)
-
-
-def from_affine(flow: Flow, hit: Mask) -> float:
-    """Return the mean distance of the flow (H, W, 2) px from the affine field nearest to most of it, at the pixels
-    ``hit`` (H, W), as a share of its mean length there."""
-    y, x = np.nonzero(hit)
-    basis = np.stack([np.ones(len(x)), x / flow.shape[1], y / flow.shape[0]], axis=1)
-    field, weight = flow[hit].astype(np.float64), np.ones(len(x))
-    for _ in range(8):  # least absolute distances, by reweighted least squares
-        root = np.sqrt(weight)[:, None]
-        fit = np.linalg.lstsq(basis * root, field * root, rcond=None)[0]
-        distance = np.hypot(*(field - basis @ fit).T)
-        weight = 1 / np.maximum(distance, 0.1)
-    return float(distance.mean() / max(np.hypot(*field.T).mean(), 1e-9))

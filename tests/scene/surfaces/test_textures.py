@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import tracemalloc
 import zlib
 
 import cv2
@@ -307,3 +308,18 @@ def test_shrinking_is_the_mean_of_the_area(size, most, dtype):
 def test_contents_and_not_their_pieces_are_hashed():
     assert I.content_hash(b"ab", b"c") == I.content_hash(b"abc") != I.content_hash(b"abd")
     assert len(I.content_hash(b"")) == 32
+
+
+def test_a_png_that_unpacks_to_more_than_it_states_takes_no_memory():
+    """Its last row is black, so that its length is asked for; 64 MB of zeros stand in 64 kB."""
+    chunk = lambda kind, body: struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 8, 8, 8, 2, 0, 0, 0))
+    data = b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(1 << 26))) + chunk(b"IEND", b"")
+    tracemalloc.start()
+    try:
+        I.decode_image(data, None, "bomb.png")
+    except AssetError:  # libpng may refuse what is too much, too
+        pass
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 24

@@ -176,6 +176,30 @@ def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
     return outcome
 
 
+def _after_failure(message: Message, name: str, attempt: int, folder: RunFolder, outcome: Outcome) -> int | None:
+    """Note that an attempt at a sequence failed, and return the number of the next one; None: there is none.
+
+    Raises :class:`OutputError` if nothing else can be made either."""
+    outcome.surprises += not message.get("expected", False)
+    folder.log(name, f"attempt {attempt} failed: {message['error']}")
+    if folder.state(name) == "":  # the worker died between the rename and the message
+        outcome.found += 1
+        return None
+    if message["stop"]:
+        raise OutputError(
+            f"{message['error']}; the run has stopped with {outcome.found + len(outcome.made)} of {outcome.planned} "
+            "sequences whole",
+            accepted="run again with --resume when that is mended",
+        )
+    if message.get("lost"):  # not the sequence's fault: a whole machine was lost
+        return attempt
+    if attempt >= ATTEMPTS or message["final"]:
+        outcome.set_aside[name] = message["error"]
+        message["given_up"] = True
+        return None
+    return attempt + 1
+
+
 def _loop(
     plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener | None
 ) -> None:
@@ -213,23 +237,9 @@ def _loop(
                 folder.add_cost(task, message, attempt)
             elif message["kind"] == "failed":
                 attempt, _ = running.pop(number)
-                outcome.surprises += not message.get("expected", False)
-                folder.log(task.name, f"attempt {attempt} failed: {message['error']}")
-                if folder.state(task.name) == "":  # the worker died between the rename and the message
-                    outcome.found += 1
-                elif message["stop"]:
-                    raise OutputError(
-                        f"{message['error']}; the run has stopped with {outcome.found + len(outcome.made)} of "
-                        f"{outcome.planned} sequences whole",
-                        accepted="run again with --resume when that is mended",
-                    )
-                elif message.get("lost"):  # not the sequence's fault: a whole machine was lost
-                    again.append((number, attempt))
-                elif attempt >= ATTEMPTS or message["final"]:
-                    outcome.set_aside[task.name] = message["error"]
-                    message["given_up"] = True
-                else:
-                    again.append((number, attempt + 1))
+                next_attempt = _after_failure(message, task.name, attempt, folder, outcome)
+                if next_attempt:
+                    again.append((number, next_attempt))
             tell(message)
         folder.check_in_place()
         if time_limit_s > 0:

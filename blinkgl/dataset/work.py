@@ -154,25 +154,7 @@ class Maker:
         task = self.plan.tasks[number]
         log = SequenceLog(self.job.out, task.name)
         log.write(f"attempt {attempt}, pid {os.getpid()} on {platform.node()}")
-        last, cpu = 0.0, time.process_time()
-
-        def progress(report: SequenceReport, fraction: float) -> None:
-            nonlocal last
-            # There are hundreds of frames per second, and each message is a line of JSON through a pipe.
-            if (now := time.monotonic()) - last > _NEWS_EVERY_S:
-                last = now
-                tell(
-                    {
-                        "kind": "progress",
-                        "task": number,
-                        "frames": report.frames,
-                        "events": report.events,
-                        "fraction": fraction,
-                        "seconds": dict(report.seconds),
-                        "notes": list(report.notes),
-                    }
-                )
-
+        cpu = time.process_time()
         try:
             # A lost context fails its sequence; the next attempt begins with a new one.
             self.renew()
@@ -184,7 +166,7 @@ class Maker:
                     self.job.out,
                     self.gl,
                     base=Path(self.job.base),
-                    progress=progress,
+                    progress=_progress(number, tell),
                 )
         except (KeyboardInterrupt, SystemExit):
             log.write("interrupted")
@@ -217,6 +199,22 @@ class Maker:
         if self.gl is not None:
             self.gl.release()
             self.gl = None
+
+
+def _progress(number: int, tell: Callable[[Message], None]) -> Callable[[SequenceReport, float], None]:
+    """Return the listener that tells how far a sequence is."""
+    last = 0.0
+
+    def progress(report: SequenceReport, fraction: float) -> None:
+        nonlocal last
+        # There are hundreds of frames per second, and each message is a line of JSON through a pipe.
+        if (now := time.monotonic()) - last > _NEWS_EVERY_S:
+            last = now
+            seconds, notes = dict(report.seconds), list(report.notes)
+            made = {"frames": report.frames, "events": report.events, "fraction": fraction}
+            tell({"kind": "progress", "task": number, **made, "seconds": seconds, "notes": notes})
+
+    return progress
 
 
 def failed(number: int, error: Exception) -> Message:

@@ -106,6 +106,15 @@ def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
     return (quotient << 20) + ((rest << 20) + part * low) // whole
 
 
+@register_jitable
+def _jittered(pixel, passed, on, off, v):
+    """Return the thresholds after the level number ``passed``: they are drawn once per level and do not depend on the
+    frame times."""
+    a, b = normal2(v.seed, np.uint64(pixel), _JITTER, np.uint64(passed))
+    up = max(v.floor_on, on + np.int64(np.floor(v.jitter * a + 0.5)))
+    return up, max(v.floor_off, off + np.int64(np.floor(v.jitter * b + 0.5)))
+
+
 @kernel(error_model="numpy")
 def _emit_block(active, first, now, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
@@ -158,12 +167,8 @@ def _emit_block(active, first, now, p, v, cap, packed, begin):
                 else:
                     cut += 1
             if p.fired.size:
-                # The next thresholds, drawn once per level and numbered by the levels passed, so that they do not
-                # depend on the frame times.
                 p.fired[i] += 1
-                a, b = normal2(v.seed, np.uint64(i), _JITTER, np.uint64(p.fired[i]))
-                up = max(v.floor_on, step_on + np.int64(np.floor(v.jitter * a + 0.5)))
-                down = max(v.floor_off, step_off + np.int64(np.floor(v.jitter * b + 0.5)))
+                up, down = _jittered(i, p.fired[i], step_on, step_off, v)
                 step = down + polarity * (up - down)
             gap -= step
         # The last level passed is the new reference.

@@ -36,15 +36,14 @@ from blinkgl.events.table import register
 from blinkgl.events.thresholds import pixel_thresholds
 from blinkgl.events.v2e_blocks import (
     DRAWS,
-    End,
     add_scaled_block,
-    emit,
     flag_block,
     lin_log_block,
     noise_block,
     relax_block,
     shot_block,
 )
+from blinkgl.events.v2e_events import End, emit
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,

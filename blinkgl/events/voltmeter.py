@@ -198,6 +198,17 @@ def _end_of_part(side, distance, mean, noise, seed, pixel, draw):
             return max(min(end, NEAREST), -NEAREST), draw
 
 
+class _State(NamedTuple):
+    """A pixel at a time in the interval."""
+
+    t_us: float  # from the interval's start
+    voltage: float
+    variance: float  # unspent, see the module
+    since_us: float  # when V's parts were last known, and what they were
+    light: float
+    leak: float
+
+
 @kernel(error_model="numpy")
 def _emit_block(active, first, end, p, v, cap, packed, begin):
     """Write the events of the listed pixels of one block to ``packed[begin:]``, in raster order, and move their
@@ -206,100 +217,111 @@ def _emit_block(active, first, end, p, v, cap, packed, begin):
     Returns (end of the events, events cut)."""
     out, cut = begin, 0
     dt_us = v.dt_ns * 1e-3
-    start_ns = v.t0_ns - 1000 * v.base_us
     # The listed pixels are in raster order: the row is counted along. ``row_end``: first pixel behind
     # row y.
     y = first // v.width
     row_end = (y + 1) * v.width
     v_end, unspent_end, light_end, leak_end = end.v, end.unspent, end.light, end.leak
+    explained = p.by_light.size > 0
     for j in range(active.size):
         i = np.int64(active[j])
         while i >= row_end:
             y += 1
             row_end += v.width
-        # The packed word (packing.py) without time and polarity.
-        pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(end.intensity[i - first]), dt_us, v)
-        voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
-        t_us = 0.0
-        if p.release.size and p.release[i] != NEVER_NS:
-            # Dead until the interval's end: nothing fires, and V keeps the mark.
-            if p.release[i] > v.t0_ns + v.dt_ns:
-                v_end[i - first], unspent_end[i - first] = IN_DEAD_TIME, _ZERO
-                if p.by_light.size:
-                    light_end[i - first] = leak_end[i - first] = _ZERO
-                continue
+        o = i - first
+        # Dead until the interval's end: nothing fires, and V keeps the mark.
+        waiting = p.release.size > 0 and p.release[i] != NEVER_NS
+        if waiting and p.release[i] > v.t0_ns + v.dt_ns:
+            v_end[o], unspent_end[o] = IN_DEAD_TIME, _ZERO
+            if explained:
+                light_end[o] = leak_end[o] = _ZERO
+            continue
+        light, leak = (np.float64(p.by_light[i]), np.float64(p.by_leak[i])) if explained else (0.0, 0.0)
+        state = _State(0.0, p.v[i] / V_ONE, np.float64(p.unspent[i]), 0.0, light, leak)
+        if waiting:
             # Released within the interval: V is known to be 0 at that time.
-            t_us, voltage, variance = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0, 0.0
+            t_us = max(p.release[i] - v.t0_ns, 0) * 1e-3
+            state = _State(t_us, 0.0, 0.0, t_us, light, leak)
             p.release[i] = NEVER_NS
-        # V's parts by light and leak when it was last known, and that time.
-        since_us, light, leak = t_us, 0.0, 0.0
-        if p.by_light.size:
-            light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
-        emitted, dead = 0, False
-        # The first block of random numbers: V at the interval's start, the time of the first event, which of its two
-        # roots. One more for each event that follows, and for each end that is drawn.
-        # 20 bits for the draws within a step, so that no two steps share a number.
-        draw = np.uint64(v.step) << _U20
-        last = draw + _MAX_DRAWS
-        past, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
-        unused = True
-        if variance > 0.0:
-            # Spends the variance: V at the interval's start is drawn around its mean.
-            voltage = max(min(voltage + np.sqrt(variance) * past, NEAREST), -NEAREST)
-            variance = 0.0
-        # One turn per part of the interval, at most one event in each, until no threshold is in reach.
-        while t_us < dt_us:
-            left_us = dt_us - t_us
-            part_us, side = reach_of_part(voltage, mu, sigma, left_us)
-            # No threshold is reachable in the rest: nothing is drawn, the variance stays unspent.
-            if side == 0 and part_us == left_us:
-                voltage += mu * left_us
-                variance = sigma * sigma * left_us
-                break
-            if not unused:
-                draw += _U1
-                _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
-            unused = False
-            distance = 1.0 - side * voltage
-            after_us = _passage(side, distance, side * mu, sigma, normal, uniform)
-            if after_us <= part_us:
-                t_us += after_us
-                event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
-                voltage = 0.0
-                # An event resets V to 0, and the rest of the interval continues from there.
-                if emitted == cap or draw >= last:  # too many to draw them all: count the expected number
-                    cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
-                    break
-                word = pixel | np.int64(side > 0)
-                if p.by_light.size:
-                    word |= cause_at(side, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
-                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
-                out += 1
-                emitted += 1
-                if p.release.size:
-                    # Dead beyond the interval's end, or V restarts from 0 within it.
-                    release_ns = event_ns + v.refractory_ns
-                    if release_ns > v.dt_ns:
-                        p.release[i] = v.t0_ns + release_ns
-                        dead = True
-                        break
-                    t_us = release_ns * 1e-3
-                since_us, light, leak = t_us, 0.0, 0.0
-            else:
-                # Not met in this part.
-                mean, noise = voltage + mu * part_us, sigma * np.sqrt(part_us)
-                voltage, draw = _end_of_part(side, distance, mean, noise, v.seed, np.uint64(i), draw)
-                t_us += part_us
-                if part_us == left_us or draw >= last:
-                    break
-        v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
-        if p.by_light.size:
-            rest_us = 0.0 if dead else dt_us - since_us
-            light_end[i - first] = np.float32(0.0 if dead else light + (mu - leak_rate) * rest_us)
-            leak_end[i - first] = np.float32(0.0 if dead else leak + leak_rate * rest_us)
-        unspent_end[i - first] = _ZERO if dead else np.float32(variance)
+        moved = rates(np.float64(p.intensity[i]), np.float64(end.intensity[o]), dt_us, v)
+        # The packed word (packing.py) without time and polarity.
+        word = (y << 17) | ((i - row_end + v.width) << 1)
+        state, release_ns, out, cut_here = _emit_pixel(i, word, state, moved, v, explained, cap, packed, out)
+        cut += cut_here
+        dead = release_ns != NEVER_NS
+        if dead:
+            p.release[i] = v.t0_ns + release_ns
+        v_end[o] = IN_DEAD_TIME if dead else np.int32(state.voltage * V_ONE)
+        if explained:
+            mu, leak_rate, _ = moved
+            rest_us = 0.0 if dead else dt_us - state.since_us
+            light_end[o] = np.float32(0.0 if dead else state.light + (mu - leak_rate) * rest_us)
+            leak_end[o] = np.float32(0.0 if dead else state.leak + leak_rate * rest_us)
+        unspent_end[o] = _ZERO if dead else np.float32(state.variance)
     return out, cut
+
+
+@register_jitable
+def _emit_pixel(i, pixel_word, state, moved, v, explained, cap, packed, out):
+    """Write the events of pixel ``i`` to ``packed[out:]``, at most ``cap``. moved : mu, its leak part and sigma, see
+    :func:`rates`. Return (state at the end, end of its dead time beyond the interval, ns from the interval's start, or
+    NEVER_NS, end of the events, events cut)."""
+    mu, leak_rate, sigma = moved
+    t_us, voltage, variance, since_us, light, leak = state
+    dt_us, start_ns = v.dt_ns * 1e-3, v.t0_ns - 1000 * v.base_us
+    emitted, cut, release_ns = 0, 0, np.int64(NEVER_NS)
+    # The first block of random numbers: V at the interval's start, the time of the first event, which of its two roots.
+    # One more for each event that follows, and for each end that is drawn. 20 bits count them within a step.
+    draw = np.uint64(v.step) << _U20
+    last = draw + _MAX_DRAWS
+    past, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+    unused = True
+    if variance > 0.0:
+        # Spends the variance: V at the interval's start is drawn around its mean.
+        voltage, variance = max(min(voltage + np.sqrt(variance) * past, NEAREST), -NEAREST), 0.0
+    # One turn per part of the interval, at most one event in each, until no threshold is in reach.
+    while t_us < dt_us:
+        left_us = dt_us - t_us
+        part_us, side = reach_of_part(voltage, mu, sigma, left_us)
+        # No threshold is reachable in the rest: nothing is drawn, the variance stays unspent.
+        if side == 0 and part_us == left_us:
+            voltage += mu * left_us
+            variance = sigma * sigma * left_us
+            break
+        if not unused:
+            draw += _U1
+            _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+        unused = False
+        distance = 1.0 - side * voltage
+        after_us = _passage(side, distance, side * mu, sigma, normal, uniform)
+        if not after_us <= part_us:
+            # Not met in this part.
+            mean, noise = voltage + mu * part_us, sigma * np.sqrt(part_us)
+            voltage, draw = _end_of_part(side, distance, mean, noise, v.seed, np.uint64(i), draw)
+            t_us += part_us
+            if part_us == left_us or draw >= last:
+                break
+            continue
+        # An event resets V to 0, and the rest of the interval continues from there.
+        t_us += after_us
+        event_ns, voltage = min(np.int64(t_us * 1e3), v.dt_ns), 0.0
+        if emitted == cap or draw >= last:  # too many to draw them all: count the expected number
+            cut = 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
+            break
+        word = pixel_word | np.int64(side > 0)
+        if explained:
+            word |= cause_at(side, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
+        packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
+        out += 1
+        emitted += 1
+        if v.refractory_ns > 0:
+            # Dead beyond the interval's end, or V restarts from 0 within it.
+            if event_ns + v.refractory_ns > v.dt_ns:
+                release_ns = event_ns + v.refractory_ns
+                break
+            t_us = (event_ns + v.refractory_ns) * 1e-3
+        since_us, light, leak = t_us, 0.0, 0.0
+    return _State(t_us, voltage, variance, since_us, light, leak), release_ns, out, cut
 
 
 @register_jitable(inline="always")

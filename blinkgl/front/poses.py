@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.config.base import Config, placed
-from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, check_rigid, rigid_matrix
+from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig, check_rigid, rigid_matrix
 from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
@@ -152,6 +152,7 @@ class Keyframes(Piece):
         return cls(dict(zip(times.tolist(), made, strict=True)), interpolation=interpolation)
 
 
+@signed_by(TrajectoryConfig)
 class Trajectory(Piece):
     """A motion from a file by a spline: ``Camera(pose=Trajectory("flight.txt"))``.
 
@@ -167,22 +168,11 @@ class Trajectory(Piece):
         self,
         file: str | os.PathLike,
         *,
-        form: Literal["auto", "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"] = "auto",
-        columns: str | None = None,
-        time_unit: Literal["s", "ms", "us", "ns"] | None = None,
-        maps_from: Literal["camera", "world"] | None = None,
-        axes: Literal["opencv", "opengl", "ned"] | None = None,
-        rate: float | None = None,
-        start: float | None = None,
-        smooth: float = 0.0,
-        speed_limit: float = 100.0,
-        turn_limit: float = 7200.0,
         T_body_sensor: ArrayLike | str | os.PathLike | None = None,
+        **keys: Any,
     ):
         there = check.path(file, "Trajectory.file").expanduser().absolute()
-        tree = check.given(file=there, form=form, start=start, smooth=smooth)
-        tree |= check.given(columns=columns, time_unit=time_unit, maps_from=maps_from, axes=axes, rate=rate)
-        tree |= check.given(speed_limit=speed_limit, turn_limit=turn_limit)
+        tree = check.given(file=there, **keys)
         if isinstance(T_body_sensor, (str, os.PathLike)):
             tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "Trajectory.T_body_sensor").absolute())
         elif T_body_sensor is not None:

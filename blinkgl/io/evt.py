@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
@@ -358,6 +359,17 @@ def _encode_evt3(x, y, t, p, state, first, words):
     return n
 
 
+@register_jitable
+def _time_high(new, high, low, wraps):
+    """Return (TIME_HIGH, TIME_LOW, wraps) after a word TIME_HIGH of EVT 3."""
+    # The 12-bit counter fell by half of its range or more: it has wrapped.
+    if high - new >= 1 << 11:
+        wraps += 1
+    # A new TIME_HIGH begins its 4096 µs: the low bits of before belong to the block that has ended, and TIME_LOW
+    # follows only with the next event that needs one. A repeated word changes nothing. (OpenEB)
+    return new, low if new == max(high, 0) else 0, wraps
+
+
 @kernel
 def _decode_evt3(words, state, x, y, t, p, triggers, mend):
     """Decode words; return (events, index of the first word of an unknown type, or whose vector exceeds the 11 bits of
@@ -414,15 +426,7 @@ def _decode_evt3(words, state, x, y, t, p, triggers, mend):
                 wraps, high, mended = wraps + (high == 0xFFF), (high + 1) & 0xFFF, mended + 1
             low = word & 0xFFF
         elif kind == 8:
-            new = word & 0xFFF
-            # The 12-bit counter fell by half of its range or more: it has wrapped.
-            if high - new >= 1 << 11:
-                wraps += 1
-            # A new TIME_HIGH begins its 4096 µs: the low bits of before belong to the block that has ended, and
-            # TIME_LOW follows only with the next event that needs one. A repeated word changes nothing. (OpenEB)
-            if new != max(high, 0):
-                low = 0
-            high = new
+            high, low, wraps = _time_high(word & 0xFFF, high, low, wraps)
         elif kind == 10:
             # Bits 11..8 are the channel, bit 0 the edge.
             if high >= 0:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
@@ -364,6 +365,50 @@ def _word(buffer, i, place, pair):
     return pair[1 if letter == 116 else 0], i
 
 
+@register_jitable
+def _fields(buffer, i, values, places, shift, pair, ecd):
+    """Parse the fields of the line that begins at ``i`` into ``values``. Return (their number, what is wrong, see
+    :func:`_parse`, and where the parsing ended: at the line's end, if nothing is)."""
+    field, wrong = 0, 0
+    while buffer[i] != 10:
+        c = buffer[i]
+        if _separates(c):
+            i += 1
+            continue
+        # The rest of a comment line is skipped.
+        if (c == 35 or c == 37) and field == 0:
+            while buffer[i] != 10:
+                i += 1
+            break
+        if field == len(places):
+            wrong = 1
+            break
+        place = places[field]
+        field += 1
+        begin = i
+        mantissa, exponent, _, i = _number(buffer, i)
+        c = buffer[i]
+        if i < 0 or not (_separates(c) or c == 10):
+            values[place], i = _word(buffer, begin, place, pair)
+            if i < 0:
+                # A word in the place of the polarity is a code of it.
+                wrong, i = 2 if place == 3 else 1, begin
+                break
+            continue
+        if ecd and place == 0 and exponent >= 0:
+            wrong = 3
+        # Times are multiplied by 10^shift: that makes microseconds.
+        values[place], ok = _scaled(mantissa, exponent + (shift if place == 0 else 0))
+        if not ok:
+            wrong = 1
+            break
+        if place > 0 and place < 4 and exponent < 0 and values[place] * 10.0**-exponent != mantissa:
+            # Coordinates between pixels are refused as well: rectified events are not raw events.
+            wrong = 2 if place == 3 else 4
+            break
+    return field, wrong, i
+
+
 @kernel
 def _parse(buffer, x, y, t, p, places, shift, pair, keep, ecd):
     """Parse the events in complete lines. Return (count, index of the line that stops the reading, lines left out, what
@@ -373,43 +418,7 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep, ecd):
     pair : numbers of OFF, of ON, and another of OFF.   keep : go on after no row of numbers.   ecd : with points."""
     n, line, i, lost, values = 0, 0, 0, 0, np.zeros(5, np.int64)
     while i < len(buffer):
-        field, wrong = 0, 0
-        while buffer[i] != 10:
-            c = buffer[i]
-            if _separates(c):
-                i += 1
-                continue
-            # The rest of a comment line is skipped.
-            if (c == 35 or c == 37) and field == 0:
-                while buffer[i] != 10:
-                    i += 1
-                break
-            if field == len(places):
-                wrong = 1
-                break
-            place = places[field]
-            field += 1
-            begin = i
-            mantissa, exponent, _, i = _number(buffer, i)
-            c = buffer[i]
-            if i < 0 or not (_separates(c) or c == 10):
-                values[place], i = _word(buffer, begin, place, pair)
-                if i < 0:
-                    # A word in the place of the polarity is a code of it.
-                    wrong, i = 2 if place == 3 else 1, begin
-                    break
-                continue
-            if ecd and place == 0 and exponent >= 0:
-                wrong = 3
-            # Times are multiplied by 10^shift: that makes microseconds.
-            values[place], ok = _scaled(mantissa, exponent + (shift if place == 0 else 0))
-            if not ok:
-                wrong = 1
-                break
-            if place > 0 and place < 4 and exponent < 0 and values[place] * 10.0**-exponent != mantissa:
-                # Coordinates between pixels are refused as well: rectified events are not raw events.
-                wrong = 2 if place == 3 else 4
-                break
+        field, wrong, i = _fields(buffer, i, values, places, shift, pair, ecd)
         if field != 0 or wrong:
             on = values[3] == pair[1]
             fits = field == len(places) and 0 <= values[1] <= 65535 and 0 <= values[2] <= 65535

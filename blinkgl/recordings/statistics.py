@@ -105,24 +105,14 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: GroupSums |
     polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
     other = polarity if against is None else against.polarity
     # GroupSums of products, not correlations, since only sums can be added over groups, and without one of them.
-    products = np.stack(
-        [
-            _by(on_group, np.einsum("kn,kn->n", x, y))
-            for x, y in ((polarity, other), (polarity, polarity), (other, other))
-        ],
-        1,
-    )
+    pairs = ((polarity, other), (polarity, polarity), (other, other))
+    products = np.stack([_by(on_group, np.einsum("kn,kn->n", x, y)) for x, y in pairs], 1)
     pixels = np.stack([_by(on_group, np.ones(len(group))), _by(np.where(still, group, GROUPS), np.ones(len(group)))], 1)
     seconds = np.diff(clip.edges_us[first : stop + 1]) * 1e-6
     mine = both.sum(axis=1)
     theirs = mine if against is None else against.both
-    alike = np.stack(
-        [
-            _by(np.where(used, group, GROUPS), one.astype(np.float64))
-            for one in (used, mine, theirs, mine * theirs, mine * mine, theirs * theirs)
-        ],
-        1,
-    )
+    moments = (used, mine, theirs, mine * theirs, mine * mine, theirs * theirs)
+    alike = np.stack([_by(np.where(used, group, GROUPS), each.astype(np.float64)) for each in moments], 1)
     looks, full = _looks(part, clip.size, span_us, None if against is None else against.full)
     return GroupSums(
         rates=rates,

@@ -44,14 +44,11 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
-        # Pixels that it would cover if nothing were in front of it.
         if any(part.material.mask is not None for part in obj.parts):
             amodal, pixels = _holed(scene, obj, t_ns, amodal)
-            pixels = max(pixels, seen)
         else:
-            mask = np.zeros(ids.shape, np.bool_)
-            cover(px, drawn, mask)
-            pixels = max(int(np.count_nonzero(mask)), seen)
+            pixels = _covered(px, drawn, ids.shape)
+        pixels = max(pixels, seen)
         # An object between the pixel centres has no box.
         if not pixels:
             continue
@@ -107,6 +104,13 @@ def _solid(obj: SceneObject, t_ns: int, T_cam_obj: np.ndarray) -> tuple[np.ndarr
         faces.append(shown + begin)
         begin += len(vertices[-1])
     return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _covered(px: np.ndarray, faces: np.ndarray, shape: tuple[int, ...]) -> int:
+    """Return the pixels of the picture that a body would cover if nothing were in front of it."""
+    mask = np.zeros(shape, np.bool_)
+    cover(px, faces, mask)
+    return int(np.count_nonzero(mask))
 
 
 def _holed(scene: Scene, obj: SceneObject, t_ns: int, box: np.ndarray) -> tuple[np.ndarray, int]:

@@ -17,6 +17,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.machine.kernels import kernel
 from blinkgl.render.mesh_edges import Contour, write_planes
@@ -202,6 +203,38 @@ def _emit(numbers, bodies, T_cam_obj, mvps, pool, width, height, out):
     return count
 
 
+@register_jitable
+def _part_in_picture(ax, ay, dx, dy, width, height):
+    """Return the part [low, high] of the line from (ax, ay) to (ax + dx, ay + dy) that is in the picture or at most a
+    pixel outside, where float32 is accurate; high <= low: none (Liang-Barsky)."""
+    low, high = 0.0, 1.0
+    for k in range(4):
+        d = -dx if k == 0 else dx if k == 1 else -dy if k == 2 else dy
+        room = ax + 1 if k == 0 else width + 1 - ax if k == 1 else ay + 1 if k == 2 else height + 1 - ay
+        if d > 0:
+            high = min(high, room / d)
+        elif d < 0:
+            low = max(low, room / d)
+        elif room < 0:
+            high = -1.0
+    return low, high
+
+
+@register_jitable
+def _cut_at_near_plane(ends):
+    """Move an end behind the near plane, z <= w, to where the edge meets it. ends : (2, 4) clip coordinates. Return
+    whether anything is in front of it."""
+    r0, r1 = ends[0, 3] - ends[0, 2], ends[1, 3] - ends[1, 2]
+    if r0 <= 0 and r1 <= 0:
+        return False
+    if r0 <= 0 or r1 <= 0:
+        t = r0 / (r0 - r1)
+        k = 0 if r0 <= 0 else 1
+        for r in range(4):
+            ends[k, r] = ends[0, r] + t * (ends[1, r] - ends[0, r])
+    return ends[0, 3] > 0 and ends[1, 3] > 0
+
+
 @kernel
 def _emit_one(mvp, pool, mine, front, width, height, out, count):
     """Append the lines of one object, whose edges are ``mine`` of the pool's, to the first ``count``, and return the
@@ -241,17 +274,7 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
             p = places[v0] if k == 0 else places[v1]
             for r in range(4):
                 ends[k, r] = mvp[r, 0] * p[0] + mvp[r, 1] * p[1] + mvp[r, 2] * p[2] + mvp[r, 3]
-        # In front of the near plane: z <= w.
-        r0, r1 = ends[0, 3] - ends[0, 2], ends[1, 3] - ends[1, 2]
-        if r0 <= 0 and r1 <= 0:
-            continue
-        if r0 <= 0 or r1 <= 0:
-            t = r0 / (r0 - r1)
-            # Where the edge meets the near plane; the end behind it moves there.
-            k = 0 if r0 <= 0 else 1
-            for r in range(4):
-                ends[k, r] = ends[0, r] + t * (ends[1, r] - ends[0, r])
-        if not (ends[0, 3] > 0 and ends[1, 3] > 0):
+        if not _cut_at_near_plane(ends):
             continue
         # NDC to px: both axes from -1 to 1, y down already in the projection.
         ax = (ends[0, 0] / ends[0, 3] + 1) * 0.5 * width
@@ -259,22 +282,11 @@ def _emit_one(mvp, pool, mine, front, width, height, out, count):
         bx = (ends[1, 0] / ends[1, 3] + 1) * 0.5 * width
         by = (ends[1, 1] / ends[1, 3] + 1) * 0.5 * height
         ad, bd = ends[0, 2] / ends[0, 3], ends[1, 2] / ends[1, 3]
-        # The part inside the picture plus one pixel, where float32 is accurate. Liang-Barsky: [low, high] is the part
-        # of the line in the rectangle.
-        low, high, dx, dy = 0.0, 1.0, bx - ax, by - ay
-        for k in range(4):
-            d = -dx if k == 0 else dx if k == 1 else -dy if k == 2 else dy
-            room = ax + 1 if k == 0 else width + 1 - ax if k == 1 else ay + 1 if k == 2 else height + 1 - ay
-            if d > 0:
-                high = min(high, room / d)
-            elif d < 0:
-                low = max(low, room / d)
-            elif room < 0:
-                high = -1.0
+        dx, dy = bx - ax, by - ay
+        low, high = _part_in_picture(ax, ay, dx, dy, width, height)
         if not low < high:
             continue
-        length = np.sqrt(dx * dx + dy * dy) * (high - low)
-        if not length > 1e-9:
+        if not np.sqrt(dx * dx + dy * dy) * (high - low) > 1e-9:
             continue
         cx, cy, cd = ax, ay, ad
         ax, ay, ad = cx + low * dx, cy + low * dy, cd + low * (bd - cd)

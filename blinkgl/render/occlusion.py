@@ -134,13 +134,9 @@ def judged_by_samples(
             y0 = min(max(int(np.floor(yt)), 0), last_y)
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
             ax, ay, own = xt - x0, yt - y0, ids[y, x]
+            shown = ids_there[y0, x0], ids_there[y0, x1], ids_there[y1, x0], ids_there[y1, x1]
             # All four show its own object: visible, if the point is on the interpolated surface.
-            if (
-                ids_there[y0, x0] == own
-                and ids_there[y0, x1] == own
-                and ids_there[y1, x0] == own
-                and ids_there[y1, x1] == own
-            ):
+            if shown[0] == own and shown[1] == own and shown[2] == own and shown[3] == own:
                 four = nearness[y0, x0], nearness[y0, x1], nearness[y1, x0], nearness[y1, x1]
                 if thin[y0, x0] or not _on_surface(four, ax, ay, inverse):
                     verdict[y, x] = UNDECIDED

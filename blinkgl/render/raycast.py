@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.machine.kernels import kernel
 
@@ -318,6 +319,40 @@ def _balls(forest, origins, axes):
     return centre, radius, outside
 
 
+@register_jitable
+def _box_entry(low, high, box, o_lo, o_hi, inverse):
+    """Return the depths at which a ray enters and leaves a box, widened by the rounding; enter > leave: it misses it.
+
+    low, high : (N, 3), and the number of the box in them.   o_lo, o_hi : (3,) the origin moved apart by the slack of
+    the test.   inverse : (3,) 1 / direction."""
+    # Slabs: the ray is inside the box between the largest entry and the smallest exit.
+    enter, leave = 0.0, np.inf
+    for k in range(3):
+        # a ray in the plane of a side gives 0 * inf = nan, which no comparison takes: visited
+        a = (low[box, k] - o_lo[k]) * inverse[k]
+        b = (high[box, k] - o_hi[k]) * inverse[k]
+        if inverse[k] < 0.0:
+            a, b = b, a
+        if a > enter:
+            enter = a
+        if b < leave:
+            leave = b
+    return enter * (1.0 - _DEPTH_SLACK), leave * (1.0 + _DEPTH_SLACK)
+
+
+@register_jitable
+def _may_meet(balls, part, rx, ry, best):
+    """Return whether the ray (rx, ry, 1) may meet the ball of a part (:func:`_balls`) nearer than ``best``."""
+    centre, radius, outside = balls
+    # The ball begins behind the best hit so far.
+    if centre[part, 2] - radius[part] > best:
+        return False
+    # The angle to the middle is wider than the tangent's, or the ball is behind the camera.
+    along = centre[part, 0] * rx + centre[part, 1] * ry + centre[part, 2]
+    length = rx * rx + ry * ry + 1.0
+    return not (outside[part] > 0.0 and (along < 0.0 or along * along < outside[part] * length))
+
+
 @kernel(error_model="numpy")
 def nearest_tree(
     forest: Forest,
@@ -344,22 +379,15 @@ def nearest_tree(
     triangles, face, lower, upper, child, count, root, _, size, side, extent, mask, uvs, masks, cutoffs, texels = forest
     o, d, inverse, o_lo, o_hi = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     stack, entry = np.empty(_STACK, np.int64), np.empty(_STACK)
-    centre, radius, outside = _balls(forest, origins, axes)
+    balls = _balls(forest, origins, axes)
     for i in range(rays.shape[0]):
         best = far[i]
-        # Squared length of (rx, ry, 1), for the balls' test.
-        length = rays[i, 0] * rays[i, 0] + rays[i, 1] * rays[i, 1] + 1.0
         depth[i] = np.inf
         hit[i] = -1
         for p in range(root.shape[0]):
             if any_will_do and hit[i, 0] >= 0:
                 break
-            # The ball begins behind the best hit so far.
-            if size[p] == 0 or centre[p, 2] - radius[p] > best:
-                continue
-            # Ray and ball: the angle to the middle is wider than the tangent's, or the ball is behind the camera.
-            along = centre[p, 0] * rays[i, 0] + centre[p, 1] * rays[i, 1] + centre[p, 2]
-            if outside[p] > 0.0 and (along < 0.0 or along * along < outside[p] * length):
+            if size[p] == 0 or not _may_meet(balls, p, rays[i, 0], rays[i, 1], best):
                 continue
             scale = extent[p]
             for k in range(3):
@@ -396,21 +424,9 @@ def nearest_tree(
                         hit[i, 0], hit[i, 1], hit[i, 2] = p, face[j], front
                         bary[i, 0], bary[i, 1], bary[i, 2] = u, v, w
                     continue
-                # Slabs: the ray is inside the box between the largest entry and the smallest exit.
                 for c in range(child[node], child[node] + 2):
-                    enter, leave = 0.0, np.inf
-                    for k in range(3):
-                        # a ray in the plane of a side gives 0 * inf = nan, which no comparison takes: visited
-                        a = (lower[c, k] - o_lo[k]) * inverse[k]
-                        b = (upper[c, k] - o_hi[k]) * inverse[k]
-                        if inverse[k] < 0.0:
-                            a, b = b, a
-                        if a > enter:
-                            enter = a
-                        if b < leave:
-                            leave = b
-                    enter *= 1.0 - _DEPTH_SLACK
-                    if enter <= leave * (1.0 + _DEPTH_SLACK) and enter <= best:
+                    enter, leave = _box_entry(lower, upper, c, o_lo, o_hi, inverse)
+                    if enter <= leave and enter <= best:
                         stack[n], entry[n] = c, enter
                         n += 1
                 if n >= 2 and entry[n - 1] > entry[n - 2] and count[node] == 0:

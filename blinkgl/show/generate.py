@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
@@ -39,16 +40,15 @@ def run(
     overrides: Sequence[str] = (),
     quiet: bool = False,
     executor: Executor | None = None,
-    resume: bool = False,
-    mixed: bool = False,
-    time_limit_s: float = 0.0,
     view: bool = False,
     layout: str | None = None,
+    **options: Any,
 ) -> int:
     """Run :func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are
     missing, whose names and reasons are printed even when ``quiet``. view : show each sequence in a browser when it is
     complete, and all until Ctrl-C. layout : when no sequence is missing, also write them as ``OUT-LAYOUT`` (`blinkgl
-    export`). Raises their errors, and ConfigError without the extra [view]."""
+    export`). options : resume, mixed and time_limit_s, of the run. Raises their errors, and ConfigError without the
+    extra [view]."""
     exported = f"{out.rstrip('/')}-{layout}"
     if layout is not None:
         export.refuse_early(exported, layout)
@@ -58,16 +58,7 @@ def run(
     console = plain_console(quiet=quiet)
     display = None if quiet else Display(console, Path(out))
     with _shown(view, Path(out), display) as listener:
-        outcome = run_dataset(
-            template,
-            out,
-            executor,
-            num=num,
-            resume=resume,
-            mixed=mixed,
-            time_limit_s=time_limit_s,
-            listener=listener,
-        )
+        outcome = run_dataset(template, out, executor, num=num, listener=listener, **options)
         show_outcome(console, outcome, Path(out))
         if quiet:
             for name, reason in sorted(outcome.set_aside.items()):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,14 +53,12 @@ def run(
     overrides: Sequence[str] = (),
     size: str | None = None,
     quiet: bool = False,
-    gamma: str | None = None,
-    interpolate: str = "linear",
-    max_px: float = 1.0,
-    keep_noise: bool = False,
-    declared: dict[str, Any] | None = None,
+    frames: Mapping[str, Any] | None = None,
+    declared: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> int:
-    """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``declared``: of the frames, as of
+    """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``frames``: gamma, interpolate, max_px and
+    keep_noise, see :class:`~blinkgl.recordings.simulation.FrameUse`.   ``declared``: of the frames, as of
     :class:`~blinkgl.io.frames.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.io.frames import Declared
     from blinkgl.machine.compiling import announced_compiling
@@ -68,7 +66,8 @@ def run(
     from blinkgl.recordings.simulation import FrameUse, file_to_events, own_frames
 
     options["emulator"], camera = emulator_options(emulator, config, overrides, sensor)
-    options["use"] = FrameUse(Codes(gamma, own=own_frames(camera)), interpolate, max_px, keep_noise)
+    use = dict(frames or {})
+    options["use"] = FrameUse(Codes(use.pop("gamma", None), own=own_frames(camera)), **use)
     options["declared"] = Declared(**(declared or {}))
     if camera is not None:
         options |= {"readout": camera.readout, "size": (camera.height, camera.width)}

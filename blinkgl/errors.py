@@ -8,7 +8,6 @@ and exits with status 2; ``--debug`` shows the traceback. Programming errors are
 from __future__ import annotations
 
 import errno
-from typing import Any
 
 _MAX_VALUE_CHARS = 120
 _MAX_TEXT_CHARS = 400
@@ -51,7 +50,7 @@ class BlinkGLError(Exception):
     passing = False
     """Whether the same work may succeed when it is tried again without any change; see :func:`may_pass`."""
 
-    def __init__(self, problem: str, *, where: str | None = None, value: Any = ..., accepted: str | None = None):
+    def __init__(self, problem: str, *, where: str | None = None, value: object = ..., accepted: str | None = None):
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
         line = f"{_plain(where)}: {_plain(problem)}" if where else _plain(problem)
         if value is not ...:

@@ -29,7 +29,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -44,6 +43,7 @@ from blinkgl.io.frames import Declared
 from blinkgl.layouts.export import LAYOUTS, export_layout
 from blinkgl.machine.cpu import cpu_field
 from blinkgl.recordings.simulation import file_to_events
+from blinkgl.types.trees import Tree
 
 HERE = Path(__file__).resolve().parents[1] / "tests" / "fingerprint"
 PINNED = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
@@ -72,7 +72,7 @@ def sums(folder: Path) -> dict[str, str]:
 
 
 @functools.cache
-def table() -> dict[str, Any]:
+def table() -> Tree:
     """Return what cases.yaml says."""
     return read_table(HERE / "cases.yaml")
 

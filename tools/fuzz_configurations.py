@@ -12,7 +12,6 @@ import types
 import typing
 import zlib
 from pathlib import Path
-from typing import Any
 
 import h5py
 import hdf5plugin  # noqa: F401 - the events' filter
@@ -33,6 +32,7 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest
+from blinkgl.types.trees import Tree
 
 SMALL: dict[str, object] = {
     "camera": {"width": 32, "height": 24},
@@ -47,7 +47,7 @@ SMALL: dict[str, object] = {
     "labels": {"flow": ["forward"], "depth": True},
     "preview": {"enabled": False},
 }
-_OTHERS: dict[str, Any] = {
+_OTHERS: Tree = {
     "explicit": {
         "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
         "objects": [{"mesh": "box"}, {"mesh": "ball", "position": [1, 1, 0]}],
@@ -137,7 +137,7 @@ def drawn(seed: int, index: int) -> dict[str, object]:
         if most is not None and isinstance(picked, (int, float)) and picked > most:
             picked = type(picked)(most)
         for at, entry in [*kinds.items(), (path, picked)]:
-            table: dict[str, Any] = tree
+            table: Tree = tree
             for step in at[:-1]:
                 table = table.setdefault(step, {}) if isinstance(table.get(step, {}), dict) else {}
             if at[-1] in ("kind", "emulator") and table.get(at[-1]) not in (None, entry):

@@ -36,6 +36,7 @@ from blinkgl.tools import fingerprint as cases
 from blinkgl.tools.bench_rows import probe_scene
 from blinkgl.tools.shader_debugger.commands import run_diff
 from blinkgl.tools.shader_debugger.session import moment, open_subject
+from blinkgl.types.trees import Tree
 
 try:
     import torch
@@ -46,7 +47,7 @@ try:
 except ImportError:
     torch: Any = None
 
-Row = dict[str, Any]
+Row = Tree
 Rows = Iterable[tuple[str, Callable[[], "Row | list[Row]"]]]
 STEP_NS = 1_000_003
 DENSITIES = (0.07, 1.0, 0.31, 0.01)

@@ -40,8 +40,9 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.io.atomic import write_whole
 from blinkgl.machine import bench
 from blinkgl.machine.interrupts import interruptible
+from blinkgl.types.trees import Tree
 
-Row = dict[str, Any]
+Row = Tree
 """A row of a table: title of a column -> text or number."""
 
 
@@ -90,7 +91,7 @@ def table(rows: list[Row]) -> list[str]:
     ]
 
 
-def write(out: Path, report: dict[str, Any]) -> None:
+def write(out: Path, report: Tree) -> None:
     """``gpu_suite.json`` and ``gpu_suite.md``, whole."""
     lines = [f"# {report['machine']}, {report['device']}"]
     for stage, pieces in report["stages"].items():
@@ -156,7 +157,7 @@ def stop(process: Any) -> None:
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
-def run_stage(name: str, options: Namespace, report: dict[str, Any]) -> None:
+def run_stage(name: str, options: Namespace, report: Tree) -> None:
     """Every piece of a stage, as far as its minutes reach."""
     minutes, pieces = STAGES[name]
     seconds = 60 * (options.minutes or (REHEARSAL_MINUTES if options.small else minutes))
@@ -174,7 +175,7 @@ def run_stage(name: str, options: Namespace, report: dict[str, Any]) -> None:
 
 
 def run_process(
-    name: str, first: int, deadline: float, options: Namespace, report: dict[str, object], outcomes: dict[str, Any]
+    name: str, first: int, deadline: float, options: Namespace, report: dict[str, object], outcomes: Tree
 ) -> int | None:
     """Run a piece from a row on until it ends, hangs or its time is over. Return the row that another process begins
     with, or None."""
@@ -216,7 +217,7 @@ def run_process(
     return None if row[0] < 0 else row[0] + 1
 
 
-OPTIONS: dict[str, dict[str, Any]] = {
+OPTIONS: dict[str, Tree] = {
     "--stage": {"default": "".join(STAGES), "help": "one or several: A, AB …; all of them"},
     "--minutes": {"type": float, "help": "of each stage, instead of its own"},
     "--out": {"type": Path, "default": Path("out/gpu_suite")},
@@ -253,7 +254,7 @@ def main(arguments: list[str] | None = None) -> int:
         importlib.import_module(TRAINED).pack(options.pack, options.small)
         return 0
     options.out.mkdir(parents=True, exist_ok=True)
-    report: dict[str, Any] = {"machine": bench.machine_line(), "device": options.device, "stages": {}}
+    report: Tree = {"machine": bench.machine_line(), "device": options.device, "stages": {}}
     options.scratch = tempfile.mkdtemp(prefix="blinkgl-gpu-")
     try:
         with interruptible(signal.SIGTERM):

@@ -23,6 +23,7 @@ from blinkgl.blender.comparing import Difference, compare
 from blinkgl.blender.process import Blender, how_it_ended
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.types.trees import Tree
 
 PROGRAM = Path(__file__).with_name("inside") / "convert.py"
 ENDINGS = (".blend", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".dae", ".abc", ".obj")
@@ -112,7 +113,7 @@ def import_scene(
             with output_errors(temporary):
                 shutil.copyfile(folder / "scene.glb", temporary)
     reasons, duration = report.pop("unbaked"), report["duration_s"]
-    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in report.items()}
+    plain: Tree = {key: tuple(value) if isinstance(value, list) else value for key, value in report.items()}
     return Imported(
         path=out,
         wrong=tuple(_as_line(name, *differs[name], duration, reasons.get(name, "")) for name in differs),
@@ -157,7 +158,7 @@ def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, bake_mb
 
 def _run(
     folder: Path, source: Path, out: Path, limit_s: float, progress: Callable[[str], None]
-) -> tuple[dict[str, Any], dict[str, Difference], tuple[str, ...]]:
+) -> tuple[Tree, dict[str, Difference], tuple[str, ...]]:
     """Return (the report of Blender's side, which has written ``folder``/scene.glb; how that differs from what Blender
     sees; what of it is not drawn). The program asks for the comparison, as often as it has exported."""
     report, compared, glb = None, None, folder / "scene.glb"

@@ -22,10 +22,10 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.machine.closing import Closing
+from blinkgl.types.trees import Tree
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 REMEDY = (
@@ -108,14 +108,14 @@ class Blender(Closing):
                 pipe.close()
         self._log.close()
 
-    def tell(self, words: dict[str, Any]) -> None:
+    def tell(self, words: Tree) -> None:
         """Send a line of JSON to the program's standard input. That it has ended is said by its answers."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(words).encode() + b"\n")
             self._process.stdin.flush()
 
-    def answers(self) -> Iterator[dict[str, Any]]:
+    def answers(self) -> Iterator[Tree]:
         """Yield each line's object, until the program closes its standard output. A ``{"doing": …}`` is stored for
         errors and yielded; an ``{"error": …, "accepted": …}`` is raised."""
         for line in self._lines():

@@ -45,7 +45,7 @@ class Refused(ValueError):
     """The error that a rule raises: the problem, its place (a key of the rule's model), the value and what is
     accepted."""
 
-    def __init__(self, problem: str, *, where: str = "", value: Any = ..., accepted: str | None = None):
+    def __init__(self, problem: str, *, where: str = "", value: object = ..., accepted: str | None = None):
         super().__init__(problem)
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
 

@@ -40,6 +40,7 @@ from blinkgl.config.poses import rigid_matrix
 from blinkgl.config.reader import parse_yaml, read_text, to_yaml
 from blinkgl.errors import ConfigError
 from blinkgl.types.numbers import is_number
+from blinkgl.types.trees import Tree
 
 _RIGID = 1e-4
 _NONE = ("none", "None", "", "no", "pinhole", "no_distortion", None)
@@ -112,7 +113,7 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
     return cameras | rectified_
 
 
-def _tree(text: str, where: str) -> dict[str, Any]:
+def _tree(text: str, where: str) -> Tree:
     """Return the table of a YAML or JSON file, also of OpenCV's dialect: ``%YAML:1.0`` and the tags of its types."""
     text = re.sub(r"\A\s*%YAML[: ]1\.\d\s*\n(---\s*\n)?", "", text)
     tree = parse_yaml(re.sub(r"!!opencv-\w+", "", text), where)
@@ -255,7 +256,7 @@ def _lens(camera: CameraModel, key: str) -> dict[str, object]:
     }
 
 
-def _camera(table: dict[str, Any], where: str, key: str) -> Calibrated:
+def _camera(table: Tree, where: str, key: str) -> Calibrated:
     model = table.get("camera_model", "pinhole")
     if model != "pinhole":
         raise ConfigError("unsupported camera model", where=f"{where}.camera_model", value=model, accepted="pinhole")

@@ -23,6 +23,7 @@ from blinkgl.camera.drawing import seen_through
 from blinkgl.config.base import Config, Refused, placed, rule
 from blinkgl.config.draw import is_distribution
 from blinkgl.errors import ConfigError
+from blinkgl.types.trees import Tree
 
 _KEYS = ("width", "height", "lens", "distortion", "fov", "focal", "fx", "fy", "cx", "cy", "near")
 _OF_A_CALIBRATION = ("lens", "distortion", "fov", "focal", "fx", "fy", "cx", "cy")
@@ -109,7 +110,7 @@ class CameraConfig(Config):
         """Return the camera that the keys describe."""
         return _model(*(getattr(self, key) for key in _KEYS))
 
-    def scaled(self, factor: float) -> dict[str, Any]:
+    def scaled(self, factor: float) -> Tree:
         """Return the keys of a camera with the same view and ``factor`` times the pixels in x and y, rounded to whole
         pixels."""
         # Pixel centres are at whole numbers, so the picture begins at -0.5.

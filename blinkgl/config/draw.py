@@ -32,6 +32,7 @@ import numpy as np
 from blinkgl.config.base import Path
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role
+from blinkgl.types.trees import Tree
 
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "weighted", "shares")
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: its multiples modulo 2^64 are spread as evenly as possible
@@ -49,7 +50,7 @@ def draw(tree: object, seed: int, sequence: int) -> Any:
     return _walk(tree, (), lambda path, kind, spec: _draw_one(path, kind, spec, seed, sequence))
 
 
-def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) -> list[Any]:
+def options(path: tuple[str, ...], node: Tree, between: bool = False) -> list[Any]:
     """Return values that represent all that the distribution ``node`` can draw: both ends of a range, every choice.
     ``between``: also a value inside the range. Raises ConfigError (with the path) for a malformed one."""
     kind, spec = next(iter(node.items()))
@@ -236,9 +237,9 @@ class Fill:
     reads : the keys whose values it receives, as they are written; None where a key is not given."""
 
     reads: tuple[str, ...]
-    values: Callable[..., dict[str, Any]]
+    values: Callable[..., Tree]
 
-    def __call__(self, tree: Mapping[str, object]) -> dict[str, Any]:
+    def __call__(self, tree: Mapping[str, object]) -> Tree:
         """Return ``tree`` laid over the fill's values."""
         return _lay(self.values(*(_said(tree, key.split(".")) for key in self.reads)), tree)
 
@@ -283,7 +284,7 @@ def corners(tree: object) -> Iterator[Any]:
         return
     varying = {path[:depth] for path in every for depth in range(len(path) + 1)}
 
-    def chosen(node: Any, path: Path, pick: Callable[[Path, dict[str, Any]], Any]) -> Any:
+    def chosen(node: Any, path: Path, pick: Callable[[Path, Tree], Any]) -> Any:
         if path not in varying:
             return node
         if is_distribution(node):

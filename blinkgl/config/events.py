@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 from pydantic import Field, model_validator
 
 from blinkgl.config.base import Config, Former, Refused, rule
+from blinkgl.types.trees import Tree
 
 _MAX_EVENTS = Field(
     2**25,
@@ -124,7 +125,7 @@ class EmulatorConfig(Config):
 
     @classmethod
     @abstractmethod
-    def from_sensor(cls, sensor: object) -> dict[str, Any]:
+    def from_sensor(cls, sensor: object) -> Tree:
         """Return the values of the keys that a camera's data sheet describes; None where this sensor gives none.
 
         sensor : a :class:`~blinkgl.config.sensor.SensorConfig`, which knows the emulators' keys."""
@@ -252,7 +253,7 @@ class EsimConfig(_TwoThresholds):
     device: Device = _DEVICE
 
     @classmethod
-    def from_sensor(cls, sensor: object) -> dict[str, Any]:
+    def from_sensor(cls, sensor: object) -> Tree:
         return _pixel(sensor)
 
 
@@ -371,7 +372,7 @@ class V2eConfig(_TwoThresholds):
             raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
+    def from_sensor(cls, sensor: Any) -> Tree:
         return {
             **_pixel(sensor),
             "cutoff_hz": sensor.cutoff_hz,
@@ -426,7 +427,7 @@ class VoltmeterConfig(EmulatorConfig):
     causes: bool = _CAUSES
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> dict[str, Any]:
+    def from_sensor(cls, sensor: Any) -> Tree:
         """Return the constants of the nearest calibrated camera, with the sensor's threshold and noise.
 
         The leak is the drift k4 of a still pixel, as the preset's is of one camera in one light; unknown, it is V2E's.

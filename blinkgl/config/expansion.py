@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field
 
@@ -22,7 +21,6 @@ from blinkgl.config.base import Config
 from blinkgl.config.camera import calibrated, placed_by_calibration
 from blinkgl.config.problems import validate
 from blinkgl.config.reader import (
-    Table,
     each_option,
     merge,
     read_table,
@@ -33,13 +31,14 @@ from blinkgl.config.reader import (
 from blinkgl.config.rig import check_one_lens
 from blinkgl.config.sensor import sensor_file_or_name
 from blinkgl.errors import ConfigError
+from blinkgl.types.trees import Tree
 
 
 class Recipe(Config):
     """A shipped recipe file."""
 
     about: str = Field(description="The data set or program, and its paper.")
-    events: dict[str, Any] = Field(description="Keys of `events:`; distributions are drawn once per sequence.")
+    events: Tree = Field(description="Keys of `events:`; distributions are drawn once per sequence.")
     sources: dict[str, str] = Field(description="Source of each value, by key.")
     differs: str = Field("", description="Differences from the original.")
 
@@ -50,7 +49,7 @@ def load_recipe(name: str) -> Recipe:
     return validate(Recipe, keys, where=f"emulators/{name}.yaml")
 
 
-def expanded(tree: Table, base: Path) -> Table:
+def expanded(tree: Tree, base: Path) -> Tree:
     """Return ``tree`` with its calibrations, sensor files (paths relative to ``base``) and recipes replaced by their
     content. Raises ConfigError."""
     meanings = {
@@ -59,14 +58,14 @@ def expanded(tree: Table, base: Path) -> Table:
         "events": _recipe,
     }
 
-    def spelled_out(table: Table) -> Table:
+    def spelled_out(table: Tree) -> Tree:
         meant = {key: each_option(table[key], meaning) for key, meaning in meanings.items() if key in table}
         return {**table, **meant}
 
-    def placed(table: Table) -> Table:
+    def placed(table: Tree) -> Tree:
         return {**spelled_out(table), **placed_by_calibration(table, base)}
 
-    def whole(table: Table) -> Table:
+    def whole(table: Tree) -> Tree:
         check_one_lens(table)
         return with_sections(spelled_out(table), placed)
 
@@ -80,7 +79,7 @@ def _recipe(events: object) -> object:
     return each_option(load_recipe(events["recipe"]).events, partial(_over, own=own))
 
 
-def _over(events: Table, own: Table) -> Table:
+def _over(events: Tree, own: Tree) -> Tree:
     """Return a recipe's keys with ``own`` laid over them."""
     if own.get("emulator", events.get("emulator")) != events.get("emulator"):
         raise ConfigError(
@@ -92,7 +91,7 @@ def _over(events: Table, own: Table) -> Table:
     return {**events, **own}
 
 
-def with_scenes(tree: Table, base: Path) -> Table:
+def with_scenes(tree: Tree, base: Path) -> Tree:
     """Return ``tree`` with every ``scene: {from: FILE, …}`` replaced by that file's scene. Raises ConfigError."""
     groups = tree.get("groups")
     named = [(f"groups.{name}.", group) for name, group in groups.items()] if isinstance(groups, dict) else []
@@ -103,7 +102,7 @@ def with_scenes(tree: Table, base: Path) -> Table:
     return tree
 
 
-def _scene_from(own: Table, where: str, base: Path) -> Table:
+def _scene_from(own: Tree, where: str, base: Path) -> Tree:
     file = own.pop("from")
     if not isinstance(file, str):
         raise ConfigError("not a file", where=where, value=file, accepted="a YAML file with a scene")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from blinkgl.config.base import Config, Former, Refused, always, rule
+from blinkgl.types.trees import Tree
 
 NS_PER_S, NS_PER_US = 1_000_000_000, 1000
 MAX_IMAGES = 1_000_000
@@ -45,7 +46,7 @@ class ImagesConfig(Config):
     """A frame camera that shares the event camera's pixels: images with exposure, shutter, lens and noise, at their own
     times. It sets `labels.images` to false unless that is given."""
 
-    presets: ClassVar[dict[str, dict[str, Any]]] = {
+    presets: ClassVar[dict[str, Tree]] = {
         "plain": {},
         "deblurring": {
             "rate": 24.0,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, always
+from blinkgl.types.trees import Tree
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The ``imu:`` section: the inertial unit on the camera (:mod:`blinkgl.sequence.inertial`).
@@ -20,7 +21,7 @@ class ImuConfig(Config):
     """An inertial unit fixed to the camera. World units are metres. Noise densities are those of Kalibr's imu.yaml: of
     continuous time, independent of the rate."""
 
-    presets: ClassVar[dict[str, dict[str, Any]]] = {
+    presets: ClassVar[dict[str, Tree]] = {
         "ideal": {},
         "adis16448": {
             "accelerometer_noise_density": 2.0e-3,

@@ -32,7 +32,7 @@ def validate(model: type[Config], data: object, *, where: str = "") -> Any:
         raise _translate(model, error, where) from None
 
 
-def validate_field(model: type[Config], name: str, value: Any) -> Any:
+def validate_field(model: type[Config], name: str, value: object) -> Any:
     """Return ``value`` validated as the model's field ``name``. Raises ConfigError as :func:`validate`."""
     info = model.model_fields[name]
     try:

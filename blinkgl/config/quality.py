@@ -7,6 +7,7 @@ from importlib import resources
 from typing import Any, Literal, get_args
 
 from blinkgl.config.reader import shipped
+from blinkgl.types.trees import Tree
 
 Quality = Literal["fast", "balanced", "accurate", "reference"]
 QUALITIES: tuple[str, ...] = get_args(Quality)
@@ -19,19 +20,19 @@ def with_default(tree: object) -> Any:
     return {"quality": DEFAULT, **tree} if isinstance(tree, dict) else tree
 
 
-def load_quality(name: str) -> dict[str, Any]:
+def load_quality(name: str) -> Tree:
     """Return ``timeline:`` and ``render:`` of a preset as plain data; comments in its file give the figures it is based
     on."""
     return shipped("quality", name)
 
 
-def measured_presets() -> dict[str, Any]:
+def measured_presets() -> Tree:
     """Return what the suite of ``trade`` measured: ``settings`` by name, and ``scenes`` with a row of costs and errors
     for each of them; a share, not a percentage. Made by ``tools/quality_presets.py``."""
     return json.loads((resources.files("blinkgl.configs") / "quality" / "measured.json").read_text(encoding="utf-8"))
 
 
-def fill_quality(quality: object, kind: object) -> dict[str, Any]:
+def fill_quality(quality: object, kind: object) -> Tree:
     """Return the preset's values for a configuration with this timeline.kind (None: not given). Unknown presets have
     none. The preset's timeline values are left out for a timeline of another kind."""
     if quality not in QUALITIES:

@@ -26,6 +26,7 @@ from yaml.resolver import Resolver
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.names import shipped_names
 from blinkgl.errors import ConfigError
+from blinkgl.types.trees import Tree
 
 MAX_BYTES = 4 << 20
 MAX_VALUES = 100_000
@@ -89,7 +90,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         if self._values > MAX_VALUES:
             raise ComposerError(None, None, f"more than {MAX_VALUES} values, aliases expanded", event.start_mark)
 
-    def plain_map(self, node: MappingNode) -> dict[str, Any]:
+    def plain_map(self, node: MappingNode) -> Tree:
         """Return the table of a mapping. Its keys are constructed before merge keys are flattened, so that only
         duplicates among the table's own keys are errors."""
         if not isinstance(node, MappingNode):
@@ -195,7 +196,7 @@ def read_text(path: str | Path) -> str:
         ) from None
 
 
-def read_table(path: str | Path, accepted: str = "key: value lines") -> dict[str, Any]:
+def read_table(path: str | Path, accepted: str = "key: value lines") -> Tree:
     """Return :func:`read_yaml` of a file that must hold a table; an empty file is an empty table."""
     tree = read_yaml(path)
     if tree is None:
@@ -223,7 +224,6 @@ class _Dumper(yaml.SafeDumper):
 # ---------------------------------------------------------------------------------------------------------------------
 # Plain trees of configurations as read from YAML, and operations on them: merging, and changes in several places.
 
-Table = dict[str, Any]
 _TAGS = ("kind", "emulator")
 _WHOLE = ("sensor",)
 """Keys whose tables are replaced as a whole: a sensor is not mixed from two."""
@@ -253,7 +253,7 @@ def each_option(node: Any, change: Callable[[object], object]) -> object:
     return node
 
 
-def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
+def with_groups(tree: Tree, change: Callable[[Tree], Tree]) -> Tree:
     """Return ``tree`` and each of its groups changed by ``change``; invalid groups are left to validation."""
     changed, groups = change(tree), tree.get("groups")
     if isinstance(groups, dict):
@@ -264,7 +264,7 @@ def with_groups(tree: Table, change: Callable[[Table], Table]) -> Table:
     return changed
 
 
-def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
+def with_sections(tree: Tree, change: Callable[[Tree], Tree]) -> Tree:
     """Return ``tree`` with the table of each sensor in ``sensors:`` changed."""
     sensors = tree.get("sensors")
     if not isinstance(sensors, list):
@@ -272,7 +272,7 @@ def with_sections(tree: Table, change: Callable[[Table], Table]) -> Table:
     return {**tree, "sensors": [change(one) if isinstance(one, dict) else one for one in sensors]}
 
 
-def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
+def apply_overrides(tree: Tree, overrides: Sequence[str]) -> Tree:
     """Return a copy of ``tree`` with ``--set`` options applied; missing tables on the path are created."""
     tree = copy.deepcopy(tree)
     for option in overrides:
@@ -312,7 +312,7 @@ def apply_overrides(tree: Table, overrides: Sequence[str]) -> Table:
 # Files that ship with the program, by name: runs, and tables of sensors, rigs, quality presets and recipes.
 
 
-def shipped(kind: str, name: object, what: str = "table", where: str = "") -> dict[str, Any]:
+def shipped(kind: str, name: object, what: str = "table", where: str = "") -> Tree:
     """Return a copy of the table of this name. Raises ConfigError listing the known ones (:func:`shipped_names`).
 
     what, where : for the message."""
@@ -323,7 +323,7 @@ def shipped(kind: str, name: object, what: str = "table", where: str = "") -> di
 
 
 @lru_cache
-def _read(kind: str, name: str) -> dict[str, Any]:
+def _read(kind: str, name: str) -> Tree:
     text = (resources.files("blinkgl.configs") / kind / f"{name}.yaml").read_text(encoding="utf-8")
     return parse_yaml(text, f"{kind}/{name}.yaml")
 

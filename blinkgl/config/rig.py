@@ -16,7 +16,7 @@ import copy
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -35,6 +35,7 @@ from blinkgl.config.sensor import Sensor
 from blinkgl.config.values import Position, Vector3
 from blinkgl.errors import ConfigError
 from blinkgl.types.poses import pose_of
+from blinkgl.types.trees import Tree
 
 SECTIONS = ("camera", "sensor", "events", "readout", "labels", "images", "imu", "tracks")
 """Sections of a single camera's configuration that each sensor has."""
@@ -146,9 +147,7 @@ def check_one_lens(tree: Mapping[str, object]) -> None:
                 )
 
 
-def spelled_out(
-    tree: dict[str, object], fills: Iterable[Callable[[dict[str, object]], dict[str, object]]]
-) -> dict[str, Any]:
+def spelled_out(tree: dict[str, object], fills: Iterable[Callable[[dict[str, object]], dict[str, object]]]) -> Tree:
     """Return ``tree`` with every sensor of its rig, if it is one, complete: the sensor's own keys over the preset's,
     both over the top level's sections, then completed by ``fills`` as a single camera's sections. Repeating it changes
     nothing.
@@ -170,7 +169,7 @@ def spelled_out(
     return {**tree, "sensors": [_complete(one, k, tree, fills) for k, one in enumerate(tables)]}
 
 
-def with_preset(tree: Mapping[str, object]) -> dict[str, Any]:
+def with_preset(tree: Mapping[str, object]) -> Tree:
     """Return ``tree`` with its own sensors laid over those of its preset. Repeating it changes nothing. Raises
     ConfigError for an unknown rig, no list of sensors, or two of one name."""
     sensors = tree.get("sensors")
@@ -205,7 +204,7 @@ def _laid(own: list[dict[str, object]], base: list[dict[str, object]]) -> list[d
     ]
 
 
-def _over_preset(preset: dict[str, object], own: dict[str, object]) -> dict[str, Any]:
+def _over_preset(preset: dict[str, object], own: dict[str, object]) -> Tree:
     """Return a preset's sensor with its own keys laid over it: another way to give the focal length or the place, as a
     calibration does, takes the place of the preset's."""
     preset, place = copy.deepcopy(preset), own.get("place")
@@ -224,7 +223,7 @@ def _complete(
     number: int,
     tree: dict[str, object],
     fills: Iterable[Callable[[dict[str, object]], dict[str, object]]],
-) -> dict[str, Any]:
+) -> Tree:
     for key in _SHARED:
         if key in own:
             raise ConfigError(

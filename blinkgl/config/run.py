@@ -46,6 +46,7 @@ from blinkgl.config.rig import (
 from blinkgl.config.sensor import fill_sensor
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
+from blinkgl.types.trees import Tree
 
 FILLS = (
     Fill(("quality", "timeline.kind"), fill_quality),
@@ -65,7 +66,7 @@ class RunTemplate:
     tree : plain data as read, overrides applied.   base : folder that relative paths start from.
     """
 
-    tree: dict[str, Any]
+    tree: Tree
     base: Path
 
     def sequence(self, index: int) -> SequenceConfig:

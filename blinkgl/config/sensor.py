@@ -36,6 +36,7 @@ from blinkgl.config.problems import validate
 from blinkgl.config.reader import read_table, shipped
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
+from blinkgl.types.trees import Tree
 
 
 def _emulator_tables(tables: dict[str, dict[str, object]]) -> dict[str, dict[str, object]]:
@@ -83,7 +84,7 @@ class SensorConfig(Config):
     shot_noise_rate_hz: float | None = Field(
         None, ge=0, le=1e4, description="Noise events per second and pixel in the dark."
     )
-    emulators: Annotated[dict[str, dict[str, Any]], AfterValidator(_emulator_tables)] = Field(
+    emulators: Annotated[dict[str, Tree], AfterValidator(_emulator_tables)] = Field(
         {},
         description="Keys of `events:` by emulator, fitted or published for that model. They override the values "
         "above.",
@@ -112,7 +113,7 @@ class SensorConfig(Config):
         tables = (*self.emulators.values(), {"contrast_threshold": self.contrast_threshold})
         return any(table.get(key) is not None for table in tables for key in ("contrast_threshold", "k1"))
 
-    def values(self, emulator: Any) -> dict[str, Any]:
+    def values(self, emulator: object) -> Tree:
         """Return the sensor's values for the keys of the emulator of this name; none for an unknown one."""
         models = EmulatorConfig.members
         if not isinstance(emulator, str) or emulator not in models:
@@ -153,7 +154,7 @@ def _check(table: Mapping[str, object], where: str) -> None:
         validate(SensorConfig, tree, where=where)
 
 
-def sensor_table(name: Any) -> dict[str, Any]:
+def sensor_table(name: Any) -> Tree:
     """Return a copy of a sensor file's table, distributions included. Raises ConfigError as :func:`load_sensor`."""
     if is_sensor_file(name):
         return read_table(name, "a sensor: name, width, height, ...")
@@ -196,7 +197,7 @@ def _has_distributions(node: object) -> bool:
     return any(_has_distributions(child) for child in inside)
 
 
-def fill_sensor(sensor: Any, emulator: object) -> dict[str, Any]:
+def fill_sensor(sensor: Any, emulator: object) -> Tree:
     """Return the keys that ``sensor``, a name or a table, gives to a configuration with ``emulator`` (None: the default
     one); none for an unknown sensor or an invalid table."""
     try:

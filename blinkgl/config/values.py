@@ -30,7 +30,7 @@ def word_or_list(words: tuple, kinds: tuple[str, ...] = ()) -> BeforeValidator:
     """Return a validator that refuses what is neither one of ``words`` nor a list of ``kinds``; pydantic's message
     would name only the union's first member."""
 
-    def check(value: Any) -> Any:
+    def check(value: object) -> Any:
         listed = isinstance(value, (list, tuple)) and kinds
         if not (
             any(value is w or (isinstance(w, str) and value == w) for w in words)

@@ -22,6 +22,7 @@ from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 from blinkgl.machine.extras import install
 from blinkgl.machine.plugins import load_plugins, plugin_files
+from blinkgl.types.trees import Tree
 
 _HELLO_S = 600.0
 _STOP_S = 15.0
@@ -182,7 +183,7 @@ class RayCluster:
                 _temp_dir=f"{self._folder}/r",
             )
 
-    def _ask(self, node: dict[str, Any]) -> Message:
+    def _ask(self, node: Tree) -> Message:
         ray, name = self._ray, node.get("NodeManagerHostname") or node["NodeID"]
         ask = ray.remote(_hello).options(
             num_cpus=1,
@@ -255,7 +256,7 @@ class _Board:
 _maker: Maker | None = None  # of this worker process: Ray gives it one task after another
 
 
-def _open(job: dict[str, Any], plugins: list[str]) -> tuple[Maker, Message]:
+def _open(job: Tree, plugins: list[str]) -> tuple[Maker, Message]:
     global _maker
     import numba
     import ray

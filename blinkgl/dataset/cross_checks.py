@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from blinkgl.config.run import RunTemplate, load_run, without_places
 from blinkgl.config.sequence import SequenceConfig
@@ -20,6 +19,7 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.io.records import open_regular, shown
 from blinkgl.sequence_files.index import INDEX, entry, read_index, task_of
 from blinkgl.sequence_files.sequence_dir import MANIFEST
+from blinkgl.types.trees import Tree
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Results of a verification.
@@ -54,7 +54,7 @@ class Known:
     """A sequence without problems of its own."""
 
     folder: Path
-    manifest: dict[str, Any]
+    manifest: Tree
     config: SequenceConfig
 
 
@@ -146,7 +146,7 @@ def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]
     return problems
 
 
-def _files_of_first(manifest: dict[str, Any]) -> dict[str, Any]:
+def _files_of_first(manifest: Tree) -> Tree:
     """Return files of a sequence, for a rig of its first camera only."""
     if not manifest.get("cameras"):
         return manifest["files"]
@@ -223,7 +223,7 @@ def lost(root: Path, folders: list[Path]) -> list[str]:
     return lines + ([f"and {more} more are missing"] if more else [])
 
 
-def made_with(manifest: dict[str, Any]) -> dict[str, str]:
+def made_with(manifest: Tree) -> dict[str, str]:
     """Return versions and OpenGL, under the names of the run's record."""
     gl = manifest.get("opengl") or {}
     return {
@@ -236,7 +236,7 @@ def _called(template: RunTemplate) -> str:
     return template.check().output.name
 
 
-def comparable(config: SequenceConfig) -> dict[str, Any]:
+def comparable(config: SequenceConfig) -> Tree:
     """Return plain data without what a sequence's own configuration changes: its number, and which of the folders."""
     tree = without_places(json.loads(config.model_dump_json()))
     for key in ("sequences", "first_index"):

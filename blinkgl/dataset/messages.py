@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
-Message = dict[str, Any]
+from blinkgl.types.trees import Tree
+
+Message = Tree
 RUN_FOLDER = ".run"
 """Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and its content is not
 compared."""

@@ -22,7 +22,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
@@ -41,6 +41,7 @@ from blinkgl.io.atomic import (
 from blinkgl.io.records import entries_below, inside, parse, read_text, shown
 from blinkgl.machine.posix import fcntl
 from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
+from blinkgl.types.trees import Tree
 
 FORMAT = "blinkgl-run"
 CHECKSUMS = "checksums.json"
@@ -354,7 +355,7 @@ class RunFolder:
             self._write("dropped.json", dropped)
             self.seal((*_BEGUN, *_ENDED))
 
-    def costs(self) -> list[dict[str, Any]]:
+    def costs(self) -> list[Tree]:
         """Return the last line of each sequence; a line cut by a crash is left out."""
         costs: dict[str, dict[str, object]] = {}
         with contextlib.suppress(FileNotFoundError, AssetError):
@@ -364,7 +365,7 @@ class RunFolder:
                     costs[entry["name"]] = entry
         return list(costs.values())
 
-    def read(self, name: str) -> dict[str, Any] | None:
+    def read(self, name: str) -> Tree | None:
         """Return a JSON file of the folder, checked; None when there is none. Raises OutputError when it is damaged."""
         path = self.path / name
         try:
@@ -379,7 +380,7 @@ class RunFolder:
                 accepted="a readable file; without it the run's recipe is unknown",
             ) from error
 
-    def _write(self, name: str, data: dict[str, Any]) -> None:
+    def _write(self, name: str, data: Tree) -> None:
         with atomic_file(self.path / name) as path, output_errors(path):
             path.write_text(_text(data), encoding="utf-8")
 

@@ -24,7 +24,6 @@ import tarfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,6 +40,7 @@ from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.sequence_files.index import sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest, whole
 from blinkgl.types.events import TOLD, Events
+from blinkgl.types.trees import Tree
 
 _FLOW = LABELS["flow_forward"]
 """The label that makes a sample; without it there is none."""
@@ -153,7 +153,7 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         yield f"{key}.{ending}", path.read_bytes()
 
 
-def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]:
+def _camera(folder: Path, manifest: Tree, t_us: int) -> Tree:
     """Return intrinsics, and the camera's pose at a label's time; nothing where a sequence has no poses."""
     if POSES not in manifest["files"]:
         return {}
@@ -163,7 +163,7 @@ def _camera(folder: Path, manifest: dict[str, Any], t_us: int) -> dict[str, Any]
     return {"K": poses["K"].tolist(), "near": float(poses["near"]), "T_world_cam": T_world_cam.tolist()}
 
 
-def _last_image(folder: Path, manifest: dict[str, Any], t_us: int) -> tuple[int, ExposureLine] | None:
+def _last_image(folder: Path, manifest: Tree, t_us: int) -> tuple[int, ExposureLine] | None:
     """Return number and exposure of the frame camera's last image complete at ``t_us``; None: there was none."""
     if EXPOSURES not in manifest["files"]:
         return None

@@ -43,6 +43,7 @@ from blinkgl.machine.plugins import missing_plugins
 from blinkgl.sequence_files.index import made_folders, sequence_folders
 from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, manifest_problems, read_manifest, verify_sequence
+from blinkgl.types.trees import Tree
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a configuration requires of a sequence's folder: its name, its manifest, its files.
@@ -90,14 +91,14 @@ def unlike(manifest: Mapping[str, object], said: list[tuple[str, object]]) -> li
     ]
 
 
-def misnamed(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+def misnamed(name: str, manifest: Tree, config: SequenceConfig) -> list[str]:
     """Return whether a folder's name differs from its content, with its split or without. "." may have any name."""
     path = sequence_name(config.output, manifest["sequence"])
     wrong = name != "." and name != (path if "/" in name else path.split("/")[1])
     return [f"the folder is called {shown(name)}, but holds {path}"] if wrong else []
 
 
-def not_asked_for(wanted: set[str], manifest: dict[str, Any]) -> list[str]:
+def not_asked_for(wanted: set[str], manifest: Tree) -> list[str]:
     """Return missing and extra files, at most five each."""
     there = set(manifest["files"])
     missing = [f"{file}: missing, config.yaml asks for it" for file in sorted(wanted - there)[:5]]
@@ -208,7 +209,7 @@ def look_at_camera(folder: Path, name: str, manifest: dict[str, object], config:
     return [f"{MANIFEST}: sensor is {shown(manifest.get('sensor'))}, of which config.yaml says nothing"]
 
 
-def events_problems(folder: Path, manifest: dict[str, Any]) -> list[str]:
+def events_problems(folder: Path, manifest: Tree) -> list[str]:
     """Return the problems of the events, all of which are read: storage, order, place, time, number. Raises AssetError,
     EventDataError: the first of them that a reader refuses."""
     start, duration = manifest["t_offset_us"], manifest.get("duration_us") or 0

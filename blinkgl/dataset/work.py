@@ -43,6 +43,7 @@ from blinkgl.gl import GLContext, create_context
 from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.plugins import load_plugins, plugin_versions
 from blinkgl.machine.posix import peak_kib
+from blinkgl.types.trees import Tree
 from blinkgl.version import __version__
 
 _NEWS_EVERY_S = 0.25
@@ -232,7 +233,7 @@ def failed(number: int, error: Exception) -> Message:
 
 def report_of(message: Message) -> SequenceReport:
     """Return the report in a "done" message."""
-    report: dict[str, Any] = {**message["report"], "path": Path(message["report"]["path"])}
+    report: Tree = {**message["report"], "path": Path(message["report"]["path"])}
     return SequenceReport(**report)
 
 
@@ -269,7 +270,7 @@ def _code() -> dict[str, str]:
     )
     rooms = [(f"blinkgl/{name}", package / name) for name in MAKES_BYTES] + [("shaders", shaders)]
     rooms += [(f"configs/{name}", tables / name) for name in SHIPPED_TABLES]
-    sums: dict[str, Any] = {}
+    sums: Tree = {}
     for name, place in rooms:
         digest = sums.setdefault(
             f"code of {name.rpartition('/')[0] if name.endswith('.py') else name}", hashlib.sha256()

@@ -70,7 +70,7 @@ def make_emulator(config: EmulatorConfig, height: int, width: int, seed: int = 0
     return made(height, width, config, seed)
 
 
-def _checked(emulator: Any) -> str:
+def _checked(emulator: object) -> str:
     """Return the class's name in the table. Raises TypeError as :func:`register`."""
     if not (isinstance(emulator, type) and issubclass(emulator, Emulator)):
         raise TypeError(f"{emulator!r} is not a subclass of Emulator")
@@ -80,7 +80,7 @@ def _checked(emulator: Any) -> str:
         if not right:
             raise TypeError(f"emulator {name}: `{part}` {problem}")
 
-    def result(part: str, call: Callable[..., Any], *arguments: Any) -> Any:
+    def result(part: str, call: Callable[..., Any], *arguments: object) -> Any:
         try:
             return call(*arguments)
         except Exception as error:

@@ -109,8 +109,7 @@ def emit(
             continue
         o = i - first
         word = (y << 17) | ((i - row_end + v.width) << 1)
-        on, off, mean_leak = np.float64(constants[i, 0]), np.float64(constants[i, 1]), np.float64(constants[i, 2])
-        pixel = Pixel(i, o, word, on, off, mean_leak, causes, causes and hot[i] > 0)
+        pixel = _pixel(i, o, word, constants[i], causes, causes and hot[i] > 0)
         leak = np.float64(leaks[i]) if leaks.size else 0.0
         k = _time_constants(intensity[i], intensity_end[o], v.kappa) if lag.size else -1.0
         curve = _curve(_ends(x, x_end, i, o), _ends(lag, lag_end, i, o), _ends(noise, noise_end, i, o), k, leak, v)
@@ -194,6 +193,22 @@ def _ends(before, now, i, o):
 
 
 @register_jitable
+def _pixel(number, offset, word, constants, explained, hot):
+    """Return the :class:`Pixel` of these constants: ON threshold, OFF threshold, mean leak."""
+    on, off, mean_leak = np.float64(constants[0]), np.float64(constants[1]), np.float64(constants[2])
+    return Pixel(
+        number=number,
+        offset=offset,
+        word=word,
+        on=on,
+        off=off,
+        mean_leak=mean_leak,
+        explained=explained,
+        hot=hot,
+    )
+
+
+@register_jitable
 def _time_constants(intensity, intensity_end, kappa):
     """Return the time constants of the low-pass in the interval, as in v2e_model.relax but in double precision."""
     return kappa * (0.5 * (np.float64(intensity) + np.float64(intensity_end)) + 20.0)
@@ -206,15 +221,22 @@ def _curve(x, lag, noise, k, leak, v):
     noise_change, dx = noise[1] - noise[0], x[1] - x[0]
     base, drift = x[0] + noise[0] + leak * v.since_epoch_0, noise_change + leak * (v.dt_ns * 1e-9)
     c, rise, fall = curve_of(base, drift, dx, lag[0], k)
-    return Curve(c, rise, fall, k, base + drift + dx + lag[1], noise[0], noise_change)
+    end = base + drift + dx + lag[1]
+    return Curve(c=c, rise=rise, fall=fall, k=k, end=end, noise=noise[0], noise_change=noise_change)
 
 
 @register_jitable
 def _with_leak(curve, change, v):
     """Return the curve with ``change`` more leak, ln units a second, since the leak epoch."""
-    c, end = curve.c + change * v.since_epoch_0, curve.end + change * v.since_epoch_1
-    rise = curve.rise + change * (v.dt_ns * 1e-9)
-    return Curve(c, rise, curve.fall, curve.k, end, curve.noise, curve.noise_change)
+    return Curve(
+        c=curve.c + change * v.since_epoch_0,
+        rise=curve.rise + change * (v.dt_ns * 1e-9),
+        fall=curve.fall,
+        k=curve.k,
+        end=curve.end + change * v.since_epoch_1,
+        noise=curve.noise,
+        noise_change=curve.noise_change,
+    )
 
 
 @register_jitable

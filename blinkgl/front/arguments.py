@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from blinkgl.errors import ConfigError
+from blinkgl.types.trees import Tree
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
@@ -77,12 +78,12 @@ def plain(value: object) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def given(**arguments: object) -> dict[str, Any]:
+def given(**arguments: object) -> Tree:
     """Return the arguments that are not None, as plain data."""
     return {name: plain(value) for name, value in arguments.items() if value is not None}
 
 
-def path(value: Any, where: str) -> Path:
+def path(value: object, where: str) -> Path:
     """Return a path. Raises ConfigError: not a path."""
     if not isinstance(value, (str, os.PathLike)) or not str(value):
         raise ConfigError("not a path", where=where, value=value, accepted="text or a pathlib.Path")

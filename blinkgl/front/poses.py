@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, TypeVar, get_origin
+from typing import ClassVar, Literal, TypeVar, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from blinkgl.config.poses import KeyedMotionConfig, PoseConfig, TrajectoryConfig
 from blinkgl.config.problems import validate
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
+from blinkgl.types.trees import Tree
 
 Vector = Sequence[float] | np.ndarray
 P = TypeVar("P", bound="Piece")
@@ -23,7 +24,7 @@ P = TypeVar("P", bound="Piece")
 class Piece:
     """A value that is checked at creation. ``tree``: itself as plain data, as in the YAML."""
 
-    tree: dict[str, Any]
+    tree: Tree
     _called: ClassVar[Mapping[str, str]] = {}
     """Arguments of the model's keys that have other names; "": the keys' own names."""
 
@@ -31,7 +32,7 @@ class Piece:
         if "__init__" in vars(cls):
             cls.__init__ = check.public()(cls.__init__)
 
-    def _checked(self, model: type[Config], tree: dict[str, object], **renamed: str) -> dict[str, Any]:
+    def _checked(self, model: type[Config], tree: dict[str, object], **renamed: str) -> Tree:
         """Return ``tree`` unchanged if the model accepts it. renamed : further names, as of :attr:`_called`."""
         names = {**self._called, **renamed}
 
@@ -169,7 +170,7 @@ class Trajectory(Piece):
         file: str | os.PathLike,
         *,
         T_body_sensor: ArrayLike | str | os.PathLike | None = None,
-        **keys: Any,
+        **keys: object,
     ):
         there = check.path(file, "Trajectory.file").expanduser().absolute()
         tree = check.given(file=there, **keys)
@@ -182,7 +183,7 @@ class Trajectory(Piece):
         check.existing(there, "Trajectory.file")
 
 
-def motion_tree(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> dict[str, Any]:
+def motion_tree(pose: Pose | Keyframes | Trajectory | Vector, where: str, others: str = "") -> Tree:
     """Return the table of a motion; a position alone is a pose. others : other accepted values, for the message."""
     if isinstance(pose, (Pose, Keyframes, Trajectory)):
         return pose.tree

@@ -16,6 +16,7 @@ from blinkgl.scene import types as data
 from blinkgl.scene.geometry.meshes import make_mesh, transform_mesh
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.worlds.from_file import CV_FROM_GL, split_rigid
+from blinkgl.types.trees import Tree
 
 Theirs = Any  # an object of pyrender, which is not imported
 _TRIANGLES, _REPEAT = 4, 10497  # OpenGL's codes
@@ -28,7 +29,7 @@ class Taken(NamedTuple):
     lens: dict[str, float]
     place: Pose
     bodies: list[tuple[data.Mesh, Material, Pose, str]]
-    lights: list[dict[str, Any]]
+    lights: list[Tree]
     background: float
     notes: tuple[str, ...]
 

@@ -40,6 +40,7 @@ from blinkgl.scene.geometry.meshes import make_mesh
 from blinkgl.scene.surfaces.coats import COATS
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
+from blinkgl.types.trees import Tree
 
 
 @signed_by(CameraConfig)
@@ -64,7 +65,7 @@ class Camera(Piece):
         *,
         calibration: str | os.PathLike | None = None,
         pose: Pose | Keyframes | Trajectory | Vector = (0.0, 0.0, 0.0),
-        **keys: Any,
+        **keys: object,
     ):
         table = {"near": 0.05, **check.given(width=width, height=height, **keys)}
         if calibration is None:
@@ -87,7 +88,7 @@ class Body(Piece):
     velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes. Raises
     ConfigError; a missing MuJoCo and intersecting bodies raise when the scene is built."""
 
-    def __init__(self, kind: Literal["dynamic", "fixed", "none"] = "dynamic", **keys: Any):
+    def __init__(self, kind: Literal["dynamic", "fixed", "none"] = "dynamic", **keys: object):
         self.tree = self._checked(BodyConfig, check.given(kind=kind, **keys))
 
 
@@ -153,7 +154,7 @@ class Way(Piece):
 class _Object(Piece):
     """Common base of primitives and meshes: an object of the scene, its mesh and its material."""
 
-    mesh: dict[str, Any]
+    mesh: Tree
     triangles: data.Mesh | None = None
     notes: tuple[str, ...] = ()  # what was not taken from another program's scene
 
@@ -167,7 +168,7 @@ class _Object(Piece):
         body: Body | None,
         deform: Deform | None,
         animation: str | int | Animation | None = None,
-    ) -> dict[str, Any]:
+    ) -> Tree:
         kind = type(self).__name__
         self.material = None if material is None else check.one_of(material, f"{kind}.material", Material, "a Material")
         motion = {"way": pose.tree} if isinstance(pose, Way) else motion_tree(pose, f"{kind}.pose", "Way, ")
@@ -369,7 +370,7 @@ class Scene(Piece):
         return cls(camera, bodies, **keys)
 
     @functools.cached_property
-    def _listed(self) -> tuple[dict[str, Any], InMemory]:
+    def _listed(self) -> tuple[Tree, InMemory]:
         """The scene as plain data, with meshes, materials and objects by name, and those parts that are made of
         arrays."""
         falls = any(body.tree.get("physics", {}).get("kind") == "dynamic" for body in self.objects)
@@ -406,7 +407,7 @@ class Scene(Piece):
         return tree, memory
 
     @property
-    def tree(self) -> dict[str, Any]:  # pyrefly: ignore [bad-override]
+    def tree(self) -> Tree:  # pyrefly: ignore [bad-override]
         return self._listed[0]
 
     def __add__(self, body: Primitive | Mesh) -> Scene:

@@ -12,6 +12,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.labels import LABELS
+from blinkgl.types.trees import Tree
 
 Section = str | Mapping[str, Any] | Config
 """A section of a configuration: the name of a preset or kind, a table of its keys, or the model itself."""
@@ -26,7 +27,7 @@ _EXAMPLES = {
 """Arguments that are a name, a table, or a configuration, and a table of each, for messages."""
 
 
-def section_tree(argument: str, section: Section) -> dict[str, Any]:
+def section_tree(argument: str, section: Section) -> Tree:
     """Return the section that an argument of :data:`_EXAMPLES` gives, as plain data. A text sets the first choice that
     the section's model has: an emulator, a preset, a way to choose points. Raises ConfigError."""
     from blinkgl.recordings.simulation import emulator_config
@@ -74,11 +75,11 @@ def is_interval(label: object) -> bool:
     return isinstance(label, (int, float)) and not isinstance(label, bool)
 
 
-def labels_tree(labels: Sequence[str | float]) -> dict[str, Any]:
+def labels_tree(labels: Sequence[str | float]) -> Tree:
     """Return the ``labels:`` that requests exactly these. Raises ConfigError as :func:`label_names`."""
     wanted = label_names(labels)
     everything: dict[str, object] = {}
-    asked: dict[str, Any] = {}
+    asked: Tree = {}
     for label in LABELS.values():
         label.ask(everything)
         if label.said in wanted:
@@ -97,7 +98,7 @@ class Timeline:
     Raises ConfigError."""
 
     @check.public()
-    def __init__(self, kind: str = "displacement", **values: Any):
+    def __init__(self, kind: str = "displacement", **values: object):
         self.tree = {"kind": check.plain(kind), **check.plain(values)}
         with placed(lambda where: where.replace("timeline", "Timeline", 1)):
             validate_field(SequenceConfig, "timeline", self.tree)
@@ -115,7 +116,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def sections(arguments: Mapping[str, object]) -> dict[str, Any]:
+def sections(arguments: Mapping[str, object]) -> Tree:
     """Return the sections of the configuration that the arguments give, without those that are None. Raises
     ConfigError."""
     return {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from blinkgl.config.sensor import SensorConfig, load_sensor as _load_sensor
 from blinkgl.events import Emulator
@@ -30,17 +29,17 @@ def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, val
 
 
 @check.public()
-def Esim(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
+def Esim(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: object) -> Emulator:
     return _made("esim", height, width, seed, sensor, values)
 
 
 @check.public()
-def V2e(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
+def V2e(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: object) -> Emulator:
     return _made("v2e", height, width, seed, sensor, values)
 
 
 @check.public()
-def DvsVoltmeter(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
+def DvsVoltmeter(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: object) -> Emulator:
     return _made("voltmeter", height, width, seed, sensor, values)
 
 

@@ -41,7 +41,7 @@ class Light(Piece):
         *,
         lights: Sequence[Mapping[str, Any]] = (),
         environment: Mapping[str, Any] | None = None,
-        **keys: Any,
+        **keys: object,
     ):
         check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
         renamed = {argument: key for key, argument in self._called.items()}
@@ -75,7 +75,7 @@ class Material(Piece):
     Maps are files, or arrays (h, w, 3) uint8, of the mask (h, w) uint8.
     Raises ConfigError."""
 
-    def __init__(self, image: str | os.PathLike | np.ndarray | None = None, **keys: Any):
+    def __init__(self, image: str | os.PathLike | np.ndarray | None = None, **keys: object):
         if "texture" in keys:  # the YAML's name, which the argument's name would overwrite
             raise ConfigError("has another name", where="Material.texture", accepted="image=…, as in Material(image)")
         maps = {key: keys[key] for key in MAPS if keys.get(key) is not None}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from blinkgl.imaging.sensor import encode, mosaic, readings
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.colour import LUMA
 from blinkgl.render.moment import View
+from blinkgl.types.trees import Tree
 
 if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer
@@ -138,7 +139,7 @@ class FrameCamera:
             pictures=pictures,
         )
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Tree:
         """Return plain values for a manifest."""
         return {
             "images": self.taken,

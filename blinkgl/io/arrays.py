@@ -284,7 +284,7 @@ def _candidates(
     return [(name, lambda name=name: table(name)) for name in called or rows]
 
 
-def _of_columns(columns: Mapping[str, str], arrays: Mapping[str, np.ndarray], where: str, **known: Any) -> Table:
+def _of_columns(columns: Mapping[str, str], arrays: Mapping[str, np.ndarray], where: str, **known: object) -> Table:
     chosen_ = {slot: np.asarray(arrays[name]) for slot, name in columns.items()}
     if isinstance(arrays.get("cause"), np.ndarray):
         chosen_["cause"] = arrays["cause"]

@@ -85,7 +85,7 @@ class Data(_Held):
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, place: Any) -> np.ndarray:
+    def __getitem__(self, place: object) -> np.ndarray:
         """Return the values at ``place``, integers and slices. Raises AssetError: as :meth:`check`; more than fits into
         memory; damaged."""
         self.check()

@@ -117,7 +117,7 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
         data.check()
     units = next((u for key in ("unit", "units") if (u := columns["t"].attribute(key)) is not None), None)
     place = columns["t"].name.rpartition("/")[0]
-    layout: dict[str, Any] = {}
+    layout: dict[str, object] = {}
     if any(key in holder for key in _MILLISECONDS for holder in (file, group)) and columns["t"].dtype.kind in "iu":
         layout = {"unit": "us"}
     elif place == "events" and all(

@@ -18,7 +18,7 @@ from blinkgl.types.numbers import is_number
 _MOST_SIDE = 65536
 
 
-def listed(table: Mapping[Any, Any], value: Any, problem: str, where: str | os.PathLike, accepted: str = "") -> Any:
+def listed(table: Mapping[Any, Any], value: object, problem: str, where: str | os.PathLike, accepted: str = "") -> Any:
     """Return what a closed list has for a value of a file's field. Raises AssetError: the value is not in it."""
     if value not in table:
         accepted = accepted or ", ".join(map(str, table))

@@ -468,7 +468,7 @@ def _av(error: type, where: str | os.PathLike) -> Any:
 
 
 @contextlib.contextmanager
-def _logged(av: Any) -> Iterator[list[str]]:
+def _logged(av: object) -> Iterator[list[str]]:
     """Return the lines that FFmpeg reports from this thread, filled at the end."""
     lines: list[str] = []
     level = av.logging.get_level()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Label, Shot, Towards, View
 from blinkgl.labels.values import Flow
+from blinkgl.types.trees import Tree
 
 
 def seconds_of(labels: LabelsConfig) -> tuple[float, ...]:
@@ -37,7 +37,7 @@ class FlowTo(Label):
     def asked(self, labels: LabelsConfig) -> bool:
         return self.towards in labels.flow
 
-    def ask(self, tree: dict[str, Any]) -> None:
+    def ask(self, tree: Tree) -> None:
         tree["flow"] = [*tree.get("flow", ()), self.towards]
 
     def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:

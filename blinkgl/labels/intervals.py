@@ -14,6 +14,7 @@ from blinkgl.labels.files import Form
 from blinkgl.labels.flow import seconds_of
 from blinkgl.labels.label import Drawn, Label
 from blinkgl.labels.values import Flow
+from blinkgl.types.trees import Tree
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ class FlowIntervals(_OverIntervals):
     def asked(self, labels: LabelsConfig) -> bool:
         return bool(seconds_of(labels))
 
-    def ask(self, tree: dict[str, Any]) -> None:
+    def ask(self, tree: Tree) -> None:
         tree["flow"] = [*tree.get("flow", ()), 0.01]
 
     def finish(self, drawn: Drawn) -> Flows:

@@ -7,7 +7,7 @@ missing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
@@ -94,11 +94,11 @@ class View:
     title: str
     unit: str
     kind: str
-    of: Any
-    reference: Any
+    of: Callable[[Any], np.ndarray]
+    reference: Callable[[Scene, ReferenceFrame], np.ndarray]
     judged_in: str
     tolerance: float
-    error: Any = grading.absolute
+    error: Callable[[np.ndarray, np.ndarray, float], np.ndarray] = grading.absolute
     statistic: Literal["max", "mean"] = "max"
     same_triangle: bool = True
     note: str = ""

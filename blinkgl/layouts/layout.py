@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -125,7 +125,7 @@ def _check_space(place: Path, size: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def keep(file: h5py.File, name: str, array: np.ndarray, **packed: Any) -> None:
+def keep(file: h5py.File, name: str, array: np.ndarray, **packed: object) -> None:
     """Store a whole array. packed : as of :func:`~blinkgl.io.hdf5.packing`."""
     _check_space(Path(file.filename), array.nbytes)
     file.create_dataset(name, data=array, track_times=False, **packed)

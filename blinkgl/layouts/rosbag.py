@@ -15,7 +15,7 @@ import heapq
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,6 +26,9 @@ from blinkgl.io.imu import read_imu
 from blinkgl.io.ros import FLOW, event_array, typestore
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.source import Source
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 _PACKET_US = 10_000
 Message = tuple[int, str, str, Any]
@@ -64,7 +67,7 @@ class RosBag(Layout):
         )
 
 
-def _camera(source: Source, topic: str, store: Any) -> Iterator[Iterator[Message]]:
+def _camera(source: Source, topic: str, store: Typestore) -> Iterator[Iterator[Message]]:
     """Yield the streams of one camera, each in order of time."""
     yield _events(source, f"{topic}/events")
     flows = source.flow_times("forward")
@@ -96,12 +99,12 @@ def _events(source: Source, topic: str) -> Iterator[Message]:
 _IMAGE = "sensor_msgs/msg/Image"
 
 
-def _header(store: Any, t_us: int, frame: str = "cam0") -> object:
+def _header(store: Typestore, t_us: int, frame: str = "cam0") -> object:
     stamp = store.types["builtin_interfaces/msg/Time"](sec=t_us // 10**6, nanosec=t_us % 10**6 * 1000)
     return store.types["std_msgs/msg/Header"](seq=0, stamp=stamp, frame_id=frame)
 
 
-def _image(store: Any, t_us: int, encoding: str, image: np.ndarray) -> object:
+def _image(store: Typestore, t_us: int, encoding: str, image: np.ndarray) -> object:
     """Return an image, or a map of float32, as a message."""
     rows = np.ascontiguousarray(image, np.uint8 if encoding == "mono8" else "<f4")
     size = {"height": image.shape[0], "width": image.shape[1], "step": rows.strides[0]}
@@ -109,7 +112,7 @@ def _image(store: Any, t_us: int, encoding: str, image: np.ndarray) -> object:
     return store.types[_IMAGE](header=_header(store, t_us), encoding=encoding, is_bigendian=0, data=data, **size)
 
 
-def _flow(source: Source, k: int, t_us: int, store: Any) -> Any:
+def _flow(source: Source, k: int, t_us: int, store: Typestore) -> Any:
     """Return the flow in px/s as a message: the velocity at the time, else the mean over the label's interval."""
     if source.count("velocity"):
         speed = source.value("velocity", k)
@@ -121,7 +124,7 @@ def _flow(source: Source, k: int, t_us: int, store: Any) -> Any:
     return store.types[FLOW](header=_header(store, t_us), flow_x=u, flow_y=v, **size)
 
 
-def _camera_info(source: Source, t_us: int, store: Any) -> tuple[str, object]:
+def _camera_info(source: Source, t_us: int, store: Typestore) -> tuple[str, object]:
     kind, camera = "sensor_msgs/msg/CameraInfo", source.camera
     assert camera is not None
     flat = isinstance(camera, PinHole)
@@ -143,11 +146,11 @@ def _camera_info(source: Source, t_us: int, store: Any) -> tuple[str, object]:
     )
 
 
-def _vector(store: Any, kind: str, values: np.ndarray) -> object:
+def _vector(store: Typestore, kind: str, values: np.ndarray) -> object:
     return store.types[f"geometry_msgs/msg/{kind}"](**dict(zip("xyzw", values.tolist())))
 
 
-def _poses(source: Source, store: Any) -> Iterator[Message]:
+def _poses(source: Source, store: Typestore) -> Iterator[Message]:
     for t_ns, pose in zip(source.poses.get("t_ns", []), source.poses.get("T_world_cam", [])):
         place, turn = _vector(store, "Point", pose[:3, 3]), Rotation.from_matrix(pose[:3, :3]).as_quat()
         body = store.types["geometry_msgs/msg/Pose"](position=place, orientation=_vector(store, "Quaternion", turn))
@@ -155,7 +158,7 @@ def _poses(source: Source, store: Any) -> Iterator[Message]:
         yield int(t_ns), "/pose", kind, store.types[kind](header=_header(store, int(t_ns) // 1000, "map"), pose=body)
 
 
-def _imu(source: Source, store: Any) -> Iterator[Message]:
+def _imu(source: Source, store: Typestore) -> Iterator[Message]:
     if source.unit is None:
         return
     arrays, kind, unknown = read_imu(source.unit), "sensor_msgs/msg/Imu", np.zeros(9)

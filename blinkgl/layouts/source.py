@@ -31,6 +31,7 @@ from blinkgl.sequence_files.index import made_folders
 from blinkgl.sequence_files.rig_dir import CAM_TO_CAM, read_sensors
 from blinkgl.sequence_files.sequence_dir import is_rig_folder, whole
 from blinkgl.types.events import Events
+from blinkgl.types.trees import Tree
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Source:
     inertial unit, its own or another of its rig; None: there is none."""
 
     folder: Path
-    manifest: dict[str, Any]
+    manifest: Tree
     name: str
     beside: Path | None = None
     unit: Path | None = None

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from blinkgl.recordings.search import Search
 from blinkgl.recordings.simulation import INTERPOLATIONS, emulator_config
 from blinkgl.recordings.statistics import GroupSums, correlation, interval_distance, sums
 from blinkgl.types.events import Events
+from blinkgl.types.trees import Tree
 
 LEAST_EVENTS = 2000
 _STILL = "A still scene of middle brightness was assumed: what depends on light, or its change, is not in it."
@@ -91,7 +91,7 @@ class Calibration:
     gamma: str | float | None = None
     warnings: list[str] = field(default_factory=list)
 
-    def sensor(self) -> dict[str, Any]:
+    def sensor(self) -> Tree:
         """Return the table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
         name, (height, width) = self.config.emulator, self.clip.sensor
         seconds = [(self.clip.edges_us[b] - self.clip.edges_us[a]) / 1e6 for a, b in self.halves]

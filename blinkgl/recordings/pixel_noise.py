@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.integrate import trapezoid
@@ -26,6 +25,7 @@ from blinkgl.events.pixels import PixelNoise
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.recordings.clip import read_recording
 from blinkgl.types.events import Events
+from blinkgl.types.trees import Tree
 
 LEAST_EVENTS = 500
 """Events per half; fewer do not determine a spread over pixels."""
@@ -78,7 +78,7 @@ class PixelFit:
     def rate_ratio(self) -> float:
         return self.simulated / max(self.recorded, 1)
 
-    def sensor(self) -> dict[str, Any]:
+    def sensor(self) -> Tree:
         """Return the table of a sensor file (:class:`~blinkgl.config.sensor.SensorConfig`)."""
         file = os.path.basename(self.recording)
         values = {k: float(f"{v:.4g}") for k, v in self.config.model_dump(exclude_defaults=True).items()}

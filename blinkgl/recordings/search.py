@@ -8,7 +8,6 @@ Econometrica 57, 1989). Parameters that the data do not determine are left at th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -19,6 +18,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.recordings.clip import Clip
 from blinkgl.recordings.simulation import emulator_config
 from blinkgl.recordings.statistics import GroupSums, Targets, sums, target
+from blinkgl.types.trees import Tree
 
 TRIED = 64
 """Number of random settings over the whole range of the parameters; the best are the starts."""
@@ -68,7 +68,7 @@ class Search:
         self.evaluations = 0
         self.undetermined: dict[str, str] = {}
         self.cost = float("nan")
-        self._set: dict[str, Any] = {}
+        self._set: Tree = {}
         self.keys: list[str] = []
         self.place: np.ndarray = np.empty(0)
         self._jacobian: np.ndarray = np.empty((0, 0))

@@ -141,7 +141,7 @@ class Frame:
         self._check()
         return self._memory.view(name, self)
 
-    def tensor(self, device: Any = "cuda", name: str = "") -> Any:
+    def tensor(self, device: object = "cuda", name: str = "") -> Any:
         """Return an output as a new torch tensor, (H, W) or (H, W, C), dtype of its format.
 
         device : torch's. On the GPU that draws it, the picture stays there if CUDA can share it; see
@@ -150,7 +150,7 @@ class Frame:
         self._check()
         return self._memory.tensor(device, name)
 
-    def transfer(self, device: Any = "cuda", name: str = "") -> str:
+    def transfer(self, device: object = "cuda", name: str = "") -> str:
         """Return the way of :meth:`tensor`: "interop", "pinned" or "plain", with the reason why no faster way is
         used."""
         self._check()
@@ -241,7 +241,7 @@ class Memory:
             self._readers[i, str(device)] = TextureReader(self.painter.gl, self.target, i, device)
         return self._readers[i, str(device)]
 
-    def tensor(self, device: Any, name: str) -> Any:
+    def tensor(self, device: object, name: str) -> Any:
         """Return a new tensor."""
         components = self.outputs[self.attachment(name)].components
         reader = self.reader(device, name)

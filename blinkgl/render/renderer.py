@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -355,7 +355,7 @@ class Labels:
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:
             drawn = _read(self._drawn(names, t_ns, ends), names)
-        values: dict[str, Any] = {}
+        values: dict[str, object] = {}
         for name in request:
             if LABELS[name].anti_aliased:
                 at = self._moment(t_ns)

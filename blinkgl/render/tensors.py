@@ -52,7 +52,7 @@ class TextureReader:
 
     way : "interop", "pinned" or "plain".   why : one line, why no faster way is used; "" for the fastest."""
 
-    def __init__(self, gl: GLContext, target: Target, i: int, device: Any, driver: Any = None):
+    def __init__(self, gl: GLContext, target: Target, i: int, device: object, driver: object = None):
         self._gl, self._target, self._i = gl, target, i
         self._torch, self.device = torch_device(device)
         self._resource: Any = None

@@ -27,6 +27,7 @@ from blinkgl.labels import LABELS
 from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.sequence_files.index import entry, sequence_folders, task_of
 from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
+from blinkgl.types.trees import Tree
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
@@ -58,12 +59,12 @@ class Collected:
     """The contents of a data set's page."""
 
     root: Path
-    sequences: list[dict[str, Any]]
+    sequences: list[Tree]
     """Lines of the index, one per camera: a rig's sequence has several."""
     plan: Plan | None
     environment: dict[str, str]
     failed: dict[str, str]
-    costs: list[dict[str, Any]]
+    costs: list[Tree]
     quantities: dict[str, np.ndarray] = field(default_factory=dict)
     examples: list[Example] = field(default_factory=list)
     parameters: list[Parameter] = field(default_factory=list)
@@ -182,7 +183,7 @@ def _value(folder: Path, name: str, flow: Path) -> Any:
     return form.read(path) if form.read is not None and path.is_file() else None
 
 
-def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> list[int]:
+def _spread(sequences: list[Tree], order: list[int], count: int) -> list[int]:
     """Choose from each (split, kind of name, emulator) in turn, so that rare kinds appear, too."""
     kinds: dict[tuple, list[int]] = {}
     for number in order:
@@ -196,7 +197,7 @@ def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> li
     return chosen
 
 
-def _pictures(folder: Path, line: dict[str, Any], index: int, t_us: int) -> list[tuple[str, np.ndarray]]:
+def _pictures(folder: Path, line: Tree, index: int, t_us: int) -> list[tuple[str, np.ndarray]]:
     """Return headings and pictures of the frame camera, the labels but flow, and the tracks at a label's time."""
     file, pictures = folder / LABELS["images"].forms[0].file(index), []
     image = _rgb(read_image(file)) if file.is_file() else None

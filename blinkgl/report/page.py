@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ from blinkgl.io.atomic import write_whole
 from blinkgl.report.charts import histogram, number, png, render, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
 from blinkgl.sequence_files.index import write_index
+from blinkgl.types.trees import Tree
 
 _MAX_PICTURE_PX = 360
 _MAX_LISTED = 50
@@ -70,7 +70,7 @@ def build_report(collected: Collected) -> str:
     )
 
 
-def _causes(sequences: list[dict[str, Any]]) -> list[tuple[str, str]]:
+def _causes(sequences: list[Tree]) -> list[tuple[str, str]]:
     """Return tiles: rates per pixel by cause, over the sequences that store causes."""
     known = [x for x in sequences if x.get("events_by_cause") and x["duration_us"]]
     pixel_seconds = sum(x["duration_us"] * 1e-6 * x["width"] * x["height"] for x in known)
@@ -91,7 +91,7 @@ def _groups(collected: Collected) -> list[tuple[str, int, int]]:
     return [(name or "all", here[name], count - apart[name]) for name, count in collected.plan.counts.items()]
 
 
-def _example(example: Example) -> dict[str, Any]:
+def _example(example: Example) -> Tree:
     pictures = [(title, png(_small(array))) for title, array in example.pictures]
     return {"name": example.name, "caption": example.caption, "pictures": pictures}
 
@@ -108,7 +108,7 @@ def _distributions(q: dict[str, np.ndarray]) -> list[tuple]:
     return [(title, unit, histogram(q[key], log=log)) for key, title, log, unit in charts if key in q and q[key].size]
 
 
-def _parameter(p: Parameter) -> dict[str, Any]:
+def _parameter(p: Parameter) -> Tree:
     shown: dict[str, object] = {
         "path": p.path,
         "group": p.group or "all",
@@ -159,7 +159,7 @@ def _counts(p: Parameter) -> list[tuple[str, float, float | None]]:
     return [(key, counted[key], share * len(p.values)) for key, share in expected.items()]
 
 
-def _cost(costs: list[dict[str, Any]]) -> dict[str, Any]:
+def _cost(costs: list[Tree]) -> Tree:
     seconds: defaultdict[str, float] = defaultdict(float)
     for c in costs:
         for stage, value in c["seconds"].items():

@@ -32,6 +32,7 @@ from blinkgl.sequence.sensor import SensorSimulation
 from blinkgl.tensors.choice import make_on_device, on_device
 from blinkgl.timeline import make_timeline
 from blinkgl.types.events import Events
+from blinkgl.types.trees import Tree
 
 SURFACES = LabelRequest("ids", "depth", "velocity")
 """Labels that give the truth of an event."""
@@ -277,19 +278,19 @@ class RenderedSequence(SensorSimulation):
         rng = generator(self.config.seed, self.index, Role.TRACKS, self.number)
         return track_points(scene, config, times, rng)
 
-    def _crowded(self) -> dict[str, Any]:
+    def _crowded(self) -> Tree:
         """Return the manifest's entry on event frames that are drawn with samples, for all their lines."""
         if self.timeline is None or self.renderer.antialiasing == self.config.render.antialiasing:
             return {}
         return {"antialiasing": {"drawn": self.renderer.antialiasing, "because": self.renderer.crowded}}
 
-    def _facts_of_labels(self) -> dict[str, Any]:
+    def _facts_of_labels(self) -> Tree:
         labels, facts = self.config.labels, {}
         for name in asked_for(labels):
             facts.update(LABELS[name].facts(self.renderer.scene, labels))
         return facts
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Tree:
         gl, scene, physics = self.renderer.gl, self.renderer.scene, {}
         if (falling := scene.dynamics) is not None:
             physics["dynamics"] = {
@@ -328,7 +329,7 @@ def nothing_in_view(scene: Scene) -> tuple[str, ...]:
     return ("no body is ever in the camera's view: its pose may be meant otherwise",) if bodies else ()
 
 
-def _described(one: SceneObject) -> dict[str, Any]:
+def _described(one: SceneObject) -> Tree:
     """Return the description of a body for users without the scene: its box at rest in its own axes, and for each part
     the source of its mesh and its material."""
     corners = np.concatenate([part.mesh.vertices for part in one.parts]) if one.parts else np.zeros((1, 3))

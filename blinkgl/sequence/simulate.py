@@ -33,6 +33,7 @@ from blinkgl.sequence.rendered import RenderedSequence
 from blinkgl.sequence.request import Item, SequenceRequest, StageClock
 from blinkgl.sequence.sensor import SensorSimulation
 from blinkgl.timeline import together
+from blinkgl.types.trees import Tree
 
 
 def simulate_sequence(request: SequenceRequest, gl: GLContext | None = None) -> Simulation:
@@ -181,7 +182,7 @@ class Simulation(Closing):
         return self.members[0].libraries if self.members else {}
 
 
-def _summed(tables: Any) -> dict[str, Any]:
+def _summed(tables: Any) -> Tree:
     total: Counter[str] = Counter()
     for table in tables:
         total.update(table)

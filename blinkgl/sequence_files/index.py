@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Iterator
 from operator import itemgetter
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
@@ -23,6 +22,7 @@ from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.records import HereOrInside, inside, parse, read_text, shown
 from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
+from blinkgl.types.trees import Tree
 
 INDEX = "index.jsonl"
 _KEYS = (
@@ -72,7 +72,7 @@ _SOMETIMES = ("events_by_cause", "sensor")
 """Keys that only some manifests have."""
 
 
-def entry(root: Path, folder: Path) -> dict[str, Any]:
+def entry(root: Path, folder: Path) -> Tree:
     """Return a sequence's line. Raises AssetError for a damaged manifest."""
     manifest = read_manifest(folder)
     return {
@@ -84,7 +84,7 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
     }
 
 
-def task_of(line: dict[str, Any]) -> str:
+def task_of(line: Tree) -> str:
     """Return the folder that the task behind a line of the index wrote; for a camera of a rig, the rig's folder."""
     path = PurePosixPath(line["path"])
     return str(path.parent if "sensor" in line else path)
@@ -118,7 +118,7 @@ class _Line(BaseModel):
 _MODEL = TypeAdapter(_Line)
 
 
-def read_index(root: str | Path) -> list[dict[str, Any]]:
+def read_index(root: str | Path) -> list[Tree]:
     """Return the lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves the data set or is
     listed twice."""
     path = Path(root) / INDEX

@@ -15,7 +15,7 @@ import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
@@ -29,6 +29,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.dsec import write_rectify_map
 from blinkgl.io.records import PlainName, first_problem
 from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter
+from blinkgl.types.trees import Tree
 
 
 def sensors_yaml(sensors: Sequence[RigSensorConfig]) -> str:
@@ -85,7 +86,7 @@ class _Sensors(BaseModel):
 _MODEL = TypeAdapter(_Sensors)
 
 
-def read_sensors(folder: str | os.PathLike) -> dict[str, dict[str, Any]]:
+def read_sensors(folder: str | os.PathLike) -> dict[str, Tree]:
     """Return the sensors of a rig's folder, by name, as in ``rig.yaml``, with ``T_rig_sensor`` as (4, 4) float64.
 
     Raises AssetError, ConfigError: no such file, or damaged."""

@@ -62,6 +62,7 @@ from blinkgl.io.records import (
 from blinkgl.labels import Form, Label, label_of
 from blinkgl.sequence_files.manifest import MODEL, RIG_MODEL
 from blinkgl.types.events import Events
+from blinkgl.types.trees import Tree
 
 MANIFEST = "manifest.json"
 RIG = "rig.yaml"
@@ -116,11 +117,11 @@ class SequenceWriter:
         self.height, self.width = height, width
         self.config_yaml, self.t_offset_us = config_yaml, int(t_offset_us)
         self.labels = labels
-        self.info: dict[str, Any] = {}
+        self.info: Tree = {}
         self.t_end_us: int | None = None
         self.lost: dict[str, int] = {}
         self._with_events, self._with_truth, self.codec = events, truth, codec
-        self._files: dict[str, dict[str, Any]] = {}
+        self._files: dict[str, Tree] = {}
         self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
         self._exposures: list[ExposureLine] = []
@@ -187,7 +188,7 @@ class SequenceWriter:
             # A copy: the thread writes them after the caller has continued.
             self._submit(partial(self._truth.append, events.copy()))
 
-    def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
+    def label(self, name: str, index: int, value: object, t_us: int, to_us: int | None = None) -> None:
         """Write the ``index``-th value of a label (:mod:`blinkgl.labels`) at ``t_us``; ``to_us``: its other time, if it
         has one. Pixels that a format cannot hold are counted in ``lost`` and the manifest. Raises TypeError: a value of
         another shape or number type."""
@@ -343,7 +344,7 @@ class SequenceWriter:
             if self._whole is not None:
                 self._whole.adopt(self)
 
-    def _about(self) -> dict[str, Any]:
+    def _about(self) -> Tree:
         """Return the manifest's entries for this kind."""
         if self.height is None:
             return {"format": "blinkgl-rig", "t_offset_us": self.t_offset_us, "events": self._count}
@@ -426,7 +427,7 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
     return problems
 
 
-def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
+def read_manifest(folder: str | os.PathLike) -> Tree:
     """Return the manifest, in the form of :mod:`blinkgl.sequence_files.manifest`. Raises AssetError: there is none, or
     it is damaged."""
     path = Path(folder) / MANIFEST
@@ -441,7 +442,7 @@ def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
         raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
 
 
-def whole(folder: str | os.PathLike) -> dict[str, Any]:
+def whole(folder: str | os.PathLike) -> Tree:
     """Return the manifest of a sequence whose files are those that it lists, as far as their sizes tell. Raises
     AssetError: none, or damaged."""
     if problems := verify_sequence(folder, checksums=False):
@@ -461,7 +462,7 @@ def manifest_problems(folder: str | os.PathLike) -> list[str]:
     return [] if problem is None else [f"{MANIFEST}: {problem}"]
 
 
-def digest_of(path: Path) -> dict[str, Any]:
+def digest_of(path: Path) -> Tree:
     """Return a file's line in a manifest."""
     with open(open_regular(path), "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

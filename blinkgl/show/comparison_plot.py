@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.recordings.comparison import IEI_EDGES_US, Comparison, RecordingSide
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _A, _B = "#1764ab", "#d1495b"
 Side = tuple[RecordingSide, str, str]
@@ -42,13 +45,13 @@ def plot(result: Comparison, path: str | os.PathLike) -> None:
         figure.savefig(temporary, dpi=110, metadata={"Software": None})
 
 
-def _curves(ax: Any) -> None:
+def _curves(ax: Axes) -> None:
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(alpha=0.25)
     ax.legend(frameon=False, fontsize=9)
 
 
-def _rates(ax: Any, result: Comparison, sides: list[Side]) -> None:
+def _rates(ax: Axes, result: Comparison, sides: list[Side]) -> None:
     # Seconds from the first interval on: a camera's clock may count from 1970.
     seconds = (result.edges_us - result.edges_us[0]) / 1e6
     for side, tag, colour in sides:
@@ -58,13 +61,13 @@ def _rates(ax: Any, result: Comparison, sides: list[Side]) -> None:
     _curves(ax)
 
 
-def _counts(ax: Any, side: Side, top: float) -> None:
+def _counts(ax: Axes, side: Side, top: float) -> None:
     image = ax.imshow(side[0].counts, cmap="magma", vmin=0, vmax=top)
     ax.set(title=f"{side[1]}: events per pixel", xticks=[], yticks=[])
     ax.figure.colorbar(image, ax=ax, shrink=0.7)
 
 
-def _intervals(ax: Any, sides: list[Side]) -> None:
+def _intervals(ax: Axes, sides: list[Side]) -> None:
     for side, tag, colour in sides:
         density = side.iei / max(side.iei.sum(), 1)
         ax.step(IEI_EDGES_US / 1000, np.append(density, density[-1:]), where="post", color=colour, label=tag)
@@ -75,7 +78,7 @@ def _intervals(ax: Any, sides: list[Side]) -> None:
     _curves(ax)
 
 
-def _correlations(ax: Any, result: Comparison, sides: list[Side]) -> None:
+def _correlations(ax: Axes, result: Comparison, sides: list[Side]) -> None:
     middle = (result.edges_us[:-1] + result.edges_us[1:]) / 2e6 - result.edges_us[0] / 1e6
     for side, tag, colour in sides:
         if side.frame_correlation is not None:
@@ -87,7 +90,7 @@ def _correlations(ax: Any, result: Comparison, sides: list[Side]) -> None:
     _curves(ax)
 
 
-def _pixel_by_pixel(ax: Any, result: Comparison, limit: int) -> None:
+def _pixel_by_pixel(ax: Axes, result: Comparison, limit: int) -> None:
     """Draw events per pixel of one recording over those of the other, with the same pixels."""
     assert result.b is not None
     pair = [np.minimum(side.counts, limit).ravel() for side in (result.a, result.b)]

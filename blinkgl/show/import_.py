@@ -11,6 +11,7 @@ from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.machine.terminal import plain_column, plain_console, say
+from blinkgl.types.trees import Tree
 
 _LONGER_SIDE = 640  # px, typical of an event camera
 _MOST = 12  # things in a line
@@ -56,12 +57,12 @@ def _recipe(target: str, came: Any) -> str:
     """Return the YAML that plays the imported file, as far as the file determines it."""
     if not came.counts["meshes"]:
         return f"scene.objects: {{mesh: …, animation: {{file: {target}}}}}    (a clip, for a figure with these joints)"
-    scene: dict[str, Any] = {"kind": "file", "path": target}
+    scene: Tree = {"kind": "file", "path": target}
     if came.cameras:
         scene |= {"camera": came.camera or came.cameras[0], "intrinsics": "file"}
     else:
         scene["pose"] = {"position": [-5, 0, 1.5], "look_at": [0, 0, 1]}
-    recipe: dict[str, Any] = {"scene": scene}
+    recipe: Tree = {"scene": scene}
     if came.duration_s:
         # Labels need an interval before the first and one after the last.
         rate = next(k * 10**n for n in range(1, 9) for k in (1, 2, 5) if k * 10**n * came.duration_s >= 4)

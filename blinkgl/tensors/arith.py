@@ -16,6 +16,9 @@ from torch import Tensor
 
 from blinkgl.events import arith
 
+PerEnv = Any
+"""A number where all environments have the same, else a tensor with one for each of them, or for each element."""
+
 
 def _c(name: str) -> float:
     """Return a constant of the numba functions."""
@@ -152,7 +155,7 @@ def words_of(seed: int) -> tuple[int, int]:
     return seed & _MASK32, (seed >> 32) & _MASK32
 
 
-def philox4x32(key: tuple[Any, ...], pixel: Any, stream: int, index: Any) -> list[Any]:
+def philox4x32(key: tuple[PerEnv, ...], pixel: PerEnv, stream: int, index: PerEnv) -> list[PerEnv]:
     """Return four 32-bit words (int64) of the block (pixel, stream, index) under ``key``; at least one is a tensor."""
     c0, c1, c2, c3 = pixel & _MASK32, stream, index & _MASK32, (index >> 32) & _MASK32
     k0, k1 = key

@@ -23,7 +23,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.emulator import INTENSITY_LIMIT_BITS, MAX_SIDE, NEVER_NS
 from blinkgl.events.packing import MAX_INTERVAL_NS
-from blinkgl.tensors.arith import words_of
+from blinkgl.tensors.arith import PerEnv, words_of
 from blinkgl.types.events import Events
 
 _RADIX_BITS = 16
@@ -71,9 +71,9 @@ class Interval:
     t0_ns, dt_ns : start and length.   base_us : the start's microsecond.   fresh : environments whose first frame this
     is; their intervals have a length of 1 and no events.   start_ns, end_ns : (environments,) int64 on the host."""
 
-    t0_ns: Any
-    dt_ns: Any
-    base_us: Any
+    t0_ns: PerEnv
+    dt_ns: PerEnv
+    base_us: PerEnv
     fresh: tuple[int, ...]
     start_ns: np.ndarray
     end_ns: np.ndarray
@@ -88,7 +88,7 @@ class Interval:
         """Return the length for each environment."""
         return np.maximum(self.end_ns - self.start_ns, 1).tolist()
 
-    def of(self, value: Any, env: Tensor) -> Any:
+    def of(self, value: object, env: Tensor) -> Any:
         """Return ``value``, one of the times, for elements of these environments."""
         return value[env] if isinstance(value, Tensor) else value
 
@@ -150,7 +150,7 @@ def _there(device: Any) -> torch.device:
 Made = TypeVar("Made")
 
 
-def configured(config: Any, kind: type[Made]) -> Made:
+def configured(config: object, kind: type[Made]) -> Made:
     """Return the configuration of an emulator, None for its defaults. Raises EventDataError: it is another's."""
     if config is not None and not isinstance(config, kind):
         raise EventDataError("not its configuration", where="config", value=config, accepted=kind.__name__)
@@ -170,7 +170,7 @@ class Batch(ABC):
         """Return whether reading a number costs nothing, because the host is the device."""
         return self.device.type == "cpu"
 
-    def __init__(self, height: int, width: int, envs: int, device: Any, seed: int):
+    def __init__(self, height: int, width: int, envs: int, device: object, seed: int):
         for where, value in (("height", height), ("width", width), ("envs", envs), ("seed", seed)):
             if not isinstance(value, numbers.Integral) or isinstance(value, bool):
                 raise EventDataError("not a whole number", where=where, value=value, accepted="a whole number")
@@ -383,7 +383,7 @@ def _cells(events: TensorEvents, channel: Tensor, channels: int) -> Tensor:
     return ((events.env.to(torch.int64) * channels + channel) * height + events.y) * width + events.x
 
 
-def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tensor:
+def voxel_grid(events: TensorEvents, t0_us: PerEnv, t1_us: PerEnv, bins: int) -> Tensor:
     """Return (environments, bins, H, W) float32: polarities (+1, -1), each divided between the two bins next to (bins -
     1) (t - t0) / (t1 - t0); events outside [t0, t1] are ignored.
 
@@ -395,7 +395,7 @@ def voxel_grid(events: TensorEvents, t0_us: Any, t1_us: Any, bins: int) -> Tenso
     env = events.env.to(torch.int64)
     start, end = (value[env] if isinstance(value, Tensor) else int(value) for value in (t0_us, t1_us))
     last = bins - 1
-    length: Any = end - start
+    length: PerEnv = end - start
     length = length.to(torch.float64) if isinstance(length, Tensor) else length
     place = (events.t - start).to(torch.float64) * (last / length)
     lower = place.to(torch.int64).clamp(0, last)
@@ -432,7 +432,7 @@ def latest_times(events: TensorEvents, before: Tensor | None = None) -> Tensor:
     return start.reshape(-1).scatter_reduce(0, cells, events.t, "amax").view(shape)
 
 
-def time_surface(latest: Tensor, t_us: Any, tau_us: float) -> Tensor:
+def time_surface(latest: Tensor, t_us: PerEnv, tau_us: float) -> Tensor:
     """Return exp(-(t - latest) / tau), float32 of the shape of ``latest``; 0 where a pixel had no event.
 
     latest : of :func:`latest_times`.   t_us : now, one or (environments,).   Source: Lagorce et al., TPAMI 2017."""

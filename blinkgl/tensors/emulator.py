@@ -33,7 +33,7 @@ class _OnDevice(Emulator):
     device = "cuda"
     _batch_kind: ClassVar[Any]
 
-    def __init__(self, height: int, width: int, config: Any = None, seed: int = 0, device: Any = DEVICE):
+    def __init__(self, height: int, width: int, config: object = None, seed: int = 0, device: object = DEVICE):
         super().__init__(height, width, config, seed)  # type: ignore[bad-argument-type]
         self._batch: Batch = self._batch_kind(height, width, self.config, device=device, seed=seed)
         self.tensor_device = self._batch.device

@@ -9,7 +9,7 @@ was kept, and jitter, which draws the next thresholds at every level.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from blinkgl.events.emulator import NEVER_NS
 from blinkgl.events.esim import to_q25
 from blinkgl.events.philox import Stream
 from blinkgl.events.thresholds import MIN_THRESHOLD, pixel_thresholds
-from blinkgl.tensors.arith import log_q25_, normal2
+from blinkgl.tensors.arith import PerEnv, log_q25_, normal2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, configured, places
 
 _ASLEEP = 2**30 + 2**28
@@ -39,9 +39,9 @@ class Firing(NamedTuple):
     whole: Tensor  # length of the path from the previous frame
     gap: Tensor  # how far the signal ends beyond the level being passed
     polarity: Tensor
-    on: Any  # thresholds of the pixel
-    off: Any
-    step: Any  # the one of its polarity
+    on: PerEnv  # thresholds of the pixel
+    off: PerEnv
+    step: PerEnv  # the one of its polarity
 
 
 class Sizes(NamedTuple):
@@ -53,7 +53,7 @@ class Sizes(NamedTuple):
     farthest: int
 
 
-def crossing_ns(part: Tensor, whole: Tensor, dt_ns: Any, longest_ns: int) -> Tensor:
+def crossing_ns(part: Tensor, whole: Tensor, dt_ns: PerEnv, longest_ns: int) -> Tensor:
     """Return floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly: ``crossing_ns`` of
     blinkgl.events.esim."""
     # Both factors are below 2^31, so the product fits int64.
@@ -96,7 +96,7 @@ class TensorEsim(Batch):
         config: EsimConfig | None = None,
         *,
         envs: int = 1,
-        device: Any = "cpu",
+        device: str | torch.device = "cpu",
         seed: int = 0,
     ):
         super().__init__(height, width, envs, device, seed)
@@ -105,8 +105,8 @@ class TensorEsim(Batch):
         zeros = lambda dtype, wanted=True: torch.zeros(total if wanted else 0, dtype=dtype, device=self.device)
         on, off = config.thresholds
         # Fixed point from here on; one number where all pixels share it, else a tensor.
-        self._on: Any = int(to_q25(on))
-        self._off: Any = int(to_q25(off))
+        self._on: PerEnv = int(to_q25(on))
+        self._off: PerEnv = int(to_q25(off))
         smallest = min(self._on, self._off)
         self._spread = config.threshold_sigma > 0 or config.threshold_map is not None
         if self._spread:
@@ -161,7 +161,7 @@ class TensorEsim(Batch):
         self._upper[here] = (self._log[here] + on).to(torch.int32)
         self._lower[here] = (self._log[here] - off).to(torch.int32)
 
-    def _jittered(self, key: Any, pixel: Tensor, fired: Tensor, on: Any, off: Any) -> tuple[Tensor, Tensor]:
+    def _jittered(self, key: PerEnv, pixel: Tensor, fired: Tensor, on: PerEnv, off: PerEnv) -> tuple[Tensor, Tensor]:
         """Return the thresholds for the level after ``fired`` levels, int64."""
         a, b = normal2(key, pixel, int(Stream.JITTER), fired)
         up = on + torch.floor(a * self._jitter + 0.5).to(torch.int64)

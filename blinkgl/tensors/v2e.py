@@ -27,7 +27,7 @@ from blinkgl.events.packing import MAX_CAUSE_ROWS
 from blinkgl.events.philox import Stream
 from blinkgl.events.thresholds import pixel_thresholds
 from blinkgl.events.v2e import V2e
-from blinkgl.tensors.arith import exp_f32, horner, log_f32, log_f64, normal2, sqrt, uniform2
+from blinkgl.tensors.arith import PerEnv, exp_f32, horner, log_f32, log_f64, normal2, sqrt, uniform2
 from blinkgl.tensors.batch import Batch, Found, Interval, TensorEvents, configured, places, stable_order
 from blinkgl.tensors.waves import Parts, Rows, Shots, Step, add_curves, wake, waves
 
@@ -69,8 +69,8 @@ class Numbers(NamedTuple):
     lengths_ns : of the intervals."""
 
     step: Step
-    kappa_32: Any
-    since_32: Any
+    kappa_32: PerEnv
+    since_32: PerEnv
     lengths_ns: list[int]
 
 
@@ -104,7 +104,7 @@ class TensorV2e(Batch):
         config: V2eConfig | None = None,
         *,
         envs: int = 1,
-        device: Any = "cpu",
+        device: str | torch.device = "cpu",
         seed: int = 0,
     ):
         super().__init__(height, width, envs, device, seed)

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from blinkgl.events.packing import CAUSE_SHIFT
 from blinkgl.events.philox import Stream
-from blinkgl.tensors.arith import fall_f64, rough_normal
+from blinkgl.tensors.arith import PerEnv, fall_f64, rough_normal
 from blinkgl.types.events import Cause
 
 _TURNS = 60  # of the root finder, as in the kernel
@@ -50,15 +50,15 @@ class Step(NamedTuple):
     t0_ns, dt_ns, dt, since_0, since_1, kappa : of v2e.py's Interval.   start_ns : t0 after the base's microsecond.
     low, high : the seeds' words."""
 
-    t0_ns: Any
-    start_ns: Any
-    dt_ns: Any
-    dt: Any
-    since_0: Any
-    since_1: Any
-    kappa: Any
-    low: Any
-    high: Any
+    t0_ns: PerEnv
+    start_ns: PerEnv
+    dt_ns: PerEnv
+    dt: PerEnv
+    since_0: PerEnv
+    since_1: PerEnv
+    kappa: PerEnv
+    low: PerEnv
+    high: PerEnv
 
     def of(self, which: Tensor) -> Step:
         """Return the step for these pixels, or for pixels of these environments."""

@@ -158,7 +158,7 @@ class Page:
             "sequence", tuple(self.folders), initial_value=self._chosen, order=-1
         )
 
-        def chosen(_: Any) -> None:
+        def chosen(_: object) -> None:
             self._chosen, self._stale = self._choice.value, True
             self._changed.set()
 

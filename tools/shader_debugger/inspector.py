@@ -46,6 +46,7 @@ from blinkgl.tools.shader_debugger.session import (
     open_folder,
     open_renderer,
 )
+from blinkgl.types.trees import Tree
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The requests of the page, and the reader of each parameter: only this part parses a query's text.
@@ -243,7 +244,7 @@ class Inspector:
     def shaders(self) -> dict:
         return {"generation": self.generation, "errors": [asdict(d) | {"where": d.where} for d in self.errors]}
 
-    def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
+    def image(self, q: Tree) -> tuple[bytes, dict]:
         """Return PNG and legend of one buffer. q : the result of :func:`questions.read_query`, here and below."""
         when, name = self._when(q["t"]), check_pass(q["pass"], self._buffers(), "pass")
         source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
@@ -259,7 +260,7 @@ class Inspector:
         )
         return picture.png_bytes(rgb), legend | {"unit": info.unit}
 
-    def difference(self, q: dict[str, Any]) -> tuple[bytes, dict]:
+    def difference(self, q: Tree) -> tuple[bytes, dict]:
         """Return PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
         when = self._when(q["t"])
         for key in "ab":
@@ -287,7 +288,7 @@ class Inspector:
         )
         return picture.png_bytes(rgb), legend | {"unit": PASSES[q["b"][0]].unit}
 
-    def verdict(self, q: dict[str, Any]) -> dict:
+    def verdict(self, q: Tree) -> dict:
         """Return the comparison of all buffers with the reference: the verdict of ``diff``, and its text."""
         comparison = self.comparison(self._when(q["t"]))
         reports = [comparison.report(name) for name in comparison.names()]
@@ -302,7 +303,7 @@ class Inspector:
             }
         )
 
-    def probe(self, q: dict[str, Any]) -> dict:
+    def probe(self, q: Tree) -> dict:
         """Return the result of the command ``probe``, with its text of every number."""
         when = self._when(q["t"])
         x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")

@@ -59,7 +59,7 @@ def render(
     hits = cast(scene, t_ns, None if xy is None else xy.reshape(-1, 2))
     looks = surface(scene, hits)
 
-    def images(values: Any) -> dict[str, Any]:
+    def images(values: object) -> dict[str, Any]:
         return {k: v if k == "t_ns" else v.reshape(*shape, *v.shape[1:]) for k, v in vars(values).items()}
 
     def flow(to_ns: int | None) -> Flow | None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -25,6 +26,14 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.filters import filtered_names, pass_of, places_of
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from blinkgl.render.draw_items import DrawItem, Kind
+    from blinkgl.render.painter import RenderStats
+    from blinkgl.render.passes.base import Shot
+    from blinkgl.render.resources import SceneResources
 
 DEBUG_PROGRAM = "debug.glsl"
 
@@ -147,7 +156,7 @@ class _Nothing:
 class _Uniforms(Uniforms):
     """Records uniforms that the program no longer uses, where a run would stop: the wrong result explains more."""
 
-    def __init__(self, program: Any, unused: set[tuple[str, str]]):
+    def __init__(self, program: moderngl.Program, unused: set[tuple[str, str]]):
         super().__init__(program)
         self._unused = unused
 
@@ -161,14 +170,14 @@ class DebugPainter(Painter):
 
     unused : (program, name) of each."""
 
-    def __init__(self, gl: GLContext, scene: Scene, resources: Any, stats: Any):
+    def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         super().__init__(gl, scene, resources, stats)
         self.unused: set[tuple[str, str]] = set()
 
-    def uniforms(self, program: object) -> Any:
+    def uniforms(self, program: moderngl.Program) -> Uniforms:
         return _Uniforms(program, self.unused)
 
-    def draw(self, uniforms: Any, item: Any, t_ns: int) -> None:
+    def draw(self, uniforms: Uniforms, item: DrawItem, t_ns: int) -> None:
         # Vertex arrays silently leave out attributes that a program does not have.
         program, shape = uniforms[""], item.deformer
         if shape is not None:
@@ -192,10 +201,10 @@ class Inspection(ScenePass):
         Output("WINDOW", "RGBA32F"),
     )
 
-    def defines(self, kind: object) -> Any:
+    def defines(self, kind: object) -> dict[str, Any]:
         return {f"OUT_{output.name}": i for i, output in enumerate(self.outputs)}
 
-    def set(self, painter: Any, uniforms: Any, item: Any, shot: Any) -> Any:
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         uniforms["part_number"].value = item.part + 1
 
 
@@ -213,11 +222,11 @@ class LuminanceLookup(Luminance):
     def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
         return (*super().outputs, *SHOWN)
 
-    def defines(self, kind: Any) -> Any:
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
         return super().defines(kind) | {"SHOW_LOOKUP": 1}
 
     @classmethod
-    def every_kind(cls) -> Any:
+    def every_kind(cls) -> Iterator[LuminanceLookup]:
         yield cls()
 
 
@@ -227,7 +236,7 @@ class ColourLookup(Colour):
 
     outputs: ClassVar[tuple[Output, ...]] = (*Colour.outputs, *SHOWN)
 
-    def defines(self, kind: Any) -> Any:
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
         return super().defines(kind) | {"SHOW_LOOKUP": 1}
 
 

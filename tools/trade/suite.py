@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from blinkgl.config.quality import QUALITIES, load_quality
 from blinkgl.config.reader import apply_overrides
@@ -26,6 +25,7 @@ from blinkgl.tools.trade.measure import Density, Options
 from blinkgl.tools.trade.run import chosen, trade, write_tables
 from blinkgl.tools.trade.settings import Setting, excess, pareto_front, suite_design
 from blinkgl.tools.trade.words import convergence_line
+from blinkgl.types.trees import Tree
 
 OPTIONS = Options(tiles=(3, 2, 14, 11), levels=Density(), reference_s=480.0, rounds=3, rounds_s=240.0, labels=False)
 COLUMNS = (
@@ -145,7 +145,7 @@ def _measured(
     }
 
 
-def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: dict[str, Any], seconds: float) -> dict[str, object]:
+def _whole(done: dict[str, dict], scenes: Sequence[Trial], asked: Tree, seconds: float) -> dict[str, object]:
     measured = {c.name: done[c.name] for c in scenes if c.name in done}
     missing = [c.name for c in scenes if "settings" not in measured.get(c.name, {})]
     return {
@@ -216,7 +216,7 @@ def _mean(values: Iterable[float]) -> float:
     return math.exp(sum(logs) / len(logs))
 
 
-def write(result: dict[str, Any], out: Path) -> None:
+def write(result: Tree, out: Path) -> None:
     """Write suite.json and suite.csv. Raises OutputError."""
     scenes = result["scenes"].items()
     rows = ({"scene": name, **row} for name, scene in scenes for row in scene.get("settings", ()))

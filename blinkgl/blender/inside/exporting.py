@@ -16,6 +16,8 @@ from baking import FURTHEST, SEEN, Clock, Track, bake, keep_out, sample, write_k
 from glb import read, write
 from rates import rate_of
 
+Blender = Any  # bpy's objects have no types
+
 MOST_FRAMES = 100_000
 CONSTANT = 1e-7
 ROUNDS = 3  # how often a scene is exported at most
@@ -41,7 +43,7 @@ class Refused(Exception):
         self.problem, self.accepted = problem, accepted
 
 
-def names(objs: Iterable[Any], limit: int = 3) -> str:
+def names(objs: Iterable[Blender], limit: int = 3) -> str:
     """Return 'a', 'b', 'c' and 4 more."""
     listed = [f"'{getattr(obj, 'name', obj)}'" for obj in objs]
     return ", ".join(listed[:limit]) + (f" and {len(listed) - limit} more" if len(listed) > limit else "")
@@ -97,7 +99,7 @@ def open_file(source: Path, fps: float | None) -> None:
         set_rate(bpy.context.scene, fps)
 
 
-def set_rate(scene: Any, fps: float) -> None:
+def set_rate(scene: Blender, fps: float) -> None:
     """Set the frames per second, which Blender stores as a whole number over a divisor."""
     scene.render.fps = max(round(fps), 1)
     scene.render.fps_base = scene.render.fps / fps
@@ -118,7 +120,7 @@ def clock_of(frames: list[int] | None, per: int) -> Clock:
 # --- what is rendered -------------------------------------------------------------------------------------------------
 
 
-def rendered() -> tuple[list[Any], list[str]]:
+def rendered() -> tuple[list[Blender], list[str]]:
     """Return the objects of the view layer that Blender renders at some time, shown so that they are evaluated, and
     lines about others. Objects that the camera does not see are hidden."""
     objects, unseen, hidden = [], [], []
@@ -139,7 +141,7 @@ def rendered() -> tuple[list[Any], list[str]]:
     return objects, lines + ([f"in collections that are not rendered: {names(hidden)}"] if hidden else [])
 
 
-def collections(layer: Any) -> Iterator[str]:
+def collections(layer: Blender) -> Iterator[str]:
     """Yield the names of a layer's collections that are rendered."""
     if not (layer.exclude or layer.collection.hide_render or layer.holdout or layer.indirect_only):
         yield layer.collection.name
@@ -147,7 +149,7 @@ def collections(layer: Any) -> Iterator[str]:
             yield from collections(child)
 
 
-def realize(objs: list[Any]) -> None:
+def realize(objs: list[Blender]) -> None:
     """Convert instances of geometry nodes to faces of the object itself, because the exporter leaves them out."""
     group = bpy.data.node_groups.new("Realize", "GeometryNodeTree")
     for way in ("INPUT", "OUTPUT"):
@@ -164,11 +166,11 @@ def realize(objs: list[Any]) -> None:
 # --- what glTF cannot store -------------------------------------------------------------------------------------------
 
 
-def left_out(objs: list[Any], clock: Clock) -> list[str]:
+def left_out(objs: list[Blender], clock: Clock) -> list[str]:
     """Return lines about what glTF cannot represent."""
     scene, lines = clock.scene, []
 
-    def say(problem: str, some: Iterable[Any], limit: int = 3) -> None:
+    def say(problem: str, some: Iterable[Blender], limit: int = 3) -> None:
         if some := list(some):
             lines.append(f"{problem}: {names(some, limit)}")
 
@@ -223,7 +225,7 @@ def left_out(objs: list[Any], clock: Clock) -> list[str]:
     return lines
 
 
-def shines(world: Any) -> bool:
+def shines(world: Blender) -> bool:
     """Return whether a world is not black."""
     if not world.use_nodes:
         return any(world.color)
@@ -231,7 +233,7 @@ def shines(world: Any) -> bool:
     return any(c.links or s.links or (s.default_value and any(c.default_value[:3])) for c, s, *_ in inputs)
 
 
-def has_plain_colour(material: Any) -> bool:
+def has_plain_colour(material: Blender) -> bool:
     """Return whether the exporter supports the colour: that of a Principled or an emitting surface, or a still
     picture's in the coordinates of the mesh."""
     nodes = material.node_tree.nodes if material.use_nodes else ()
@@ -260,13 +262,13 @@ def has_plain_colour(material: Any) -> bool:
 # --- the GLB ----------------------------------------------------------------------------------------------------------
 
 
-def forgive(module: str, function: str, instead: Any, failed: dict[str, str]) -> None:
+def forgive(module: str, function: str, instead: Blender, failed: dict[str, str]) -> None:
     """Let one of the exporter's functions return ``instead`` where it raises, and store the name of its first
     argument."""
     place = import_module(f"io_scene_gltf2.blender.exp.{module}")
     whole = getattr(place, function)
 
-    def careful(what: Any, *others: Any, **more: Any) -> Any:
+    def careful(what: Blender, *others: Blender, **more: Blender) -> Blender:
         try:
             return whole(what, *others, **more)
         except Exception as problem:  # noqa: BLE001 - one bad material or mesh, named, does not cost the scene
@@ -338,7 +340,7 @@ def counts(tree: dict) -> dict[str, int]:
     }
 
 
-def steady(clock: Clock, objs: list[Any]) -> None:
+def steady(clock: Clock, objs: list[Blender]) -> None:
     """Give lights with key frames the greatest energy that they have at nine times."""
     keyed = [obj for obj in objs if obj.type == "LIGHT" and obj.data.animation_data is not None]
     # glTF's lights are constant: the brightest of nine times stands for the whole.

@@ -53,7 +53,7 @@ def register(
 
     Raises TypeError naming the part that is wrong, or a name that is taken; nothing is then registered."""
 
-    def unless(right: Any, part: str, problem: str) -> None:
+    def unless(right: object, part: str, problem: str) -> None:
         if not right:
             raise TypeError(f"pass {name!r}: `{part}` {problem}")
 

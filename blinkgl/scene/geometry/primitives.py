@@ -155,7 +155,7 @@ def primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Calla
         )
 
     @wraps(build)
-    def made(**parameters: Any) -> Mesh:
+    def made(**parameters: object) -> Mesh:
         return at_level(0, **parameters)
 
     made.__signature__ = signature  # type: ignore[attr-defined]

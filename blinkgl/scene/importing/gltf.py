@@ -29,6 +29,7 @@ from blinkgl.scene.reading import Omissions, contents, limit_faces, reading
 from blinkgl.scene.shapes.clips import PATHS, Track
 from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
 from blinkgl.scene.types import Material
+from blinkgl.types.trees import Tree
 
 # Not drawn, but a file that requires these extensions is accepted: shape, base colour and motion are correct, only the
 # light on the surface is missing. Any other required extension (compressed geometry or images, instances, other
@@ -77,12 +78,12 @@ class Document:
     def where(self) -> str:
         return str(self.path)
 
-    def lights(self) -> dict[int, dict[str, Any]]:
+    def lights(self) -> dict[int, Tree]:
         """Return the lights of the scene's nodes by node index, in the form of KHR_lights_punctual, checked, with
         defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
         table = gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights).lights
-        lights: dict[int, dict[str, Any]] = {}
+        lights: dict[int, Tree] = {}
         for index in (index for index, node in self.nodes.items() if node.visible):
             if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
                 number = index_of(reference.get("light"), len(table), "lights", self.where)

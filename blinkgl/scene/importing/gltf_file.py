@@ -12,7 +12,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -128,7 +127,7 @@ def needs(extension: str, where: str) -> AssetError:
     )
 
 
-def item(tree: dict, key: str, index: Any, where: str) -> dict:
+def item(tree: dict, key: str, index: object, where: str) -> dict:
     """Return an entry of a list of the file, by a reference to it."""
     items = tree.get(key, [])
     return items[index_of(index, len(items), key, where)]

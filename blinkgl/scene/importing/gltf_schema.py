@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from blinkgl.errors import AssetError
+from blinkgl.types.trees import Tree
 
 # Bounds are far above those of any real file: what is beyond them is damage.
 Index = Annotated[int, Field(ge=0, lt=2**31)]
@@ -24,7 +25,7 @@ Vector2 = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Vector4 = Annotated[list[Number], Field(min_length=4, max_length=4)]
 Matrix4 = Annotated[list[Number], Field(min_length=16, max_length=16)]
-Extensions = dict[str, dict[str, Any]]
+Extensions = dict[str, Tree]
 
 
 class _Part(BaseModel):

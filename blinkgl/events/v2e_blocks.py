@@ -122,18 +122,7 @@ def _shot_draws(seed, block, index, rate_per_ns, gaps, picks, accepts):
         accepts[j], _ = uniform2(seed, block, _SHOT, number * _U2 + _U1)
 
 
-@register_jitable
-def _entries_up_to(table, weight, guess):
-    """Return how many entries of the cumulative ``table`` are <= weight."""
-    # Weights are similar, so the proportional guess is a cache line away.
-    while guess > 0 and table[guess - 1] > weight:
-        guess -= 1
-    while guess < table.size - 1 and table[guess] <= weight:
-        guess += 1
-    return guess
-
-
-@register_jitable
+@register_jitable(inline="always")
 def _insert(keys, count, in_order, key):
     """Put ``key`` behind the first ``count`` keys, or in order among them, which then are sorted."""
     slot = count
@@ -177,7 +166,12 @@ def shot_block(
             drawn = 0
         gap, pick, accept = gaps[drawn], picks[drawn], accepts[drawn]
         drawn += 1
-        place = _entries_up_to(table, np.float32(pick * whole), np.int64(pick * table.size))
+        # How many entries are <= weight. Weights are similar, so the proportional guess is a cache line away.
+        weight, place = np.float32(pick * whole), np.int64(pick * table.size)
+        while place > 0 and table[place - 1] > weight:
+            place -= 1
+        while place < table.size - 1 and table[place] <= weight:
+            place += 1
         # The table holds the ON half of all pixels, then the OFF half.
         offset, on = place & (BLOCK - 1), place < BLOCK
         if offset < pixels_in_block:

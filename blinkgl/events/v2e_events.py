@@ -109,7 +109,7 @@ def emit(
             continue
         o = i - first
         word = (y << 17) | ((i - row_end + v.width) << 1)
-        pixel = _pixel(i, o, word, constants[i], causes, causes and hot[i] > 0)
+        pixel = _pixel(i, o, word, constants, causes, causes and hot[i] > 0)
         leak = np.float64(leaks[i]) if leaks.size else 0.0
         k = _time_constants(intensity[i], intensity_end[o], v.kappa) if lag.size else -1.0
         curve = _curve(_ends(x, x_end, i, o), _ends(lag, lag_end, i, o), _ends(noise, noise_end, i, o), k, leak, v)
@@ -136,7 +136,7 @@ def emit(
     return out, cut
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _emit_pixel(pixel, curve, state, leak, v, cap, keys, key, packed, out):
     """Write the events of one pixel in the interval to ``packed[out:]``. Return (comparator at the end, leak at the
     end, whether the pixel is dead beyond the interval, end of the events, events beyond the cap, next key)."""
@@ -179,10 +179,11 @@ def _emit_pixel(pixel, curve, state, leak, v, cap, keys, key, packed, out):
         # After a dead time, and after shot noise, the reference is the signal itself.
         if v.refractory_ns > 0 or by_shot:
             level = _signal(curve, s)
-        before, state = state, _restarted(pixel, curve, s, at_ns, level)
+        since_ns, noise_then = state.since_ns, state.noise_then
+        state = _restarted(pixel, curve, s, at_ns, level)
         if dead:
             # The reference is taken at the release, in another interval.
-            state = Comparator(s, at_ns, state.up, state.down, before.since_ns, before.noise_then)
+            state = Comparator(s, at_ns, state.up, state.down, since_ns, noise_then)
     return state, leak, dead, out, cut, key
 
 
@@ -192,10 +193,11 @@ def _ends(before, now, i, o):
     return (np.float64(before[i]), np.float64(now[o])) if before.size else (0.0, 0.0)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _pixel(number, offset, word, constants, explained, hot):
     """Return the :class:`Pixel` of these constants: ON threshold, OFF threshold, mean leak."""
-    on, off, mean_leak = np.float64(constants[0]), np.float64(constants[1]), np.float64(constants[2])
+    on, off = np.float64(constants[number, 0]), np.float64(constants[number, 1])
+    mean_leak = np.float64(constants[number, 2])
     return Pixel(
         number=number,
         offset=offset,
@@ -208,13 +210,13 @@ def _pixel(number, offset, word, constants, explained, hot):
     )
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _time_constants(intensity, intensity_end, kappa):
     """Return the time constants of the low-pass in the interval, as in v2e_model.relax but in double precision."""
     return kappa * (0.5 * (np.float64(intensity) + np.float64(intensity_end)) + 20.0)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _curve(x, lag, noise, k, leak, v):
     """Return the :class:`Curve` of a pixel. x, lag, noise : at both ends; ``leak``, ln units a second, since the leak
     epoch."""
@@ -225,7 +227,7 @@ def _curve(x, lag, noise, k, leak, v):
     return Curve(c=c, rise=rise, fall=fall, k=k, end=end, noise=noise[0], noise_change=noise_change)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _with_leak(curve, change, v):
     """Return the curve with ``change`` more leak, ln units a second, since the leak epoch."""
     return Curve(
@@ -239,13 +241,13 @@ def _with_leak(curve, change, v):
     )
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _signal(curve, s):
     """Return what the comparator sees at the fraction ``s`` of the interval."""
     return signal_at(s, curve.c, curve.rise, curve.fall, curve.k)
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _restarted(pixel, curve, s, now_ns, reference):
     """Return the comparator whose reference was taken at the fraction ``s``."""
     noise_then = curve.noise + curve.noise_change * s

@@ -261,7 +261,7 @@ def _emit_block(active, first, end, p, v, cap, packed, begin):
     return out, cut
 
 
-@register_jitable
+@register_jitable(inline="always")
 def _emit_pixel(i, pixel_word, state, moved, v, explained, cap, packed, out):
     """Write the events of pixel ``i`` to ``packed[out:]``, at most ``cap``. moved : mu, its leak part and sigma, see
     :func:`rates`. Return (state at the end, end of its dead time beyond the interval, ns from the interval's start, or

@@ -324,3 +324,54 @@ def test_timelens_storage(export):
         """,
     )
     assert said.rstrip().endswith("9 (260, 346) True"), said
+
+
+LENSES = {"radtan": [-0.2, 0.05, 0.001, -0.002], "equidistant": [-0.02, 0.01, -0.004, 0.0005]}
+SMALL = {
+    "camera": {"width": 160, "height": 120, "focal": 110},
+    "time": {"duration": 0.4, "label_rate": 20},
+    "labels": {"images": True},
+    "images": {"rate": 20, "exposure_us": 5000},
+}
+RAYS = """
+import sys
+from pathlib import Path
+import numpy as np, torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+kept = dict(orientation_method="none", center_method="none", auto_scale_poses=False, load_3D_points=False)
+xy, names, o, d = np.random.default_rng(0).uniform(3, (157, 117), (200, 2)), [], [], []
+for split in ("train", "val", "test"):
+    made = NerfstudioDataParserConfig(data=Path(sys.argv[1]), **kept).setup().get_dataparser_outputs(split)
+    for k, path in enumerate(made.image_filenames):
+        rays = made.cameras.generate_rays(k, coords=torch.tensor(xy[:, ::-1].copy(), dtype=torch.float32))
+        names.append(path.stem), o.append(rays.origins.numpy()), d.append(rays.directions.numpy())
+np.savez(sys.argv[2], xy=xy, names=names, o=o, d=d)
+"""
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_nerfstudios_parser_and_cameras(export, tmp_path, lens):
+    """BLINKGL_NERFSTUDIO is a Python that has nerfstudio. Points on its rays are seen where it asked for them: OpenCV's
+    projection with the frame camera's poses in the middles of the exposures."""
+    python = os.environ.get("BLINKGL_NERFSTUDIO")
+    if not python:
+        pytest.skip("no nerfstudio (set BLINKGL_NERFSTUDIO to a Python that has it)")
+    import cv2
+    import numpy as np
+
+    camera = {**SMALL["camera"], "lens": lens, "distortion": LENSES[lens]}
+    out = next(export("nerf", {**SMALL, "camera": camera}).glob("*/*"))
+    subprocess.run([python, "-c", RAYS, str(out), str(tmp_path / "rays.npz")], check=True, capture_output=True)
+    with np.load(tmp_path / "rays.npz") as made:
+        xy, names, o, d = (made[key] for key in ("xy", "names", "o", "d"))
+    with np.load(next((out.parents[2] / "data").glob("*/*/frame_camera/poses.npz"))) as poses:
+        T_world_cam = poses["T_world_cam"][:, 1]
+    K = np.array([[110, 0, 79.5], [0, 110, 59.5], [0, 0, 1.0]])
+    assert sorted(names) == [f"{k:06d}" for k in range(len(T_world_cam))]
+    for name, origin, direction in zip(names, o, d, strict=True):
+        T_cam_world = np.linalg.inv(T_world_cam[int(name)])
+        seen = (origin + 5 * direction) @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+        project = cv2.projectPoints if lens == "radtan" else cv2.fisheye.projectPoints
+        px, _ = project(seen[:, None], np.zeros(3), np.zeros(3), K, np.array(LENSES[lens]))
+        px = px.reshape(-1, 1, 2)
+        assert np.abs(px[:, 0] - (xy - 0.5)).max() < 1e-3

@@ -2,9 +2,9 @@
 
     python -m blinkgl.tools.side_by_side SHEET.png [FOLDER]        (extra pyrender)
 
-Files of FOLDER (whatever BlinkGL reads), else ten that are written here: a bent sheet in each format, with colours of
-vertices and with pictures where the format has them. Above BlinkGL, below pyrender, and the share of pixels that differ
-by more than a tenth.
+Files of FOLDER (whatever BlinkGL reads: a sheet of ten files of a kind, say), else ten that are written here: a bent
+sheet in each format, with colours of vertices and with pictures where the format has them. Above BlinkGL, below
+pyrender, and the share of pixels that differ by more than a tenth.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 import blinkgl
 from blinkgl.errors import BlinkGLError
+from blinkgl.machine.extras import install
 from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES
 from blinkgl.srgb import to_srgb8
 
@@ -125,7 +127,10 @@ def theirs(job: str, answer: str) -> None:
 
 
 def main(sheet: str, folder: str | None = None) -> int:
-    """Write the contact sheet; return 0."""
+    """Write the contact sheet; return 0, or 2 without pyrender."""
+    if find_spec("pyrender") is None:
+        print(f"error: no pyrender; {install('pyrender')}", file=sys.stderr)
+        return 2
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(scratch)
         kinds = sorted(p for p in Path(folder or ".").rglob("*") if p.suffix.lower() in MESH_SUFFIXES)

@@ -320,14 +320,17 @@ def resume_run(
     """Restore a run from its newest checkpoint ``folder``; return its state. A finished training may get more steps or
     minutes."""
     state = read_state(folder)
+    # Compared leaf by leaf, with defaults for keys that an older version did not have.
     saved, now = leaves(state.get("config", {})), {**_OTHER, **leaves(json.loads(config.model_dump_json()))}
     saved = {path: 1 for path in now if path.endswith(".uses")} | {**_OTHER, **saved}
     done = {"optim.steps": state["step"], "optim.minutes": state["seconds"] / 60}
     for path in sorted({*saved, *now}):
         before, wanted = saved.get(path), now.get(path)
+        # Folders, workers and logs are facts of the machine, not of the training.
         free = path.split(".")[0] in _FREE or re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
         if before is not None and wanted is not None:
             free = free or ("content" in state and _PLACES.fullmatch(path))
+            # A finished run may get more steps.
             free = free or (path in done and _extends(wanted, before, done[path]))
         if not free and before != wanted:
             raise ConfigError(

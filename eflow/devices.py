@@ -19,6 +19,7 @@ def setup(config: TrainConfig) -> tuple[int, int, torch.device]:
     """Join the process group of torchrun, if any, and return (rank, world, device).
 
     world : number of processes; rank : the number of this one."""
+    # Set by torchrun.
     rank, world, local = (int(os.environ.get(k, d)) for k, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
     kind = config.run.device
     if kind == "auto":
@@ -29,6 +30,7 @@ def setup(config: TrainConfig) -> tuple[int, int, torch.device]:
     if kind == "cuda":
         torch.cuda.set_device(device)
         use_tf32(device, config.run.tf32)
+    # torch gives memory back after each step and asks for it again, which costs more than the step's small layers.
     if kind == "cpu":
         keep_memory()
     if config.run.threads:

@@ -59,6 +59,7 @@ def comparison(
     ``largest`` px, or the 99th percentile of the true speed (without truth, of the predicted speed).
     events : (H, W, 3) uint8; flows (H, W, 2) px. caption : of the events.   near : (H, W) bool; elsewhere predicted
     flow is pale, since no event tells it."""
+    # Called when `largest` is known: truth and prediction share one scale.
     coloured = lambda: _paled(flow_colour(predicted, largest), near)
     panels = [(caption, events)]
     if truth is None or valid is None or not valid.any():

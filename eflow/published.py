@@ -127,6 +127,7 @@ def published_names(name: str) -> tuple[str, ...]:
     if part in ("features", "context"):
         index, _, rest = rest.partition(".")
         at = int(index)
+        # Layers 3 to 8 are three stages of two residual blocks each.
         if 3 <= at <= 8:
             where = f"layer{(at - 3) // 2 + 1}.{(at - 3) % 2}.{rest.replace('shortcut', 'downsample')}"
         else:
@@ -139,6 +140,7 @@ def published_names(name: str) -> tuple[str, ...]:
         return (f"update_block.encoder.{names[layer]}.{rest}",)
     if part == "gru":
         kind, index, rest = rest.split(".", 2)
+        # Update and reset gate are one convolution here and two there.
         letters = "zr" if kind == "gates" else "q"
         return tuple(f"update_block.gru.conv{letter}{int(index) + 1}.{rest}" for letter in letters)
     index, _, rest = rest.partition(".")

@@ -67,6 +67,7 @@ def submit(
         raise AssetError("not a benchmark's test set", where=str(root), value=layout, accepted=", ".join(BENCHMARKS))
     benchmark, source = BENCHMARKS[layout], open_source(root, layout)
     assert isinstance(source, FolderSource)
+    # A server refuses an incomplete archive only after the upload.
     _check_sequences(source, benchmark.sequences, str(root))
     entries = [source.entry(i) for i in range(len(source))]
     names = [f"{sequence.name}/{benchmark.name(entry)}" for sequence, entry in entries]
@@ -74,6 +75,7 @@ def submit(
         raise AssetError("a file index is listed twice", where=str(root))
     sizes: dict[str, tuple[int, int]] = {}
     still = 0
+    # Sizes differ between sequences, so the predictor learns them from each sample.
     predictor = Predictor(model, 0, 0, warm_start=warm_start)
     with atomic_file(out, overwrite=False) as temporary:
         with zipfile.ZipFile(temporary, "w", benchmark.compression) as archive:
@@ -82,6 +84,7 @@ def submit(
                 sizes[names[i]] = sample.height, sample.width
                 still += not answer.flow.any()
                 progress(i + 1, len(names))
+        # Read again what was written, before it gets its name.
         check_archive(temporary, benchmark, sizes)
     return len(names), still
 

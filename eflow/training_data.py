@@ -109,6 +109,7 @@ def validate(
     """Return the AEE of each validation set with the averaged weights, and as ``zero`` that of zero flow.
 
     size : largest number of samples in a batch."""
+    # Judged are the averaged weights; the training's own come back, whatever happens.
     own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
     if ema is not None:
         model.load_state_dict(ema)

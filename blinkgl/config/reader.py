@@ -67,6 +67,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         before = self._values
         if self.check_event(yaml.AliasEvent):
             event = self.peek_event()
+            # An alias counts as much as what it stands for: a few lines of aliases could be a billion values.
             known = self.anchors.get(event.anchor)
             if known is not None:
                 if id(known) not in self._sizes:
@@ -276,6 +277,7 @@ def apply_overrides(tree: Tree, overrides: Sequence[str]) -> Tree:
     """Return a copy of ``tree`` with ``--set`` options applied; missing tables on the path are created."""
     tree = copy.deepcopy(tree)
     for option in overrides:
+        # The value is YAML, so that lists, tables and null can be given.
         dotted, equals, text = option.partition("=")
         keys = dotted.strip().split(".")
         if not equals or not all(keys):
@@ -300,6 +302,7 @@ def apply_overrides(tree: Tree, overrides: Sequence[str]) -> Tree:
             if last:
                 node[key] = value
             elif isinstance(node, dict):
+                # A table that is not there, or null, begins empty.
                 if node.get(key) is None:
                     node[key] = {}
                 node = node[key]

@@ -231,6 +231,7 @@ def _complete(
                 where=f"sensors.{number}.{key}",
                 accepted=f"{key} at the top level",
             )
+    # Without a word about events, a sensor with images or an inertial unit alone has none.
     lens = any(own.get(key) is not None for key in ("camera", "sensor"))
     other = own.get("images") is not None or (own.get("imu") is not None and not lens)
     events = own["events"] is not None if "events" in own else not other
@@ -242,6 +243,7 @@ def _complete(
                 where=f"sensors.{number}.{key}",
                 accepted="events: {} beside it, or without this key",
             )
+    # The run's own sections lie below the sensor's; those that it cannot have are left out.
     keys = [key for key in INHERITED if key in tree and (events or key in ("camera", "sensor"))]
     sections = {key: own[key] for key in SECTIONS if key in own and (events or key not in ("events", "readout"))}
     above = {key: copy.deepcopy(tree[key]) for key in keys if camera}

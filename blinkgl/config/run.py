@@ -149,6 +149,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
     groups = template.tree["groups"]
     if not isinstance(groups, dict) or not groups:
         raise ConfigError("not a table of groups", where="groups", value=groups, accepted="name: {keys of the group}")
+    # A group is the top level's tree with the group's own keys over it.
     common = {key: value for key, value in template.tree.items() if key != "groups"}
     made = []
     for name, own in groups.items():
@@ -163,6 +164,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
             raise ConfigError("not true or false", where=f"{where}.enabled", value=enabled, accepted="true or false")
         tree = merge(common, own)
         if "seed" not in own:
+            # By its name, not by its place: another group more changes no other's sequences.
             tree["seed"] = derived_seed(template.seed, name)
         elif not is_distribution(own["seed"]):
             tree["seed"] = validate_field(SequenceConfig, "seed", own["seed"])
@@ -170,6 +172,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
             tree["output"].setdefault("name", name)
         with placed(str, before=f"in group '{name}': "):
             made.append(_group(name, tree, template, enabled))
+    # Two groups may have the same name in different splits.
     folders: dict[tuple[str, str], str] = {}
     for group in made:
         output = group.template.tree["output"]

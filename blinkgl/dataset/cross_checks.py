@@ -160,6 +160,7 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     if plan is None:
         result.notes.append("no record of the run here: sequences were not compared with a recipe")
         return []
+    # Every record may be damaged: a reader's error becomes a line, and the other checks go on.
     failed: dict[str, str] = {}
     problems = guarded(lambda: failed.update(RunFolder(root).read("failed.json") or {}) or [])
     here = {folder.relative_to(root).as_posix() for folder in folders}
@@ -167,6 +168,7 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     for name in here & dropped.keys():
         result.add(name, ["was dropped, and is here: run 'blinkgl drop' with it again, or with --undo"])
     result.dropped = len(dropped)
+    # Sequences that the recipe asks for and that are neither here nor dropped on purpose.
     missing, more = _missing(plan, here | dropped.keys(), _MOST_MISSING)
     for task in missing:
         why = f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"
@@ -181,10 +183,12 @@ def against_run(root: Path, folders: list[Path], known: dict[str, Known], result
     }
     environment = record.get("environment", {})
     for name, one in known.items():
+        # SPLIT/NAME_000000 without the number is the group's folder.
         group = groups.get(re.sub(r"_\d{6,}$", "", name))
         if group is None:
             result.add(name, ["no group of the recipe makes it"])
             continue
+        # The draws are repeated from the seed and compared with what the sequence says of itself.
         drawn = group.template.sequence(one.manifest["sequence"])
         if where := first_difference(comparable(one.config), comparable(drawn)):
             result.add(name, [f"config.yaml: the recipe draws another value for {where}"])

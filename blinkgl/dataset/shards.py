@@ -76,6 +76,7 @@ def export_shards(
     written = {}
     with atomic_folder(out) as folder:
         for split, entries in sorted(labels.items()):
+            # Readers stream a shard from its beginning, so neighbours must not be of one sequence.
             order = np.random.default_rng(seed).permutation(len(entries))
             written[split] = _write(folder, split, (entries[i] for i in order), shard_bytes)
     return written

@@ -218,12 +218,14 @@ class EventCamera:
         self._pixels, self._noise, self._readout, self._resets = None, None, None, None
         if readout is not None:
             if readout.frame_resets is not None:
+                # A reset's size is stated in log intensity, the emulator's level in thresholds of its own response.
                 response = EMULATORS[config.emulator].response(config)
                 self._resets = FrameResets(readout.frame_resets, self.emulator, response.threshold / response.gain)
             if readout.pixels is not None:
                 self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
             if readout.light_noise is not None and not self.emulator.noisy:
                 self._unheard = config.emulator
+            # Rates by light need an emulator that has noise; ESIM says that it has none.
             elif readout.light_noise is not None:
                 self._noise = LightNoise(readout.light_noise, height, width, seed, self.emulator.causes)
             if readout.roi is not None and (readout.roi[0] >= width or readout.roi[1] >= height):

@@ -53,6 +53,8 @@ class LightNoise:
     def step(self, events: Events, until_us: int, luminance: np.ndarray) -> Events:
         """Return ``events`` with the noise up to ``until_us`` (that microsecond included), last within a microsecond.
         Noise begins with the first step. luminance : (H, W) at that time; between two steps light changes linearly."""
+        # Candidates of a Poisson process at the largest rate, thinned by the rate at the light of their time (Lewis and
+        # Shedler 1979).
         light = np.array(luminance, np.float32).reshape(-1)
         before, self._light = self._light, light
         if before is None:
@@ -65,9 +67,11 @@ class LightNoise:
         count = int(np.searchsorted(candidates[:, 0], until_us, side="right"))
         (t_us, pixel, uniform), self._drawn = candidates[:count].T, candidates[count:]
         pixel = pixel.astype(np.int64)
+        # The light at a candidate's time, on the line between the two frames.
         part = (t_us - self._from_us) / max(until_us - self._from_us, 1)
         self._from_us = until_us
         on, off = self.rates(before[pixel] + (light[pixel] - before[pixel]) * part)
+        # One uniform number decides both whether it is kept and its polarity.
         threshold = uniform * self.most_hz
         kept = threshold < on + off
         if not kept.any():
@@ -82,6 +86,7 @@ class LightNoise:
         )
         if not len(events):
             return own
+        # Stable: at the same microsecond the pixels' events stay before the noise.
         both = Events.concatenate([events, own])
         return both.part(np.argsort(both.t, kind="stable"))
 

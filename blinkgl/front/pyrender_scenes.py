@@ -83,6 +83,7 @@ def _bodies(source: Theirs, node: Theirs, notes: list[str]) -> Iterator[tuple[da
         faces = np.arange(len(points)) if primitive.indices is None else np.asarray(primitive.indices)
         material = _material(primitive, notes)
         normals = primitive.normals if primitive.material.smooth else None
+        # pyrender has v upwards from the picture's lower edge.
         uvs = None if primitive.texcoord_0 is None else primitive.texcoord_0[:, :2] * [1, -1] + [0, 1]
         origin: list[np.ndarray] = []
         common: dict[str, Any] = {"normals": normals, "uvs": uvs, "source": origin, "where": "Scene.from_pyrender"}
@@ -90,6 +91,7 @@ def _bodies(source: Theirs, node: Theirs, notes: list[str]) -> Iterator[tuple[da
         if primitive.color_0 is not None:
             raw = replace(raw, colours=np.asarray(primitive.color_0, np.float32)[origin[0], :3].clip(0, 1))
         raw = replace(raw, source_hash=content_hash(raw.vertices.tobytes(), raw.faces.tobytes(), raw.uvs.tobytes()))
+        # A primitive with poses is drawn once for each (instances).
         for place in [np.eye(4)] if primitive.poses is None else primitive.poses:
             rigid, shape = split_rigid(source.get_pose(node) @ place)
             named = node.name or node.mesh.name or "mesh"

@@ -373,6 +373,7 @@ class Scene(Piece):
     def _listed(self) -> tuple[Tree, InMemory]:
         """The scene as plain data, with meshes, materials and objects by name, and those parts that are made of
         arrays."""
+        # Without a falling body no simulator is asked for, and friction says nothing.
         falls = any(body.tree.get("physics", {}).get("kind") == "dynamic" for body in self.objects)
         named, meshes, materials, memory = [], {}, {}, InMemory()
         taken: set[str] = set()
@@ -380,9 +381,11 @@ class Scene(Piece):
             item = {**body.tree, "mesh": f"mesh{k}"}
             if not falls:
                 item.pop("physics", None)
+            # Names are unique in a configuration; bodies of the same kind get their number.
             item["name"] = item["name"] if item["name"] not in taken else f"{item['name']}#{k}"
             taken.add(item["name"])
             meshes[f"mesh{k}"] = body.mesh
+            # Arrays travel beside the tree, which holds only what YAML can say.
             if body.triangles is not None:
                 memory.meshes[f"mesh{k}"] = body.triangles
             if body.material is not None:

@@ -281,12 +281,14 @@ def create_context(backend: str = "auto", device: int = 0) -> GLContext:
     device = _overridden(device)
     attempts: list[str] = []
     if backend in ("auto", "egl"):
+        # Who names a device gets that one or an error; otherwise the first that works.
         others = range(1, len(egl_devices())) if backend == "auto" and device == 0 else ()
         for index in (device, *others):
             try:
                 return GLContext(_egl(index), "egl", index, tuple(attempts))
             except _EGLUnavailable as error:
                 attempts.append(f"EGL device {index}: {error}")
+                # A number that is not there is a mistake of the user, which no other device mends.
                 if error.no_such_device:
                     raise GLError(
                         "no such EGL device",

@@ -153,6 +153,7 @@ class _Expansion:
         if shown in chain:
             raise ShaderError("include cycle: " + " -> ".join([*chain[chain.index(shown) :], shown]), where=included_at)
         try:
+            # Edited text in memory precedes the file; includes that are made of tables come last.
             text = self.files[shown] if shown in self.files else path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             name = shown.removeprefix("include/")

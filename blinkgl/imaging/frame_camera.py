@@ -166,11 +166,13 @@ class FrameCamera:
         speed = draw.motion.fastest(exposure.start_ns, exposure.end_ns, config.max_px)
         points = self._points_needed(exposure.middle_ns)
         changes = max((wave.per_second() for wave in draw.scene.waveforms.values()), default=0.0)
+        # As many instants as motion, lens and changing light ask for, whichever needs most.
         count = instants(exposure, speed, config.max_px, points, config.max_instants, changes)
         lens = config.lens if points > 1 else None
         aperture = None if lens is None else thin_lens.points(count, lens.aperture)
         total = np.zeros((draw.height, draw.width, 3))
         cells, weights = exposure.cells(count)
+        # Each instant stands for its part of the exposure; changing lamps are integrated over it.
         for i, (begin_ns, t_ns, end_ns) in enumerate(cells):
             moment = draw.moment(t_ns)
             if draw.scene.waveforms:

@@ -117,6 +117,7 @@ def check_events(
     t = events.t
     if not len(t):
         return after
+    # Chunks are checked one by one, so the last time of the chunk before is kept.
     if after is not None and t[0] < after:
         raise EventDataError(f"event times decrease at event {first}", where=where, value=(after, int(t[0])))
     if (back := t[1:] < t[:-1]).any():
@@ -124,6 +125,7 @@ def check_events(
         raise EventDataError(
             f"event times decrease at event {first + i + 1}", where=where, value=(int(t[i]), int(t[i + 1]))
         )
+    # A maximum is one pass; which event it was is looked up only for the message.
     for name, side in (("x", width), ("y", height)):
         column = getattr(events, name)
         if side is not None and column.max() >= side:

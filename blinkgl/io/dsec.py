@@ -237,17 +237,20 @@ class DsecEventReader(Closing):
             self.causes = "events/cause" in self._file
             if self.causes:
                 self._columns["cause"] = dataset(self._file, "events/cause", self.path, shape=(None,), kinds="iu")
+            # Columns of a damaged or made-up file may differ.
             lengths = {len(c) for c in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("event columns differ in length", where=str(path), value=sorted(lengths))
             self.count = lengths.pop()
             self.t_offset_us, self._ms_to_idx = 0, None
+            # DSEC counts times from t_offset; a file without it counts from 0.
             if "t_offset" in self._file:
                 self.t_offset_us = int(dataset(self._file, "t_offset", self.path, shape=())[()])
             if "ms_to_idx" in self._file:
                 self._ms_to_idx = dataset(self._file, "ms_to_idx", self.path, shape=(None,))
             self.height, self.width = (self._declared(name) for name in ("height", "width"))
             if size is not None:
+                # What the file itself states must agree with the sequence.
                 if (self.height or size[0], self.width or size[1]) != size:
                     raise AssetError(
                         "another size than the sequence's",

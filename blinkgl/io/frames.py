@@ -242,14 +242,17 @@ def _folder(folder: Path, declared: Declared) -> FrameSource:
     pictures = series(folder, IMAGE)
     beside = [folder / name for name in _STAMP_FILES]
     beside += [folder.parent / name for name in ("images.txt", "data.csv", f"{folder.name}.txt")]
+    # A declared file of times precedes the ones that data sets put beside their pictures.
     list_file = Path(declared.timestamps) if declared.timestamps else next((f for f in beside if f.is_file()), None)
     if list_file is not None and declared.timestamps is None and declared.fps is not None:
         if declared.time_unit != "frames":
             pictures.notes.append(f"{list_file.name} beside the images is not used, because of --fps")
             list_file = None
+    # Times in a folder that BlinkGL wrote are microseconds; others have to say their unit.
     written = list_file is not None and any((list_file.parent.parent / name).is_file() for name in _OURS)
     usual = "us" if written else None
     stamps = None if list_file is None else read_timestamps(list_file, declared.time_unit, declared.fps, usual=usual)
+    # The list may name pictures in another folder, as images.txt of ECD does.
     if not pictures.files and list_file is not None and stamps is not None and stamps.names:
         pictures = Series([p for name in stamps.names if (p := inside(list_file.parent, name)).is_file()])
     if not pictures.files:
@@ -434,6 +437,7 @@ def _array(path: Path, declared: Declared) -> FrameSource:
     notes: list[str] = []
     own: list[int] | None = None
     with numpy_errors(path):
+        # .npy is mapped, so that frames are read as they are asked for; an archive has to be unpacked.
         if path.suffix.lower() == ".npy":
             check_npy(path)
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -448,12 +452,14 @@ def _array(path: Path, declared: Declared) -> FrameSource:
                     )
                 frames = data[held[chosen(declared.stream, held, str(path), "arrays of frames")]]
                 called = [f"{k}{unit}" for k in ("timestamps", "times", "time", "ts", "t") for unit in ("", *_ENDINGS)]
+                # Names of times, with and without their unit behind: "t", "t_us", "timestamps_ns" …
                 stamp = next((k for k in called if k in data), None)
                 if stamp is not None and declared.fps is None and declared.timestamps is None:
                     stamps = stamps_of_array(stamp, data[stamp], declared.time_unit, str(path))
                     own, notes = stamps.times_ns, [stamps.note] if stamps.note else []
                 elif stamp is not None:
                     notes.append(f"'{stamp}' in the file is not used, because of --fps or --timestamps")
+    # (N, H, W) grey, or the last axis holds channels.
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3, 4))) or not frames.shape[0]:
         raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W), (N, H, W, 3 or 4)")
     if frames.dtype == bool:
@@ -462,6 +468,7 @@ def _array(path: Path, declared: Declared) -> FrameSource:
         raise AssetError(
             "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
         )
+    # 12 bits in 16 look as 16 do: the largest code of all frames is needed for the question.
     if frames.dtype == np.uint16 and declared.white_level is None and declared.range is None:
         _ask_for_white(max(int(frame.max()) for frame in frames), str(path))
 

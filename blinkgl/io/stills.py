@@ -20,7 +20,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 import cv2
 import numpy as np
@@ -31,9 +31,6 @@ from blinkgl.io.alpha import over
 from blinkgl.io.images import decode_image, png_chunks, png_problem, read_pfm, size_problem
 from blinkgl.io.reading import Damage
 from blinkgl.io.records import decoding, input_errors
-
-if TYPE_CHECKING:
-    from tifffile import TiffFile, TiffPage
 
 SUFFIXES = frozenset(
     ".png .apng .jpg .jpeg .bmp .tif .tiff .webp .gif .pbm .pgm .ppm .pnm .exr .hdr .pfm .avif .jp2 .tga".split()
@@ -163,7 +160,7 @@ class Stills:
                     image = self._colours(image, page)
                 yield upright(image, _tag(page, _ORIENTATION) or 1)
 
-    def _unpacked(self, page: TiffPage, bits: int, k: int) -> np.ndarray:
+    def _unpacked(self, page: Any, bits: int, k: int) -> np.ndarray:
         """Return a page whose packing tifffile leaves to another library: by Pillow, or of more bits by OpenCV."""
         if bits == 8:
             return _by_pillow(_bytes(self.path), self.path, self.notes, k, as_stored=True)
@@ -178,7 +175,7 @@ class Stills:
             )
         return images[0] if images[0].ndim == 2 else images[0][..., ::-1]
 
-    def _colours(self, image: np.ndarray, page: TiffPage) -> np.ndarray:
+    def _colours(self, image: np.ndarray, page: Any) -> np.ndarray:
         """Return (H, W), (H, W, 3) or, with alpha, (H, W, 2) or (H, W, 4) of a page as stored."""
         if image.ndim == 3 and page.axes == "SYX":
             image = np.moveaxis(image, 0, -1)
@@ -281,7 +278,7 @@ def _hidden(image: Image.Image) -> int:
 
 
 @contextlib.contextmanager
-def _opened_tiff(path: Path) -> Iterator[TiffFile]:
+def _opened_tiff(path: Path) -> Iterator[Any]:
     """Open a file, and no other one that it names; the library's log says what its exceptions say, too."""
     import tifffile
 
@@ -297,7 +294,7 @@ def _opened_tiff(path: Path) -> Iterator[TiffFile]:
         yield file
 
 
-def _bits(page: TiffPage) -> int:
+def _bits(page: Any) -> int:
     return page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
 
 
@@ -333,7 +330,7 @@ def _tiff(path: Path) -> Stills:
         )
 
 
-def _check_tags(page: TiffPage, path: Path) -> None:
+def _check_tags(page: Any, path: Path) -> None:
     """Raise AssetError, naming the tag, for a value that is not in the tables here."""
     formats = page.tags.get(339)
     formats = 1 if formats is None else formats.value
@@ -457,7 +454,7 @@ def _without_end(data: bytes) -> np.ndarray | None:
     return pictures[0] if len(pictures) == 2 and np.array_equal(pictures[0], pictures[1]) else None
 
 
-def _tag(page: TiffPage, code: int) -> Any:
+def _tag(page: Any, code: int) -> Any:
     tag = page.tags.get(code)
     return None if tag is None else tag.value
 

@@ -83,6 +83,7 @@ class Dsec(Layout):
             write_flow(source, towards, folder / "flow")
         times = image_times(source)
         write_lines(folder / "images/timestamps.txt", times)
+        # Loaders pair images and times by number, so other frames are left out.
         for k, t in enumerate(source.image_times):
             if t in times:
                 write_bytes(folder / f"images/left/ev_inf/{times.index(t):06d}.png", source.copied("images", k))

@@ -80,6 +80,7 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
     sources = sources_of(root)
     if not sources:
         raise AssetError("no sequences found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
+    # Nothing is written before every sequence is known to have what the layout needs.
     for source in sources:
         _refuse_what_lacks(row, source)
     places = _places(row, sources)
@@ -89,6 +90,7 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
             heartbeat.at(f"sequence {number:,} of {len(sources):,}")
             (folder / place).mkdir(parents=True, exist_ok=True)
             lines += row.write(source, folder / place)
+        # Loaders open folders of splits that may be empty.
         for split in row.splits:
             (folder / split).mkdir(exist_ok=True)
     held = {place.split("/")[0] for place in places}

@@ -193,6 +193,7 @@ class _Surfaces:
         self.ranges = np.zeros((2, len(items), 5))
         for k, item in enumerate(items):
             deforms = item.deformer is not None and not item.deformer.is_static
+            # Two resolutions of each body: many triangles, for those that are seen large, and few.
             for row, most in enumerate((FEW if deforms else MOST, FEW)):
                 if row and (deforms or len(item.mesh.faces) <= FEW):
                     self.ranges[1, k] = self.ranges[0, k]

@@ -108,6 +108,7 @@ class Painter:
     def _dress(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Set a material's uniforms besides the base colour."""
         material, resources = item.material, self.resources
+        # A program has only the uniforms of its variant: what is not there is not used by it.
         if "coverage" in uniforms and material.mask is not None:
             self._look_up(uniforms, "coverage", resources.coverage_texture(material))
             uniforms["cutoff"].value = material.mask.threshold

@@ -235,21 +235,25 @@ def look(
     room, largest, lit = 0, 0.0, len(light[0]) > 0
     for i in range(len(body)):
         room = max(room, int(ranges[i, 1] - ranges[i, 0]))
+    # Memory for the body with the most points, used for all, and for clipped polygons.
     moved, outside = np.empty((room, 9)), np.empty(room, np.int64)
     polygon, other, corners = np.empty((16, 9)), np.empty((16, 9)), np.empty(4)
     for i in range(len(body)):
         first, last = int(ranges[i, 0]), int(ranges[i, 1])
+        # All points once, since triangles share their corners.
         _move(T[body[i]], D[body[i]], points[first:last], rates[first:last], planes, near, lens, moved, outside)
         total, row = np.zeros(6), rows[i]
         row[SEEN], row[NEAREST], row[AWAY], row[ASIDE] = 0.0, np.inf, np.inf, np.inf
         for f in range(int(ranges[i, 2]), int(ranges[i, 3])):
             ka, kb, kc = faces[f, 0] - first, faces[f, 1] - first, faces[f, 2] - first
             a, b, c = moved[ka], moved[kb], moved[kc]
+            # Faces whose back is turned to the camera are not drawn.
             if sides[i] * _behind(a, b, c) > 0.0:
                 continue
             for r in range(4):
                 corners[r] = 0.0
             rest, codes = polygon, (outside[ka], outside[kb], outside[kc])
+            # All three corners are in the frustum: most triangles need no clipping.
             if not codes[0] | codes[1] | codes[2] and not lit:
                 area, count = _twice_area(a, b) + _twice_area(b, c) + _twice_area(c, a), 3
                 _add(a, corners, total, row)
@@ -260,6 +264,7 @@ def look(
                 if count == 0:
                     continue
             row[SEEN] = 1.0
+            # In px: the area at distance 1, times the densest corner's pixels per unit of it.
             area, fastest = 0.5 * abs(area) * corners[_DENSITY], corners[_FASTEST]
             if lit:
                 fastest = max(fastest, _patterns(rest, count, area, light, lens))

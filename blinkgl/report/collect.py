@@ -256,12 +256,15 @@ def _parameters(collected: Collected, rng: np.random.Generator) -> None:
 
 def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], into: list[Parameter]) -> None:
     if is_distribution(node):
+        # A distribution is a table of one key, its kind.
         kind, spec = next(iter(node.items()))
         values = [v for v in (_at(c, path) for c in configs) if v is not None]
         if kind in ("uniform", "log_uniform", "integer"):
             into.append(Parameter(group, ".".join(path), kind, spec, values))
             return
         options = [part["value"] for part in spec] if kind == "shares" else list(spec)
+        # Plain options are counted as values; tables are counted by the option that fits, and may hold distributions in
+        # turn.
         if all(not isinstance(o, (dict, list)) for o in options):
             into.append(Parameter(group, ".".join(path), kind, spec, values))
             return

@@ -139,6 +139,7 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
             objects.split(split)
         textures.split(split)
     elif isinstance(config, ExplicitSceneConfig):
+        # Every file that a sequence would open is looked for before the first one is drawn.
         moving = [("scene.camera", config.camera), *((f"scene.objects.{k}", o) for k, o in enumerate(config.objects))]
         for where, motion in moving:
             if motion.trajectory is not None:

@@ -400,6 +400,7 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
     without a change of length."""
     folder = Path(folder)
     try:
+        # Both directions: what the manifest names and is not there, and what is there without being named.
         files = read_manifest(folder)["files"]
         present = {name: (kind, size) for name, kind, size in entries_below(folder)}
     except BlinkGLError as error:
@@ -411,6 +412,7 @@ def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> lis
         kind, size = present.get(name, ("", 0))
         if kind != "file":
             problems += [f"{shown(name)}: missing"] if not kind else []
+        # Sizes first, since a sum reads the whole file.
         elif size != expected["bytes"]:
             problems.append(f"{shown(name)}: {size} bytes, manifest says {expected['bytes']}")
         elif checksums:

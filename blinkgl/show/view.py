@@ -36,6 +36,7 @@ def run(sequences: Sequence[str], *, port: int | None = None, save: str | None =
     from blinkgl.viewer.page import Page
     from blinkgl.viewer.server import LocalServer
 
+    # The port is taken first: who waits for a large set wants to know at once that it is not free.
     server = LocalServer(port)
     try:
         page = Page(server)

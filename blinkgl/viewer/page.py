@@ -126,6 +126,7 @@ class Page:
             self._add_choice()
         gui.add_markdown(_about(sequence))
         start, end = sequence.start_us / 1000, sequence.end_us / 1000
+        # 500 to 5,000 steps of a round length.
         step = 10.0 ** np.floor(np.log10((end - start) / 500))
         self._time = gui.add_slider("time, ms", start, end, float(step), start + (end - start) / 2)
         self._playing = False
@@ -133,6 +134,7 @@ class Page:
         self._play.on_click(lambda _: self._toggle())
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value=SPEEDS[3])
         self._windows, self._layers = [], {}
+        # What a sequence does not have gets no control.
         if with_events := [s for s in sequence.sensors if s.event_count]:
             usual = with_events[0].usual_window_us() / 1000
             for label, long in (("window, ms", usual), ("window in 3-D, ms", SPACE_WINDOWS * usual)):
@@ -145,6 +147,7 @@ class Page:
             if sequence.has_space:
                 there = [name for name in LAYERS if self.stage.has(name)]
                 self._layers = {name: gui.add_checkbox(LAYERS[name], True) for name in there}
+        # Only a mark is set here: the page's own thread draws, however fast a slider moves.
         for one in (self._time, *self._windows, *self._layers.values()):
             one.on_update(lambda _: self._changed.set())
 
@@ -273,6 +276,7 @@ def save(folder: Path, out: Path) -> None:
         windows = [s.usual_window_us() for s in sequence.sensors if s.event_count]
         window_us = windows[0] if windows else 1
         times = np.linspace(sequence.start_us, sequence.end_us, SAVED_STEPS + 1)[1:].astype(np.int64)
+        # The scene's changes are recorded as a film, which needs no server to be shown.
         film = server.get_scene_serializer()
         for t_us in times.tolist():
             pictures = {s.name: s.pictures(t_us, window_us) for s in sequence.sensors}

@@ -121,6 +121,7 @@ class Hdf5Truth:
 
     def __init__(self, path: Path):
         self.path = path
+        # The file is closed again: workers open it in their own process.
         with open_hdf5(path) as file:
             self.times = dataset(file, "davis/left/flow_dist_ts", path, shape=(None,), kinds="f")[()]
             self._flow(file)

@@ -291,10 +291,12 @@ def find_dsec(root: Path) -> list[Sequence]:
     sequences = []
     for events in sorted(below(root, "events.h5")):
         place = events.parent
+        # Folders of the event camera are called events/left or events_left; another place is one of our own sets.
         video = place.name not in ("left", "events_left")
         if "forward_flow" in {p.name for p in place.parent.iterdir()} or (video and not (place / "flow").is_dir()):
             continue
         folder = place if video else place.parent.parent if place.name == "left" else place.parent
+        # Truth lies beside the events, or in an archive of its own with the same sequence names.
         flow_folder = next(
             (f for f in (folder / "flow", root / "train_optical_flow" / folder.name / "flow") if f.is_dir()), None
         )

@@ -3,8 +3,8 @@
 It replaces trimesh's reader, because a scene needs cameras, materials, node names and animations, and because every
 count and path of a file must be checked before it is used. Reference: Khronos glTF 2.0, sections 3.5 to 3.11.
 
-Coordinates stay as in the file (y up); the caller turns them z up (:data:`~blinkgl.scene.importing.parts.Z_UP`).
-Features that are not drawn are collected in :attr:`Document.omissions`.
+Coordinates stay y up; the caller turns them (:data:`~blinkgl.scene.importing.parts.Z_UP`). Features that are not drawn
+are collected in :attr:`Document.omissions`.
 """
 
 from __future__ import annotations
@@ -61,8 +61,7 @@ _MAX_TARGET_VERTICES = 8_000_000  # of all morph targets of a primitive
 class Document:
     """A parsed file. ``nodes`` are those of the default scene, parents before children, by their index in the file.
 
-    tree : its JSON, in the form that :mod:`blinkgl.scene.importing.gltf_schema` checks.
-    materials : of the file.
+    tree : its JSON, in the form that :mod:`blinkgl.scene.importing.gltf_schema` checks.   materials : of the file.
     log : repairs and decisions.   omissions : features that are not drawn.
     """
 

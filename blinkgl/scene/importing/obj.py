@@ -281,6 +281,7 @@ def _materials(data: bytes, near: Neighbours, names: Iterable[str], max_texture:
     """Return the materials of these ``names``."""
     entries: dict[str, dict[str, _Entry]] = {}
     missing = [name for name, file in _libraries(data, near, entries) if file is None]
+    # A name that differs in case or spaces alone is taken, if there is only one such.
     alike: dict[str, list[str]] = {}
     for entry in entries:
         alike.setdefault(_bare(entry), []).append(entry)
@@ -291,6 +292,7 @@ def _materials(data: bytes, near: Neighbours, names: Iterable[str], max_texture:
         key = same[0] if len(same) == 1 else None
         if key != name and key is not None:
             near.log.append(f"{near.path.stem}: the material '{name}' is taken as '{key}'")
+        # Exporters of one material leave usemtl out.
         if not name and len(entries) == 1 and names == {"": 0}:
             (key,) = entries
             near.log.append(

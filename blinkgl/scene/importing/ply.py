@@ -141,6 +141,7 @@ def checked_ply(data: bytes, max_faces: int, where: str) -> tuple[list, _Body]:
         if words[:1] == ["format"]:
             form = words[1]
         elif words[:1] == ["element"]:
+            # A count is compared with the bytes that are left before memory is taken.
             declared.append((words[1], _count(words[1], words[2], max_faces, len(data) - head.end(), where), []))
         elif words[:2] == ["property", "list"]:
             declared[-1][2].append((words[4], _TYPES[words[2]], _TYPES[words[3]]))

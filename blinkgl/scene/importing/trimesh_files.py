@@ -29,6 +29,7 @@ def read_meshes(data: bytes, near: Neighbours, max_faces: int, max_texture: int 
     check_kind(data, max_faces, where)
     if kind == "off":
         return raw_meshes(_off(data, max_texture is not None, near), [None], max_faces, where, near.log)
+    # Bytes instead of a path: a library must not open other files. process would merge and reorder vertices.
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
     raws = []
     for node in loaded.graph.nodes_geometry:

@@ -299,9 +299,11 @@ def _wave(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     """Return four swings of a hand; every second variant uses the left one."""
     pose, u = _Pose(body), body.unit
     rng = np.random.default_rng([variant, 4])
+    # Variants differ in size and in the hand that waves.
     wide, high = rng.uniform(0.8, 1.2, 2) if variant else np.ones(2)
     side, sign = ("l", 1.0) if variant % 2 else ("r", -1.0)
     other = "r" if side == "l" else "l"
+    # Four waves of the hand in a round; the trunk gives way to the arm's weight.
     to = pose.wave(4)
     pose.pelvis[:, 1] -= sign * (0.015 + 0.006 * pose.wave()) * u
     pose.turn("pelvis", -1.5 * sign)
@@ -314,6 +316,7 @@ def _wave(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     pose.turn(f"hand_{side}", -sign * 16 * wide * pose.wave(4, 0.07))
     pose.turn(f"arm_{other}", -sign * 9, 3 + 2 * pose.wave())
     pose.turn(f"forearm_{other}", 0, -16)
+    # Feet stay where they are: the legs follow the pelvis by inverse kinematics.
     pose.plant(_still_feet(pose, 0.11 * u))
     return pose.cycle(3.0 / tempo, phase)
 
@@ -324,6 +327,7 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     rng = np.random.default_rng([variant, 5])
     big, loose, late = rng.uniform(0.8, 1.2), rng.uniform(0.7, 1.3), rng.uniform(-0.03, 0.03)
     step, arms = int(rng.integers(4)), int(rng.integers(5))
+    # Four beats and two steps to the side in a round, at 116 beats a minute.
     beat = pose.wave(4, late)
     side = pose.wave(2, 0.125 + late)
     apart = 0.15 * u

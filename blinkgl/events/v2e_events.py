@@ -113,9 +113,7 @@ def emit(
         leak = np.float64(leaks[i]) if leaks.size else 0.0
         k = _time_constants(intensity[i], intensity_end[o], v.kappa) if lag.size else -1.0
         curve = _curve(_ends(x, x_end, i, o), _ends(lag, lag_end, i, o), _ends(noise, noise_end, i, o), k, leak, v)
-        since_ns, noise_at = np.int64(0), 0.0
-        if causes:
-            since_ns, noise_at = since[i] - v.t0_ns, np.float64(noise_then[i])
+        since_ns, noise_at = (since[i] - v.t0_ns, np.float64(noise_then[i])) if causes else (np.int64(0), 0.0)
         state = Comparator(0.0, np.int64(0), np.float64(upper[i]), np.float64(lower[i]), since_ns, noise_at)
         if waiting:
             # The signal at the end of the dead time is the new reference.

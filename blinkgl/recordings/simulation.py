@@ -372,7 +372,6 @@ def file_to_events(
     """
     from blinkgl.io.formats import event_writer
 
-    # Whatever can be refused is refused before the first frame is read.
     _check_target(target, emulator)
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
@@ -384,7 +383,6 @@ def file_to_events(
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
     iterator = iter(frames)
-    # Two frames are read ahead: the file's clock starts at the first, and their gap is the preview's frame rate.
     first = list(itertools.islice(iterator, 2))
     start_us, gap_ns = first[0][1] // 1000, first[-1][1] - first[0][1]
     numbered = enumerate(itertools.chain(first, iterator))

@@ -44,11 +44,9 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         amodal = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
         if not seen and ((amodal[2:] < whole[:2]) | (amodal[:2] > whole[2:])).any():
             continue
-        if any(part.material.mask is not None for part in obj.parts):
-            amodal, pixels = _holed(scene, obj, t_ns, amodal)
-        else:
-            pixels = _covered(px, drawn, ids.shape)
-        pixels = max(pixels, seen)
+        holed = any(part.material.mask is not None for part in obj.parts)
+        amodal, alone = _holed(scene, obj, t_ns, amodal) if holed else (amodal, _covered(px, drawn, ids.shape))
+        pixels = max(alone, seen)
         # An object between the pixel centres has no box.
         if not pixels:
             continue

@@ -28,6 +28,7 @@ from blinkgl.io.tables import (
     TableReader,
     choose,
     named_columns,
+    not_columns,
     not_read,
     table_of_columns,
     table_of_records,
@@ -266,6 +267,9 @@ def _candidates(
             known = {"unit": unit, "layout": layout, "per_px": per_px, **known}
     if set("txyp") <= columns.keys() and reading.stream not in shapes:
         used = [*columns.values(), *(["cause"] if "cause" in shapes else [])]
+        count = shapes[columns["t"]][0][:1]
+        others = [name for name, (shape, _) in shapes.items() if shape[:1] == count and name not in (*used, *_KNOWN)]
+        known["notes"] = [*known["notes"], *not_columns(others if count != (1,) else ())]
         arrays = {name: load(name) for name in used}
         return [("", lambda: _of_columns(columns, arrays, where, **known))]
     wide = 4 if not reading.columns or reading.named else len(reading.columns)

@@ -77,7 +77,8 @@ def microseconds(times: np.ndarray, where: str, first: int = 0, unit_ns: int = 1
     event, for NaN, infinity and what int64 cannot hold; AssetError: no numbers."""
     times = np.asarray(times)
     if times.dtype.kind not in "iufb":
-        raise AssetError("event column 't' holds no numbers", where=where, value=str(times.dtype))
+        accepted = "integers, floats, or dates in s, ms, us or ns"
+        raise AssetError("event column 't' holds no numbers", where=where, value=str(times.dtype), accepted=accepted)
     if times.dtype.kind in "iu" and unit_ns == 1000 and len(times) and abs(int(times.max())) < _MAX_TIME:
         return times.astype(np.int64, copy=False)
     scale = unit_ns / 1000

@@ -25,6 +25,7 @@ from blinkgl.io.columns import MAX_SIDE, CheckedWriter, check_events, check_size
 from blinkgl.io.hdf5 import (
     SHUFFLE,
     Blocks,
+    Group,
     dataset,
     growing_dataset,
     hdf5_errors,
@@ -33,6 +34,7 @@ from blinkgl.io.hdf5 import (
     write_rows,
 )
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.tables import not_columns
 from blinkgl.machine.closing import Closing
 from blinkgl.types.events import Events
 
@@ -237,6 +239,9 @@ class DsecEventReader(Closing):
             self.causes = "events/cause" in self._file
             if self.causes:
                 self._columns["cause"] = dataset(self._file, "events/cause", self.path, shape=(None,), kinds="iu")
+            held = self._file.get("events")
+            names = held.data() if isinstance(held, Group) else ()
+            self.notes = not_columns(name for name in names if name not in self._columns)
             # Columns of a damaged or made-up file may differ.
             lengths = {len(c) for c in self._columns.values()}
             if len(lengths) != 1:

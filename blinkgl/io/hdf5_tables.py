@@ -26,6 +26,7 @@ from blinkgl.io.tables import (
     TableReader,
     choose,
     named_columns,
+    not_columns,
     not_read,
     table_of_columns,
     table_of_records,
@@ -124,12 +125,14 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
         isinstance(data := group.get(name), Data) and data.dtype.kind in kinds for name, kinds in _EVENT_UTILS.items()
     ):
         layout = {"unit": "s", "layout": "event_utils' group of events: seconds"}
+    used, count = {data.name for data in columns.values()}, (columns["t"].shape or ())[:1]
+    others = [name for name, one in group.data().items() if (one.shape or ())[:1] == count and one.name not in used]
     return table_of_columns(
         columns,
         str(path),
         heading=f"t [{units}]" if isinstance(units, str) else heading,
         offset=next((n for holder in (group, file) if (n := _number(holder, "t_offset", path))), 0),
-        notes=_notes(file, group, columns["t"]),
+        notes=[*_notes(file, group, columns["t"]), *not_columns(others)],
         size=_size(file, group, path),
         place=place,
         **({} if isinstance(units, str) else layout),

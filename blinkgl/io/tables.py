@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,11 @@ def not_read(names: Iterable[str], known: Collection[str]) -> list[str]:
     knows."""
     left = sorted({name for name in names if name not in known and _STATES.fullmatch(name)})
     return [f"left out: {', '.join(left)}, whose meaning is not known (--size, --time-unit, --origin)"] if left else []
+
+
+def not_columns(names: Iterable[str]) -> list[str]:
+    """Return the line that says which columns of the events' table, one value an event, are not read."""
+    return [f"left out: columns that are none of t, x, y, p: {', '.join(left)}"] if (left := list(names)) else []
 
 
 def proposal(rows: np.ndarray | None, times: np.ndarray | None = None) -> str:
@@ -160,7 +165,9 @@ def table_of_records(records: Any, named: Mapping[str, str], **known: Any) -> Ta
         rows = records[part]
         return {slot: rows[name] for slot, name in named.items()}
 
-    return Table(read, len(records), named["t"], **known)
+    others = not_columns(name for name in records.dtype.names if name not in named.values())
+    made = Table(read, len(records), named["t"], **known)
+    return replace(made, notes=[*made.notes, *others])
 
 
 def table_of_rows(rows: Any, where: str, order: tuple[str, ...] | None, **known: Any) -> Table:
@@ -210,7 +217,10 @@ class TableReader:
         self.height, self.width = table.size or (None, None)
         first = table.read(slice(0, 1))
         self.count, self.causes = table.count, "cause" in first
-        unit = reading.time_unit or table.unit or named_unit(table.heading)
+        # NumPy's datetime64 and timedelta64 say their unit in the type.
+        stated = np.datetime_data(first["t"].dtype) if first["t"].dtype.kind in "mM" else (None, 1)
+        self._dated = stated[0] in NANOSECONDS and stated[1] == 1
+        unit = reading.time_unit or table.unit or (stated[0] if self._dated else named_unit(table.heading))
         if unit is None:
             times = table.read(slice(0, _SAMPLE))["t"]
             if len(times) and times.dtype.kind in "iuf":
@@ -228,7 +238,7 @@ class TableReader:
             columns = self._table.read(slice(first, min(self.count, first + size)))
             if self._keep:
                 columns = self._whole(columns)
-            t = microseconds(columns["t"], where, first, unit)
+            t = microseconds(self._numbers(columns["t"], where, first), where, first, unit)
             x, y = (columns[side] if self._table.per_px == 1 else columns[side] / self._table.per_px for side in "xy")
             p, cause = columns["p"], columns.get("cause")
             polarity = self._polarity
@@ -242,11 +252,19 @@ class TableReader:
         if self.count and self.unread == self.count:
             raise AssetError("no row is an event", where=where, accepted="x, y, t, p (--columns)")
 
+    def _numbers(self, times: np.ndarray, where: str, first: int) -> np.ndarray:
+        """Return times as numbers: those of NumPy's dates are int64. Raises EventDataError, as for NaN: no date."""
+        if not self._dated:
+            return times
+        if (none := np.isnat(times)).any():
+            microseconds(np.array([np.nan]), where, first + int(np.argmax(none)))
+        return times.astype(np.int64)
+
     def _whole(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the rows that an event can be; count the others."""
         whole = np.ones(len(columns["t"]), bool)
         for slot, column in columns.items():
-            if column.dtype.kind == "f":
+            if column.dtype.kind in "fmM":
                 whole &= np.isfinite(column)
             if slot in "xy":
                 whole &= (column >= 0) & (column < 65536)

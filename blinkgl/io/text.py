@@ -29,7 +29,7 @@ from blinkgl.io.atomic import output_errors
 from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter, proposed_polarity
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen
-from blinkgl.io.tables import slot_of, undeclared
+from blinkgl.io.tables import not_columns, slot_of, undeclared
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 from blinkgl.types.numbers import is_number
@@ -127,8 +127,7 @@ class TextReader:
         named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
         if not self._order and named:
             self._order, self._unit = order, self._heading(dict(zip(order, names)))
-            if others := [name for name, slot in zip(names, order) if slot == "_" and name]:
-                self.notes.append(f"left out: columns that are none of t, x, y, p: {', '.join(others)}")
+            self.notes += not_columns(name for name, slot in zip(names, order) if slot == "_" and name)
         elif not comment and not self._reading.columns:
             raise AssetError(
                 f"line {self._lines + 1} is not an event, and not a heading that names t, x, y and p",
@@ -157,7 +156,9 @@ class TextReader:
             with contextlib.ExitStack() as stack:
                 if suffix == ".zip":
                     archive = stack.enter_context(zipfile.ZipFile(self.path))
-                    names = [n for n in archive.namelist() if n.lower().endswith((".txt", ".csv"))]
+                    # macOS adds a folder of its own with a file of attributes beside every file.
+                    names = [n for n in archive.namelist() if not n.startswith("__MACOSX/")]
+                    names = [n for n in names if n.lower().endswith((".txt", ".csv"))]
                     if not names:
                         raise AssetError("no text in the zip", where=str(self.path), value=archive.namelist()[:8])
                     name = names[chosen(self._reading.stream, names, str(self.path), "texts in the zip")]

@@ -1,0 +1,97 @@
+"""What lies beside the columns of events is said, in every container; NumPy's dates state their unit."""
+
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from blinkgl import AssetError, EventDataError, open_events
+
+T, X, Y, P = np.arange(20) * 1000, np.arange(20) % 7, np.arange(20) % 5, np.arange(20) % 2
+COLUMNS = {"t_us": T, "x": X, "y": Y, "p": P}
+LINE = "left out: columns that are none of t, x, y, p: instance"
+
+
+def records():
+    made = np.zeros(len(T), [("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("p", "?"), ("instance", "u2")])
+    for name, column in COLUMNS.items():
+        made[name] = column
+    return made
+
+
+def hdf5(path, group, **columns):
+    with h5py.File(path, "w") as file:
+        for name, column in columns.items():
+            file[f"{group}{name}"] = column
+
+
+def dsec(path):
+    hdf5(path, "events/", t=T, x=X, y=Y, p=P.astype(bool), instance=X)
+    with h5py.File(path, "r+") as file:
+        file["ms_to_idx"], file["t_offset"] = np.arange(len(T) + 1), 0
+
+
+def record_file(path):
+    with h5py.File(path, "w") as file:
+        file["events"] = records()
+
+
+WRITERS = {
+    "columns.npz": lambda path: np.savez(path, **COLUMNS, instance=X),
+    "records.npy": lambda path: np.save(path, records()),
+    "records.npz": lambda path: np.savez(path, events=records()),
+    "group.h5": lambda path: hdf5(path, "events/", **COLUMNS, instance=X, frames=np.zeros((3, 2, 2))),
+    "root.h5": lambda path: hdf5(path, "", **COLUMNS, instance=X),
+    "records.h5": record_file,
+    "dsec.h5": dsec,
+    "variables.mat": lambda path: scipy.io.savemat(path, {**COLUMNS, "instance": X}),
+    "struct.mat": lambda path: scipy.io.savemat(path, {"events": {**COLUMNS, "instance": X}}),
+    "text.csv": lambda path: path.write_text(
+        "t_us,x,y,p,instance\n" + "".join(f"{t},{x},{y},{p},{x}\n" for t, x, y, p in zip(T, X, Y, P))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_column_that_is_not_read_is_said(tmp_path, name):
+    WRITERS[name](tmp_path / name)
+    with open_events(tmp_path / name) as file:
+        (events,) = file.chunks()
+        assert LINE in file.notes and (events.t == T).all() and (events.x == X).all()
+
+
+def test_an_archive_of_one_event_names_no_settings_as_columns(tmp_path):
+    np.savez(tmp_path / "one.npz", **{name: column[:1] for name, column in COLUMNS.items()}, gain=np.array([3.0]))
+    with open_events(tmp_path / "one.npz") as file:
+        assert not any("columns" in line for line in file.notes)
+
+
+@pytest.mark.parametrize("kind", ["datetime64", "timedelta64"])
+@pytest.mark.parametrize("unit, per_us", [("ns", 1000), ("us", 1)])
+def test_dates_state_their_unit(tmp_path, kind, unit, per_us):
+    np.savez(tmp_path / "dates.npz", x=X, y=Y, t=(T * per_us).astype(f"{kind}[{unit}]"), p=P)
+    with open_events(tmp_path / "dates.npz") as file:
+        assert np.concatenate([events.t for events in file.chunks()]).tolist() == T.tolist()
+
+
+def test_no_date_and_other_steps_are_refused(tmp_path):
+    dates = (T * 1000).astype("datetime64[ns]")
+    dates[3] = "NaT"
+    np.savez(tmp_path / "nat.npz", x=X, y=Y, t=dates, p=P)
+    with open_events(tmp_path / "nat.npz") as file, pytest.raises(EventDataError, match="time of event 3"):
+        list(file.chunks())
+    with open_events(tmp_path / "nat.npz", damaged="keep") as file:
+        assert sum(map(len, file.chunks())) == len(T) - 1
+    np.savez(tmp_path / "steps.npz", x=X, y=Y, t=T.astype("timedelta64[25us]"), p=P)
+    with open_events(tmp_path / "steps.npz") as file, pytest.raises(AssetError, match="dates in s, ms, us or ns"):
+        list(file.chunks())
+
+
+def test_the_folder_of_macos_is_no_text(tmp_path):
+    with zipfile.ZipFile(tmp_path / "mac.zip", "w") as archive:
+        archive.writestr("a.csv", "t_us,x,y,p\n1,2,3,1\n")
+        archive.writestr("__MACOSX/._a.csv", b"\0\5\x16\7")
+    with open_events(tmp_path / "mac.zip") as file:
+        assert [events.x.tolist() for events in file.chunks()] == [[2]]

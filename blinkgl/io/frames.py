@@ -450,14 +450,17 @@ def _array(path: Path, declared: Declared) -> FrameSource:
                     raise AssetError(
                         "no array 'frames'", where=str(path), value=data.names, accepted="--array NAME, or one 'frames'"
                     )
-                frames = data[held[chosen(declared.stream, held, str(path), "arrays of frames")]]
+                named = held[chosen(declared.stream, held, str(path), "arrays of frames")]
+                frames = data[named]
                 called = [f"{k}{unit}" for k in ("timestamps", "times", "time", "ts", "t") for unit in ("", *_ENDINGS)]
                 # Names of times, with and without their unit behind: "t", "t_us", "timestamps_ns" …
                 stamp = next((k for k in called if k in data), None)
                 if stamp is not None and declared.fps is None and declared.timestamps is None:
                     stamps = stamps_of_array(stamp, data[stamp], declared.time_unit, str(path))
                     own, notes = stamps.times_ns, [stamps.note] if stamps.note else []
-                elif stamp is not None:
+                others = [k for k in data.names if k not in (named, stamp)]
+                notes = [*notes, *([f"left out: {', '.join(others)}, beside the frames"] if others else [])]
+                if stamp is not None and own is None:
                     notes.append(f"'{stamp}' in the file is not used, because of --fps or --timestamps")
     # (N, H, W) grey, or the last axis holds channels.
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3, 4))) or not frames.shape[0]:

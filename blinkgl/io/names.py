@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -80,6 +80,9 @@ def series(folder: Path, suffixes: Iterable[str], wanted: Callable[[Path], bool]
     hidden = [path for path in files if path.name.startswith(".")]
     if hidden:
         notes.append(f"{_named(hidden)}: hidden, so left out")
+    below = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds(path, endings)]
+    if files and below:
+        notes.append(f"{_named(below)}: a folder, so its files are left out")
     files = natural_order(path for path in files if not path.name.startswith("."))
     files, twice = _one_each(files)
     if twice:
@@ -91,6 +94,14 @@ def series(folder: Path, suffixes: Iterable[str], wanted: Callable[[Path], bool]
             f"{_named(odd)}: left out, since the names of the {len(files)} others are of the form {_shape(files[0])}"
         )
     return Series(files, _numbers(files), notes)
+
+
+def _holds(folder: Path, endings: Collection[str]) -> bool:
+    """Return whether a folder has files of one of the endings; False for one that cannot be listed."""
+    try:
+        return any(path.suffix.lower() in endings for path in folder.iterdir())
+    except OSError:
+        return False
 
 
 def _one_each(files: list[Path]) -> tuple[list[Path], list[Path]]:

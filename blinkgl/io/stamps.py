@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.clock import named_unit, nanoseconds
+from blinkgl.io.clock import NANOSECONDS, named_unit, nanoseconds
 from blinkgl.io.records import input_errors, read_text
 from blinkgl.io.rows import read_rows, titles_of
 from blinkgl.types.numbers import exact, is_number
@@ -130,6 +130,10 @@ def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str)
     """Return the times of an array (N,) named ``name``; the unit as of :func:`read_timestamps`. Raises EventDataError:
     not numbers, not finite."""
     values = np.asarray(values).reshape(-1)
+    # NumPy's datetime64 and timedelta64 say their unit in the type.
+    if values.dtype.kind in "mM" and not np.isnat(values).any():
+        dated, step = np.datetime_data(values.dtype)
+        unit, values = unit or (dated if step == 1 and dated in NANOSECONDS else None), values.astype(np.int64)
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         bad = int(np.argmax(~np.isfinite(values))) if values.dtype.kind == "f" else 0
         raise EventDataError(

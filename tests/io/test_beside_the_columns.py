@@ -2,12 +2,14 @@
 
 import zipfile
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 import scipy.io
 
 from blinkgl import AssetError, EventDataError, open_events
+from blinkgl.io.frames import Declared, open_frames
 
 T, X, Y, P = np.arange(20) * 1000, np.arange(20) % 7, np.arange(20) % 5, np.arange(20) % 2
 COLUMNS = {"t_us": T, "x": X, "y": Y, "p": P}
@@ -95,3 +97,32 @@ def test_the_folder_of_macos_is_no_text(tmp_path):
         archive.writestr("__MACOSX/._a.csv", b"\0\5\x16\7")
     with open_events(tmp_path / "mac.zip") as file:
         assert [events.x.tolist() for events in file.chunks()] == [[2]]
+
+
+FRAMES = np.random.default_rng(0).integers(0, 255, (4, 24, 32), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("declared, left", [({}, "exposure, masks"), ({"fps": 30}, "exposure, masks")])
+def test_arrays_beside_frames_are_said(tmp_path, declared, left):
+    beside = {"exposure": np.ones(4), "masks": FRAMES[:, :2]}
+    np.savez(tmp_path / "f.npz", frames=FRAMES, timestamps_us=np.arange(4) * 1000, **beside)
+    frames = open_frames(str(tmp_path / "f.npz"), Declared(**declared))
+    assert len(list(frames)) == 4 and f"left out: {left}, beside the frames" in frames.notes
+
+
+def test_frames_with_dates_have_their_times(tmp_path):
+    dates = (np.arange(4) * 33_333_333).astype("datetime64[ns]")
+    np.savez(tmp_path / "f.npz", frames=FRAMES, timestamps=dates)
+    assert [t_ns for _, t_ns, _ in open_frames(str(tmp_path / "f.npz"), Declared())] == dates.astype(int).tolist()
+
+
+def test_pictures_in_a_folder_below_are_said(tmp_path):
+    for place in (tmp_path, tmp_path / "masks", tmp_path / "notes"):
+        place.mkdir(exist_ok=True)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), FRAMES[k])
+        cv2.imwrite(str(tmp_path / f"masks/{k}.png"), FRAMES[k])
+    (tmp_path / "notes/read.txt").write_text("nothing to see")
+    frames = open_frames(str(tmp_path), Declared(fps=30))
+    assert len(list(frames)) == 3 and "masks: a folder, so its files are left out" in frames.notes
+    assert not any("notes" in line for line in frames.notes)

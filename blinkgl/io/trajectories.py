@@ -56,6 +56,10 @@ _HEADINGS = {
 }  # fmt: skip
 """Beginnings of headings that state no unit -> whose they are, and their unit. Of "s" every time has a point, of "ns"
 none."""
+_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0}
+"""Units of positions in a heading, ``x [mm]``, in metres."""
+_CHANGED = ("applied_transform", "applied_scale", "scale", "offset")
+"""Keys of transforms.json by which programs have changed poses, or change them as they read."""
 _FASTEST = 60.0
 """units/s of a camera from which on a note asks for the unit."""
 
@@ -179,6 +183,10 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
                 accepted=f"try form: tum or euroc, or columns: {_COLUMNS['tum']} and time_unit: s, ms, us or ns",
             )
     at = {role: k for k, role in enumerate(roles) if role != "-"}
+    if titles and declared.columns is None:
+        own = zip(titles[: len(rows[0][1])], [*roles, *"-" * len(titles)])
+        left = [title for title, role in own if role == "-" and title]
+        notes += [f"{path.name}: left out: columns that are no pose: {', '.join(left)}"] if left else []
     wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
     most = max((at[role] for role in wanted), default=0)
     for number, fields in rows:
@@ -193,7 +201,22 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     if times is not None and not (unit or declared.time_unit) and (known := _known_layout(heading, times)):
         notes.append(f"{path.name}: read as {known[0]} poses: {' '.join(roles)}, {known[1]}")
         unit = known[1]
-    return _Table(times, numbers[:, :3], _rotations(numbers[:, 3:], lines, path), lines, unit, notes)
+    metres = _metres(path, titles, [at[axis] for axis in "xyz"]) if len(titles) >= len(roles) else 1.0
+    return _Table(times, numbers[:, :3] * metres, _rotations(numbers[:, 3:], lines, path), lines, unit, notes)
+
+
+def _metres(path: Path, titles: Sequence[str], columns: Sequence[int]) -> float:
+    """Return the metres of a unit of position, as the titles of x, y, z state it; 1: they state none."""
+    stated = [re.search(r"[\[(]([^\])]*)", titles[k]) for k in columns]
+    units = {"" if unit is None else unit[1].strip().lower() for unit in stated}
+    if len(units) > 1 or not units <= _METRES.keys():
+        raise AssetError(
+            "no such unit of positions",
+            where=str(path),
+            value=", ".join(sorted(units)),
+            accepted="m, cm, mm or km of all three, or none",
+        )
+    return _METRES[units.pop()]
 
 
 def _known_layout(heading: str, times: Sequence[str]) -> tuple[str, str] | None:
@@ -290,10 +313,12 @@ def _colmap(path: Path, text: str, declared: PoseFile) -> _Table:
     numbers = _numbers(path, rows, list(range(1, 8)), accepted)
     names = [fields[9] if len(fields) > 9 else str(number) for number, fields in rows]
     order = [names.index(p.as_posix()) for p in natural_order(map(Path, names))]
+    cameras = {fields[8] for _, fields in rows if len(fields) > 8}
+    notes = [f"{path.name}: poses of {len(cameras)} cameras, read as one path"] if len(cameras) > 1 else []
     lines = [rows[k][0] for k in order]
     # SciPy's quaternions have w last.
     rotations = _rotations(numbers[order][:, [1, 2, 3, 0]], lines, path)
-    return _Table(None, numbers[order][:, 4:], rotations, lines)
+    return _Table(None, numbers[order][:, 4:], rotations, lines, notes=notes)
 
 
 def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
@@ -317,7 +342,15 @@ def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
         ) from None
     lines = list(range(1, len(frames) + 1))
     times = [str(frame["time"]) for frame in frames] if all("time" in frame for frame in frames) else None
-    return _Table(times, *_matrices(path, matrices, lines), lines, "s")
+    changed = [key for key in _CHANGED if key in tree]
+    notes = [f"{path.name}: {', '.join(changed)}: not applied, poses are as in the file"] if changed else []
+    if times is None and all(isinstance(frame.get("file_path"), str) for frame in frames):
+        names = [frame["file_path"] for frame in frames]
+        order = [names.index(p.as_posix()) for p in natural_order(Path(name) for name in dict.fromkeys(names))]
+        if len(order) == len(lines) and order != sorted(order):
+            notes.append(f"{path.name}: frames in the order of their names")
+            matrices, lines = matrices[order], [lines[k] for k in order]
+    return _Table(times, *_matrices(path, matrices, lines), lines, "s", notes)
 
 
 def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> np.ndarray:

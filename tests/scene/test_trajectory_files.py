@@ -411,3 +411,49 @@ def test_what_goes_faster_than_anything_flies_is_refused(tmp_path):
         tree["scene"]["camera"]["trajectory"].update(more)
         (tmp_path / "run.yaml").write_text(yaml.safe_dump(tree))
         assert sequence_scene(load_run(tmp_path / "run.yaml").sequence(0), 0, tmp_path).camera_path.t1_ns
+
+
+@pytest.mark.parametrize("unit, metres", [("[m]", 1), ("[mm]", 1e-3), ("(cm)", 1e-2), (" [km]", 1e3), ("", 1)])
+def test_a_heading_states_the_unit_of_positions(tmp_path, unit, metres):
+    T = circle(np.arange(5) * 0.1)
+    x, y, z, w = Rotation.from_matrix(T[:, :3, :3]).as_quat().T
+    rows = [f"t [s],x{unit},y{unit},z{unit},qw,qx,qy,qz,vx,fov"]
+    rows += [f"{k / 10},{T[k, 0, 3]},{T[k, 1, 3]},0,{w[k]},{x[k]},{y[k]},{z[k]},1,60" for k in range(5)]
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    notes = []
+    _, poses = read_trajectory(tmp_path / "p.csv", notes=notes)
+    assert np.abs(poses[:, :3, 3] - T[:, :3, 3] * metres).max() < 1e-9
+    assert "p.csv: left out: columns that are no pose: vx, fov" in notes
+
+
+@pytest.mark.parametrize("axes", ["x[ft],y[ft],z[ft]", "x[m],y[mm],z[m]", "x[m],y,z"])
+def test_other_units_of_positions_are_refused(tmp_path, axes):
+    (tmp_path / "p.csv").write_text(f"t[s],{axes},qw,qx,qy,qz\n" + "".join(f"{k},0,0,0,1,0,0,0\n" for k in range(3)))
+    with pytest.raises(AssetError, match="no such unit of positions.*m, cm, mm or km of all three"):
+        read_trajectory(tmp_path / "p.csv")
+
+
+def test_frames_without_times_follow_their_names(tmp_path):
+    T = circle(np.arange(12) * 0.1)
+    frames = [
+        {"file_path": f"images/{k}.png", "transform_matrix": (T[k] @ np.diag([1, -1, -1, 1])).tolist()}
+        for k in range(12)
+    ]
+    order = RNG(0).permutation(12)
+    tree = {"frames": [frames[k] for k in order], "applied_scale": 0.5, "scale": 1}
+    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+    notes = []
+    _, poses = read_trajectory(tmp_path / "transforms.json", rate=10, notes=notes)
+    assert np.abs(poses - T).max() < 1e-9
+    assert "transforms.json: applied_scale, scale: not applied, poses are as in the file" in notes
+    assert "transforms.json: frames in the order of their names" in notes
+
+
+def test_poses_of_several_cameras_are_said(tmp_path):
+    rows = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+    for k in range(4):
+        rows += [f"{k} 1 0 0 0 {k} 0 0 {k % 2} cam{k % 2}_{k}.png", "0 0 -1"]
+    (tmp_path / "images.txt").write_text("\n".join(rows) + "\n")
+    notes = []
+    read_trajectory(tmp_path / "images.txt", rate=10, notes=notes)
+    assert "images.txt: poses of 2 cameras, read as one path" in notes

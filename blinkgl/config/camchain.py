@@ -133,6 +133,9 @@ def _of_matrix(tree: Mapping[str, object], where: str) -> Calibrated | None:
     # K row by row: fx, skew, cx; 0, fy, cy; 0, 0, 1.
     if abs(K[1]) > 1e-6 * abs(K[0]):
         raise ConfigError("the pixels are skewed", where=f"{where}: {key}", value=K[1], accepted="0 in the first row")
+    if changed := _other_pictures(table):
+        accepted = "the calibration of pictures as they are stored"
+        raise ConfigError("of other pictures or another lens", where=where, value=changed, accepted=accepted)
     size = next((table[k] for k in ("img_size", "image_size", "resolution") if k in table), None)
     size = [table.get("image_width"), table.get("image_height")] if size is None else size
     numbers = next((name for name in _COEFFICIENTS if name in table), None)
@@ -142,6 +145,17 @@ def _of_matrix(tree: Mapping[str, object], where: str) -> Calibrated | None:
         model = "equidistant" if table.get("fisheye_model") else "radtan"
     plain = {"resolution": size, "intrinsics": [K[0], K[4], K[2], K[5]], "distortion_model": model}
     return _camera(plain | {"distortion_coeffs": coefficients}, where, "intrinsics")
+
+
+def _other_pictures(table: Mapping[str, Any]) -> dict[str, object]:
+    """Return the keys by which a calibration is not of the pictures as they are: ROS's, whose binned and cut pictures
+    keep the numbers of the whole ones, and the mirror xi of an omnidirectional lens."""
+    roi = table["roi"] if isinstance(table.get("roi"), dict) else {}
+    sides = {"width": {0, None, table.get("image_width")}, "height": {0, None, table.get("image_height")}}
+    cut = {"x_offset": {0, None}, "y_offset": {0, None}, **sides}
+    changed: dict[str, object] = {f"roi.{key}": roi[key] for key, whole in cut.items() if roi.get(key) not in whole}
+    once = {"binning_x": (None, 0, 1), "binning_y": (None, 0, 1), "xi": (None, 0)}
+    return changed | {key: table[key] for key, plain in once.items() if table.get(key) not in plain}
 
 
 def _flat(matrix: object) -> list[float] | None:

@@ -260,3 +260,24 @@ def test_calibrations_that_cannot_be(tmp_path, change, keys, said):
     with pytest.raises(ConfigError) as caught:
         load_run(tmp_path / "run.yaml")
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+WHOLE = "binning_x: 0\nbinning_y: 1\nroi: {x_offset: 0, y_offset: 0, height: 90, width: 120, do_rectify: true}\n"
+
+
+@pytest.mark.parametrize(
+    "more, named",
+    [
+        ("binning_x: 2\n", "binning_x"),
+        ("roi: {x_offset: 8, y_offset: 0, height: 0, width: 0, do_rectify: false}\n", "roi.x_offset"),
+        ("roi: {x_offset: 0, y_offset: 0, height: 60, width: 120, do_rectify: false}\n", "roi.height"),
+        ("xi: 1.2\n", "xi"),
+    ],
+)
+def test_calibrations_of_other_pictures_are_refused(tmp_path, more, named):
+    text = ROS.format(K=FLAT, D=RADIAL, n=4, model="plumb_bob")
+    (tmp_path / "c.yaml").write_text(text + WHOLE)
+    assert "cam0" in read_camchain(tmp_path / "c.yaml")
+    (tmp_path / "c.yaml").write_text(text + more)
+    with pytest.raises(ConfigError, match=rf"of other pictures or another lens.*{named}.*as they are stored"):
+        read_camchain(tmp_path / "c.yaml")

@@ -348,3 +348,25 @@ def test_3mf(tmp_path):
         archive.writestr("3D/3dmodel.model", b" " * 30_000_000)
     with pytest.raises(AssetError, match="too large when it is unpacked"):
         load_asset(tmp_path / "b.3mf")
+
+
+@pytest.mark.parametrize(
+    "unit, said",
+    [
+        ("", "millimeter are taken as metres, scale: 0.001 is"),
+        (' unit="inch"', "inch are taken as metres, scale: 0.0254"),
+        (' xml:lang="en" unit="meter"', None),
+        (' unit="parsec"', "parsec are taken as metres"),
+    ],
+)
+def test_the_unit_of_3mf_is_said(tmp_path, unit, said):
+    corner = '<vertex x="{}" y="{}" z="0"/>'
+    mesh = f"<vertices>{corner.format(0, 0)}{corner.format(9, 0)}{corner.format(0, 9)}</vertices>"
+    mesh += '<triangles><triangle v1="0" v2="1" v3="2"/></triangles>'
+    model = f'<model{unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources>'
+    model += f'<object id="1" type="model"><mesh>{mesh}</mesh></object></resources>'
+    with zipfile.ZipFile(tmp_path / "a.3mf", "w") as archive:
+        archive.writestr("3D/3dmodel.model", model + '<build><item objectid="1"/></build></model>')
+    made = load_asset(tmp_path / "a.3mf")
+    assert made.parts[0].mesh.vertices.max() == 9
+    assert [said in line for line in made.log] == ([] if said is None else [True])

@@ -75,7 +75,16 @@ _3MF_COLOURS = set("basematerials base colorgroup color texture2d texture2dgroup
 _3MF_COLOURS |= {"composite", "multiproperties", "multi"}
 
 
+_3MF_UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
+
+
 def _note_3mf(model: bytes, near: Neighbours) -> None:
+    # 3MF's core specification, 3.4: without a unit, millimetres.
+    stated = re.search(rb"<(?:[A-Za-z0-9_.-]+:)?model\b[^>]*?\bunit\s*=\s*[\"'](\w+)", model)
+    unit = stated[1].decode() if stated else "millimeter"
+    if unit != "meter":
+        scale = f", scale: {_3MF_UNITS[unit]:g} is its true size" if unit in _3MF_UNITS else ""
+        near.log.append(f"{near.path.stem}: lengths in {unit} are taken as metres{scale}")
     tags = {tag.decode() for tag in re.findall(rb"<(?:[A-Za-z0-9_.-]+:)?([A-Za-z0-9_]+)", model)}
     if tags & _3MF_COLOURS:
         near.omissions.add("colours and textures of 3MF (drawn white)")

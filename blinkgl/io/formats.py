@@ -317,14 +317,13 @@ class EventFile(Closing):
 
 def ending_of(path: Path) -> str:
     """Return the ending that tells the format: ``.txt.gz`` of ``e.txt.gz``."""
-    return "".join(path.suffixes[-2:] if path.suffix.lower() == ".gz" else path.suffixes[-1:]).lower()
+    return "".join(path.suffixes[-2 if path.suffix.lower() == ".gz" else -1 :]).lower()
 
 
 def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> EventFile:
-    """Open an event file; the content decides where the ending is ambiguous.
+    """Open an event file; the content decides where the ending is ambiguous. reading : what the user declares.
 
-    reading : what the user declares. Raises AssetError: missing, unknown ending, or content that does not match the
-    ending."""
+    Raises AssetError: missing, unknown ending, or content that does not match the ending."""
     path = Path(path)
     kind = _kind(path, reading)
     reader = FORMATS[kind].open(path, reading)
@@ -334,8 +333,9 @@ def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Eve
     file = EventFile(path, kind, height, width, getattr(reader, "t_offset_us", 0), reading, _reader=reader)
     if reading.size and reader.height and (reader.height, reader.width) != reading.size:
         file.told["size"] = f"the file says {reader.width}x{reader.height}; --size is used"
-    if file.fixed_unit and reading.time_unit not in (None, "us"):
-        file.told["unit"] = f"{kind} counts µs; --time-unit {reading.time_unit} is not used"
+    for option, value in {"--time-unit": reading.time_unit, "--columns": reading.columns}.items():
+        if file.fixed_unit and value and value != "us":
+            file.told[option] = f"{kind} has its own columns, in µs; {option} is not used"
     return file
 
 

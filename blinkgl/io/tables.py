@@ -79,6 +79,13 @@ def not_columns(names: Iterable[str]) -> list[str]:
     return [f"left out: columns that are none of t, x, y, p: {', '.join(left)}"] if (left := list(names)) else []
 
 
+def overruled(stated: str | None, reading: EventReading) -> list[str]:
+    """Return the line that says that another unit of time was declared than the file states."""
+    declared = reading.time_unit
+    other = stated is not None and declared is not None and stated != declared
+    return [f"the file says {stated}; --time-unit {declared} is used"] if other else []
+
+
 def proposal(rows: np.ndarray | None, times: np.ndarray | None = None) -> str:
     """Return the options to paste for (N, 4) rows without names, or for times without a unit, as far as a sample of the
     file shows them. The user declares; nothing is read by this."""
@@ -119,7 +126,7 @@ class Table:
     count : rows.   heading : the name of t.   unit : of t, where the file or its layout says it.   offset : added to
     t, in its unit.   size : (height, width), px, None: not in the file.   place : where it lies in the file.   layout :
     the name of the layout by which its unit is known; "": the file states it, or nothing does.   per_px : steps of x
-    and y in a pixel.   notes : lines for the user."""
+    and y in a pixel.   notes : lines for the user.   named : whether its columns have names."""
 
     read: Callable[[slice], dict[str, np.ndarray]]
     count: int
@@ -131,6 +138,7 @@ class Table:
     layout: str = ""
     per_px: int = 1
     notes: Sequence[str] = ()
+    named: bool = True
 
 
 def table_of_columns(columns: Mapping[str, Any], where: str, **known: Any) -> Table:
@@ -186,7 +194,7 @@ def table_of_rows(rows: Any, where: str, order: tuple[str, ...] | None, **known:
         columns = np.ascontiguousarray(rows[part].T)  # contiguous, because each is read several times
         return {slot: column for slot, column in zip(slots, columns, strict=True) if slot != "_"}
 
-    return Table(read, len(rows), **known)
+    return Table(read, len(rows), **known, named=False)
 
 
 Candidate = tuple[str, Callable[[], Table]]
@@ -220,7 +228,11 @@ class TableReader:
         # NumPy's datetime64 and timedelta64 say their unit in the type.
         stated = np.datetime_data(first["t"].dtype) if first["t"].dtype.kind in "mM" else (None, 1)
         self._dated = stated[0] in NANOSECONDS and stated[1] == 1
-        unit = reading.time_unit or table.unit or (stated[0] if self._dated else named_unit(table.heading))
+        own = table.unit or (stated[0] if self._dated else named_unit(table.heading))
+        unit = reading.time_unit or own
+        self.notes += overruled(own, reading)
+        if table.named and reading.columns and not reading.named:
+            self.notes.append("the columns have names; --columns is not used (x=NAME,y=NAME … for others)")
         if unit is None:
             times = table.read(slice(0, _SAMPLE))["t"]
             if len(times) and times.dtype.kind in "iuf":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from blinkgl import AssetError, EventDataError, open_events
+from blinkgl import AssetError, EventDataError, Events, open_events, write_events
 from blinkgl.io.frames import Declared, open_frames
 
 T, X, Y, P = np.arange(20) * 1000, np.arange(20) % 7, np.arange(20) % 5, np.arange(20) % 2
@@ -126,3 +126,31 @@ def test_pictures_in_a_folder_below_are_said(tmp_path):
     frames = open_frames(str(tmp_path), Declared(fps=30))
     assert len(list(frames)) == 3 and "masks: a folder, so its files are left out" in frames.notes
     assert not any("notes" in line for line in frames.notes)
+
+
+def one_of_each(folder):
+    """Files that state their unit and their columns."""
+    np.savez(folder / "a.npz", **{name.removesuffix("_us"): column for name, column in COLUMNS.items()}, time_unit="us")
+    hdf5(folder / "a.h5", "events/", **COLUMNS)
+    np.save(folder / "a.npy", records())
+    (folder / "a.csv").write_text("t_us,x,y,p\n" + "".join(f"{t},1,2,1\n" for t in T))
+    events = Events(X.astype(np.uint16), Y.astype(np.uint16), T, P.astype(np.uint8))
+    for name in ("a.raw", "a.aedat4", "a.bin"):
+        write_events(folder / name, events, 60, 80)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.npy", "a.csv", "a.raw", "a.aedat4", "a.bin"])
+def test_what_is_declared_against_the_file_is_said(tmp_path, name):
+    one_of_each(tmp_path)
+    own = name in ("a.raw", "a.aedat4", "a.bin")
+    with open_events(tmp_path / name, time_unit="ns") as file:
+        times = np.concatenate([events.t for events in file.chunks()])
+        assert times.tolist() == (T if own else T // 1000).tolist()
+        line = "in µs; --time-unit is not used" if own else "the file says us; --time-unit ns is used"
+        assert sum(line in one for one in file.notes) == 1
+    with open_events(tmp_path / name, time_unit="us") as file:
+        assert not any("--time-unit" in one for one in file.notes)
+    if name != "a.csv":  # there the declared order counts, whatever the heading says
+        with open_events(tmp_path / name, columns="x,y,t,p") as file:
+            assert np.concatenate([events.t for events in file.chunks()]).tolist() == T.tolist()
+            assert sum("--columns is not used" in one for one in file.notes) == 1

@@ -208,7 +208,7 @@ def compare(
 ) -> int:
     """Describe a recording, or compare it with events or frames. The table has counts, rates, intervals, and
     polarity against brightness."""
-    from blinkgl.io.frames import Declared
+    from blinkgl.io.declared import Declared
     from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
 

@@ -13,9 +13,10 @@ import numpy as np
 from PIL import Image
 
 from blinkgl.config.images import ImagesConfig
-from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.alpha import background_of, over
-from blinkgl.io.clock import NANOSECONDS, checked_unit
+from blinkgl.io.clock import NANOSECONDS
+from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.frame_camera import camera_of
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors
 from blinkgl.io.names import Series, series
@@ -29,7 +30,6 @@ VIDEO = frozenset(
 )
 STACK = {".tif", ".tiff", ".gif", ".webp", ".apng"}
 RECORDING = {".aedat", ".aedat4"}
-RANGES = ("full", "limited")
 _STAMP_FILES = ("timestamps.txt", "timestamp.txt", "images.txt", "timestamps.csv", "data.csv")
 _OURS = ("exposures.csv", "manifest.json")
 """Beside a folder of images of a sequence that BlinkGL wrote: its list of times is in µs."""
@@ -42,54 +42,6 @@ _BITS = (8, 10, 12, 14)
 
 Frames = Iterator[tuple[np.ndarray | None, int | None, str]]
 """Frame, own time and name; None: a damaged frame, which is left out."""
-
-
-@dataclass(frozen=True)
-class Declared:
-    """What a user declares of a clip of frames; None: what the file says.
-
-    fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.stamps`).
-    time_unit : of these, "s", "ms", "us", "ns", or "frames" of ``fps``.   zero_time : count times from the first frame.
-    white_level : code of white.   range : "full" or "limited" (16 to 235 of 8 bits).   background : colour below
-    transparent pixels, "black", "grey", "white" or "#rrggbb".   stream : name or number of one of several arrays or
-    streams of frames.   damaged : "refuse", or "keep" the frames that are whole.
-
-    Raises ConfigError: values that are none of these, fps beside timestamps."""
-
-    fps: float | None = None
-    timestamps: str | os.PathLike | None = None
-    time_unit: str | None = None
-    zero_time: bool = False
-    white_level: float | None = None
-    range: str | None = None
-    background: str | None = None
-    stream: str | None = None
-    damaged: str = "refuse"
-
-    def __post_init__(self) -> None:
-        if self.damaged not in ("refuse", "keep"):
-            raise ConfigError("cannot read --damaged", where="--damaged", value=self.damaged, accepted="refuse or keep")
-        if self.fps is not None and not 1e-6 <= self.fps <= 1e9:
-            raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
-        if self.time_unit != "frames":
-            checked_unit(self.time_unit)
-            if self.fps is not None and self.timestamps is not None:
-                raise ConfigError(
-                    "a frame rate and a list of times contradict each other",
-                    where="--fps, --timestamps",
-                    value=f"{self.fps:g}, {self.timestamps}",
-                    accepted="one of them, or --time-unit frames",
-                )
-        if self.range not in (None, *RANGES):
-            raise ConfigError("unknown range", where="--range", value=self.range, accepted="full or limited")
-        if self.white_level is not None and not (np.isfinite(self.white_level) and self.white_level > 0):
-            raise ConfigError(
-                "not a white level", where="--white-level", value=self.white_level, accepted="a positive number"
-            )
-        background_of(self.background)
-
-
-NOTHING = Declared()
 
 
 @dataclass(frozen=True)
@@ -191,6 +143,10 @@ class FrameSource:
             raise EventDataError("frames without times", where=str(self.path), accepted="--fps or --timestamps")
         if stamps is not None and stamps.note:
             self.notes.append(stamps.note)
+        if stamps is None and self.own_times and declared.fps is not None:
+            self.notes.append("the times in the file are not used, because of --fps")
+        if stamps is None and self.times_ns is None and declared.time_unit is not None:
+            self.notes.append("no list of times is read; --time-unit is not used")
         times = None if stamps is None else stamps.times_ns
         source = replace(self, fps=declared.fps, times_ns=times or self.times_ns, zero_time=declared.zero_time)
         source.check_count(self.count)
@@ -214,11 +170,11 @@ def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameS
         raise AssetError("no such file or folder", where=str(path))
     suffix = path.suffix.lower()
     if path.is_dir():
-        return _folder(path, declared)
+        return _alone(_folder(path, declared), declared)
     if suffix in VIDEO:
         return _video(path, declared).timed(declared)
     if suffix in STACK or (suffix == ".png" and open_stills(path).pages > 1):
-        return _stacks(path, Series([path]), declared).timed(declared)
+        return _alone(_stacks(path, Series([path]), declared).timed(declared), declared)
     if suffix in (".npy", ".npz"):
         return _array(path, declared).timed(declared)
     if suffix in RECORDING:
@@ -230,6 +186,13 @@ def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameS
         accepted=f"a video ({' '.join(sorted(VIDEO))}), a folder of images, a stack or animation "
         f"({' '.join(sorted(STACK))}), .npy, .npz, .aedat or .aedat4",
     )
+
+
+def _alone(source: FrameSource, declared: Declared) -> FrameSource:
+    """Return the only series of a folder or file; one that is chosen of several is not there."""
+    if declared.stream is not None:
+        source.notes.append("there is one series of frames; --stream is not used")
+    return source
 
 
 def read_any_image(path: Path, background: str | None = None) -> np.ndarray:

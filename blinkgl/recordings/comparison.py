@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.formats import ENDINGS, EventFile, ending_of, kind_of_files, open_events
-from blinkgl.io.frames import CALLED, NOTHING, Declared
+from blinkgl.io.frames import CALLED
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.machine.kernels import kernel

@@ -31,8 +31,8 @@ class OwnFrames(NamedTuple):
 class Codes:
     """What is known of the codes of frames; None: nothing.
 
-    gamma, white_level, range : declared by the user, as of :class:`~blinkgl.io.frames.Declared`.   own : properties of
-    the sensor's own frames.   transfer, levels, origin : what the file says, as of
+    gamma, white_level, range : declared by the user, as of :class:`~blinkgl.io.declared.Declared`.   own : properties
+    of the sensor's own frames.   transfer, levels, origin : what the file says, as of
     :class:`~blinkgl.io.frames.FrameSource`."""
 
     gamma: str | float | None = None
@@ -75,7 +75,8 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
 
     The curve is the declared one, else the file's, else sRGB for video, else that of the sensor's own frames for grey
     integers of its size, else sRGB for integers and linear for floats. Black and white are declared, else the file's,
-    else the ends of the type, or 0 and 1 of floats. Raises ConfigError: unknown curve."""
+    else the ends of the type, or 0 and 1 of floats. Raises ConfigError: unknown curve, a white
+    level beyond the type's codes."""
     integers, notes = first.dtype.kind == "u", []
     gamma, assumed = checked_gamma(codes.gamma), None
     if gamma is None:
@@ -102,6 +103,9 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
     if codes.white_level is not None or (codes.range is not None and codes.origin != "video"):
         top = float(np.iinfo(first.dtype).max) if integers else 1.0
         white = codes.white_level or (levels[1] if levels else top)
+        if integers and white > top:
+            accepted = f"at most {top:g} of {first.dtype}"
+            raise ConfigError("no code of the frames is white", where="--white-level", value=white, accepted=accepted)
         # Of 8 bits, 16 is black and 235 white; of more, as many times that as there are more codes.
         scale = 2.0 ** (round(np.log2(white + 1)) - 8) if integers else white / 255
         levels = (16 * scale, 235 * scale) if codes.range == "limited" else (0.0, white)

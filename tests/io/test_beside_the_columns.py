@@ -7,9 +7,11 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from PIL import Image
 
-from blinkgl import AssetError, EventDataError, Events, open_events, write_events
-from blinkgl.io.frames import Declared, open_frames
+from blinkgl import AssetError, ConfigError, EventDataError, Events, open_events, simulate, write_events
+from blinkgl.io.declared import Declared
+from blinkgl.io.frames import open_frames
 
 T, X, Y, P = np.arange(20) * 1000, np.arange(20) % 7, np.arange(20) % 5, np.arange(20) % 2
 COLUMNS = {"t_us": T, "x": X, "y": Y, "p": P}
@@ -154,3 +156,31 @@ def test_what_is_declared_against_the_file_is_said(tmp_path, name):
         with open_events(tmp_path / name, columns="x,y,t,p") as file:
             assert np.concatenate([events.t for events in file.chunks()]).tolist() == T.tolist()
             assert sum("--columns is not used" in one for one in file.notes) == 1
+
+
+@pytest.mark.parametrize(
+    "declared, line",
+    [
+        ({"stream": "5"}, "there is one series of frames; --stream is not used"),
+        ({"time_unit": "us"}, "no list of times is read; --time-unit is not used"),
+        ({}, None),
+    ],
+)
+@pytest.mark.parametrize("kind", ["folder", "a.gif"])
+def test_what_is_declared_of_frames_and_not_used_is_said(tmp_path, kind, declared, line):
+    if kind == "a.gif":
+        first, *others = (Image.fromarray(frame) for frame in FRAMES)
+        first.save(tmp_path / kind, save_all=True, append_images=others, duration=10)
+    else:
+        (tmp_path / kind).mkdir()
+        for k, frame in enumerate(FRAMES):
+            cv2.imwrite(str(tmp_path / f"{kind}/{k}.png"), frame)
+    frames = open_frames(str(tmp_path / kind), Declared(fps=50, **declared))
+    assert [t_ns for _, t_ns, _ in frames][:2] == [0, 20_000_000]
+    assert ("the times in the file are not used, because of --fps" in frames.notes) == (kind == "a.gif")
+    assert [one for one in frames.notes if "not used" in one and "--fps" not in one] == ([line] if line else [])
+
+
+def test_no_code_of_8_bits_is_a_white_of_12():
+    with pytest.raises(ConfigError, match=r"--white-level.*4095.*at most 255 of uint8"):
+        list(simulate(list(FRAMES), fps=30, white_level=4095))

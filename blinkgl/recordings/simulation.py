@@ -2,8 +2,7 @@
 
     for events in frames_to_events(frames, fps=1000, emulator="v2e"): ...
 
-``frames`` is any iterable; only the current frames are stored. Public: :func:`blinkgl.simulate` and, from file to file
-(:func:`file_to_events`), :func:`blinkgl.simulate_file`.
+``frames`` is any iterable; only the current ones are stored. Public: :func:`blinkgl.simulate`, `simulate_file`.
 """
 
 from __future__ import annotations

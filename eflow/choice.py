@@ -18,8 +18,8 @@ CAMERA, BODIES = "real_small", "real_bodies"
 AFFINE = 0.33
 """Mean distance of the flow from its nearest affine field, as a share of its mean length, below which the flow is that
 of a camera alone, before a scene of little depth. Medians of windows were .17 to .27 for seven recordings of moving
-cameras, .36 for a head that turns, and .42 to
-.88 for 24 simulated sequences of independent bodies (docs/results_eflow.md)."""
+cameras and .42 to .88 for 24 simulated sequences of independent bodies with the network that it was chosen by, .34 to
+.88 with the present one (docs/results_eflow.md)."""
 
 
 def chosen(file: EventFile, asked: WindowsAsked, predictor: infer.Predictor) -> tuple[str, str]:

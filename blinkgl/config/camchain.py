@@ -150,10 +150,13 @@ def _of_matrix(tree: Mapping[str, object], where: str) -> Calibrated | None:
 def _other_pictures(table: Mapping[str, Any]) -> dict[str, object]:
     """Return the keys by which a calibration is not of the pictures as they are: ROS's, whose binned and cut pictures
     keep the numbers of the whole ones, and the mirror xi of an omnidirectional lens."""
-    roi = table["roi"] if isinstance(table.get("roi"), dict) else {}
-    sides = {"width": {0, None, table.get("image_width")}, "height": {0, None, table.get("image_height")}}
-    cut = {"x_offset": {0, None}, "y_offset": {0, None}, **sides}
-    changed: dict[str, object] = {f"roi.{key}": roi[key] for key, whole in cut.items() if roi.get(key) not in whole}
+    roi = table.get("roi")
+    if roi is not None and not isinstance(roi, dict):
+        return {"roi": roi}
+    sides = {"width": (0, None, table.get("image_width")), "height": (0, None, table.get("image_height"))}
+    cut = {"x_offset": (0, None), "y_offset": (0, None), **sides}
+    parts = roi or {}
+    changed: dict[str, object] = {f"roi.{key}": parts[key] for key, whole in cut.items() if parts.get(key) not in whole}
     once = {"binning_x": (None, 0, 1), "binning_y": (None, 0, 1), "xi": (None, 0)}
     return changed | {key: table[key] for key, plain in once.items() if table.get(key) not in plain}
 

@@ -6,6 +6,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,7 +38,6 @@ from blinkgl.sequence.request import StageClock
 from blinkgl.sequence_files.preview import Panels, PreviewWriter
 from blinkgl.sequence_files.rig_dir import sensors_yaml, write_lens
 from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter, refuse_existing
-from blinkgl.types.trees import Tree
 from blinkgl.version import __version__
 
 LOSSES = "events_cut_by_max_events_per_step", "events_lost_in_readout", "events_late_in_readout"
@@ -176,7 +176,7 @@ def _folder(sequence: Simulation, path: Path) -> SequenceWriter:
     return SequenceWriter(path, config_yaml=text, **_settings(sequence.members[0]))
 
 
-def _settings(sequence: SensorSimulation) -> Tree:
+def _settings(sequence: SensorSimulation) -> dict[str, Any]:
     """Return the arguments of a camera's writer."""
     return {
         "height": sequence.height,

@@ -21,6 +21,7 @@ from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_npy
 from blinkgl.io.names import series
 from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.records import shown_names
 from blinkgl.io.sizes import check_claim
 from blinkgl.io.tables import (
     Candidate,
@@ -153,7 +154,7 @@ class ArrayReader(TableReader):
                     candidates = _candidates(shapes, archive.__getitem__, str(path), reading, skipped)
                     table = choose(candidates, reading, str(path), archive.names)
             super().__init__(path, reading, table)
-        self.notes += [f"left out: {', '.join(skipped)}, which would have to be unpickled"] if skipped else []
+        self.notes += [f"left out: {shown_names(skipped)}, which would have to be unpickled"] if skipped else []
 
 
 FOLDED = (".npz",)

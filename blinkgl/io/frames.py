@@ -21,7 +21,7 @@ from blinkgl.io.frame_camera import camera_of
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors
 from blinkgl.io.names import Series, series
 from blinkgl.io.reading import Damage, EventReading, chosen
-from blinkgl.io.records import inside
+from blinkgl.io.records import inside, shown_names
 from blinkgl.io.stamps import Stamps, read_timestamps, stamps_of_array
 from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills
 
@@ -413,16 +413,16 @@ def _array(path: Path, declared: Declared) -> FrameSource:
                     raise AssetError(
                         "no array 'frames'", where=str(path), value=data.names, accepted="--array NAME, or one 'frames'"
                     )
-                named = held[chosen(declared.stream, held, str(path), "arrays of frames")]
-                frames = data[named]
+                name = held[chosen(declared.stream, held, str(path), "arrays of frames")]
+                frames = data[name]
                 called = [f"{k}{unit}" for k in ("timestamps", "times", "time", "ts", "t") for unit in ("", *_ENDINGS)]
                 # Names of times, with and without their unit behind: "t", "t_us", "timestamps_ns" …
                 stamp = next((k for k in called if k in data), None)
                 if stamp is not None and declared.fps is None and declared.timestamps is None:
                     stamps = stamps_of_array(stamp, data[stamp], declared.time_unit, str(path))
                     own, notes = stamps.times_ns, [stamps.note] if stamps.note else []
-                others = [k for k in data.names if k not in (named, stamp)]
-                notes = [*notes, *([f"left out: {', '.join(others)}, beside the frames"] if others else [])]
+                others = [k for k in data.names if k not in (name, stamp)]
+                notes = [*notes, *([f"left out: {shown_names(others)}, beside the frames"] if others else [])]
                 if stamp is not None and own is None:
                     notes.append(f"'{stamp}' in the file is not used, because of --fps or --timestamps")
     # (N, H, W) grey, or the last axis holds channels.

@@ -12,7 +12,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -134,6 +134,13 @@ def shown(name: object, most: int = 160) -> str:
     text = str(name)
     text = text if text.isprintable() else ascii(text)[1:-1]
     return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def shown_names(names: Iterable[object], most: int = 12) -> str:
+    """Return names from a file for one line: each as of :func:`shown`, of many the first ``most`` and how many more."""
+    listed = list(names)
+    more = f" and {len(listed) - most:,} more" if len(listed) > most else ""
+    return ", ".join(shown(name, 60) for name in listed[:most]) + more
 
 
 def _inside(name: str) -> str:

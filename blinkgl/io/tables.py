@@ -19,6 +19,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.clock import NANOSECONDS, named_unit
 from blinkgl.io.columns import events_of, microseconds, proposed_polarity
 from blinkgl.io.reading import EventReading, chosen
+from blinkgl.io.records import shown_names
 from blinkgl.types.events import Events
 
 _NAMES = {
@@ -71,12 +72,14 @@ def not_read(names: Iterable[str], known: Collection[str]) -> list[str]:
     """Return the line that says which of the ``names`` beside the columns seem to state something that no reader
     knows."""
     left = sorted({name for name in names if name not in known and _STATES.fullmatch(name)})
-    return [f"left out: {', '.join(left)}, whose meaning is not known (--size, --time-unit, --origin)"] if left else []
+    return (
+        [f"left out: {shown_names(left)}, whose meaning is not known (--size, --time-unit, --origin)"] if left else []
+    )
 
 
 def not_columns(names: Iterable[str]) -> list[str]:
     """Return the line that says which columns of the events' table, one value an event, are not read."""
-    return [f"left out: columns that are none of t, x, y, p: {', '.join(left)}"] if (left := list(names)) else []
+    return [f"left out: columns that are none of t, x, y, p: {shown_names(left)}"] if (left := list(names)) else []
 
 
 def overruled(stated: str | None, reading: EventReading) -> list[str]:

@@ -28,7 +28,7 @@ from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import write_whole
 from blinkgl.io.clock import checked_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
-from blinkgl.io.records import decoding
+from blinkgl.io.records import decoding, shown_names
 from blinkgl.io.rows import read_rows, titles_of
 from blinkgl.io.stamps import PLACES, places_of, read_timestamps
 from blinkgl.types.numbers import exact, is_number
@@ -57,7 +57,13 @@ _HEADINGS = {
 """Beginnings of headings that state no unit -> whose they are, and their unit. Of "s" every time has a point, of "ns"
 none."""
 _METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0}
-"""Units of positions in a heading, ``x [mm]``, in metres."""
+_METRES |= {
+    f"{prefix}{metre}{plural}": metres
+    for prefix, metres in {"": 1.0, "centi": 0.01, "milli": 0.001, "kilo": 1000.0}.items()
+    for metre in ("metre", "meter")
+    for plural in ("", "s")
+}
+"""Units of positions in a heading, ``x [mm]`` or ``x (meters)``, in metres."""
 _CHANGED = ("applied_transform", "applied_scale", "scale", "offset")
 """Keys of transforms.json by which programs have changed poses, or change them as they read."""
 _FASTEST = 60.0
@@ -186,7 +192,7 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     if titles and declared.columns is None:
         own = zip(titles[: len(rows[0][1])], [*roles, *"-" * len(titles)])
         left = [title for title, role in own if role == "-" and title]
-        notes += [f"{path.name}: left out: columns that are no pose: {', '.join(left)}"] if left else []
+        notes += [f"{path.name}: left out: columns that are no pose: {shown_names(left)}"] if left else []
     wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
     most = max((at[role] for role in wanted), default=0)
     for number, fields in rows:
@@ -312,13 +318,21 @@ def _colmap(path: Path, text: str, declared: PoseFile) -> _Table:
     accepted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points"
     numbers = _numbers(path, rows, list(range(1, 8)), accepted)
     names = [fields[9] if len(fields) > 9 else str(number) for number, fields in rows]
-    order = [names.index(p.as_posix()) for p in natural_order(map(Path, names))]
+    order = _order_of(names)
     cameras = {fields[8] for _, fields in rows if len(fields) > 8}
     notes = [f"{path.name}: poses of {len(cameras)} cameras, read as one path"] if len(cameras) > 1 else []
     lines = [rows[k][0] for k in order]
     # SciPy's quaternions have w last.
     rotations = _rotations(numbers[order][:, [1, 2, 3, 0]], lines, path)
     return _Table(None, numbers[order][:, 4:], rotations, lines, notes=notes)
+
+
+def _order_of(names: Sequence[str]) -> list[int]:
+    """Return the places of names in the order of the numbers in them; equal names as they come."""
+    places: dict[Path, list[int]] = {}
+    for k, name in enumerate(names):
+        places.setdefault(Path(name), []).append(k)
+    return [k for path in natural_order(places) for k in places[path]]
 
 
 def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
@@ -346,8 +360,8 @@ def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
     notes = [f"{path.name}: {', '.join(changed)}: not applied, poses are as in the file"] if changed else []
     if times is None and all(isinstance(frame.get("file_path"), str) for frame in frames):
         names = [frame["file_path"] for frame in frames]
-        order = [names.index(p.as_posix()) for p in natural_order(Path(name) for name in dict.fromkeys(names))]
-        if len(order) == len(lines) and order != sorted(order):
+        order = _order_of(names)
+        if order != sorted(order):
             notes.append(f"{path.name}: frames in the order of their names")
             matrices, lines = matrices[order], [lines[k] for k in order]
     return _Table(times, *_matrices(path, matrices, lines), lines, "s", notes)

@@ -20,7 +20,6 @@ from blinkgl.errors import may_pass
 from blinkgl.online.cuts import CUTS
 from blinkgl.online.job import StreamJob
 from blinkgl.sequence import SequenceRequest, simulate_sequence
-from blinkgl.types.trees import Tree
 
 TRIES = 8
 """Largest number of unusable sequences of a slot."""
@@ -36,7 +35,7 @@ class SlotMaker(Maker):
     @classmethod
     def of(cls, job: Mapping[str, Any], device: int | None) -> SlotMaker:
         window = job["window_us"]
-        keys: Tree = {**job, "window_us": None if window is None else tuple(window)}
+        keys: dict[str, Any] = {**job, "window_us": None if window is None else tuple(window)}
         return cls(StreamJob(**keys), device)
 
     def __init__(self, job: StreamJob, device: int | None = None):

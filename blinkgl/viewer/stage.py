@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import printable
-from blinkgl.types.trees import Tree
 from blinkgl.viewer.views import Body, CameraView, Cloud, Picture, SequenceView
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ class Stage:
         self._middle, self._radius = sequence.extent()
         self._turn = _facing(sequence)
         self._with_pictures = pictures
-        self._shown: Tree = {}
+        self._shown: dict[str, Any] = {}
         self.world = scene.add_frame("/world", show_axes=False)
         self.space = scene.add_frame(
             "/events", show_axes=False, wxyz=_wxyz(self._turn), position=self._aside(_EVENTS_AT * self._radius)

@@ -272,6 +272,9 @@ WHOLE = "binning_x: 0\nbinning_y: 1\nroi: {x_offset: 0, y_offset: 0, height: 90,
         ("roi: {x_offset: 8, y_offset: 0, height: 0, width: 0, do_rectify: false}\n", "roi.x_offset"),
         ("roi: {x_offset: 0, y_offset: 0, height: 60, width: 120, do_rectify: false}\n", "roi.height"),
         ("xi: 1.2\n", "xi"),
+        ("roi: [8, 0, 10, 10]\n", "roi"),
+        ("roi: {x_offset: [1]}\n", "roi.x_offset"),
+        ("binning_y: {a: 1}\n", "binning_y"),
     ],
 )
 def test_calibrations_of_other_pictures_are_refused(tmp_path, more, named):

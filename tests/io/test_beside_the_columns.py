@@ -66,6 +66,18 @@ def test_a_column_that_is_not_read_is_said(tmp_path, name):
         assert LINE in file.notes and (events.t == T).all() and (events.x == X).all()
 
 
+def test_names_of_strangers_are_one_short_line(tmp_path):
+    hdf5(
+        tmp_path / "e.h5",
+        "events/",
+        **COLUMNS,
+        **{"\x1b[31mred\nline": X, **{f"column_{k:03d}": X for k in range(400)}},
+    )
+    with open_events(tmp_path / "e.h5") as file:
+        (line,) = (one for one in file.notes if "columns" in one)
+    assert line.isprintable() and r"\x1b[31mred\nline" in line and line.endswith("and 389 more") and len(line) < 400
+
+
 def test_an_archive_of_one_event_names_no_settings_as_columns(tmp_path):
     np.savez(tmp_path / "one.npz", **{name: column[:1] for name, column in COLUMNS.items()}, gain=np.array([3.0]))
     with open_events(tmp_path / "one.npz") as file:

@@ -413,7 +413,10 @@ def test_what_goes_faster_than_anything_flies_is_refused(tmp_path):
         assert sequence_scene(load_run(tmp_path / "run.yaml").sequence(0), 0, tmp_path).camera_path.t1_ns
 
 
-@pytest.mark.parametrize("unit, metres", [("[m]", 1), ("[mm]", 1e-3), ("(cm)", 1e-2), (" [km]", 1e3), ("", 1)])
+UNITS = {"[m]": 1, "[mm]": 1e-3, "(cm)": 1e-2, " [km]": 1e3, "": 1, " (meters)": 1, "[Millimetre]": 1e-3}
+
+
+@pytest.mark.parametrize("unit, metres", UNITS.items())
 def test_a_heading_states_the_unit_of_positions(tmp_path, unit, metres):
     T = circle(np.arange(5) * 0.1)
     x, y, z, w = Rotation.from_matrix(T[:, :3, :3]).as_quat().T
@@ -457,3 +460,14 @@ def test_poses_of_several_cameras_are_said(tmp_path):
     notes = []
     read_trajectory(tmp_path / "images.txt", rate=10, notes=notes)
     assert "images.txt: poses of 2 cameras, read as one path" in notes
+
+
+@pytest.mark.parametrize("start", ["", "./", "images/../"])
+def test_frames_of_nerf_by_any_spelling_of_their_names(tmp_path, start):
+    T = circle(np.arange(11) * 0.1) @ np.diag([1, -1, -1, 1])
+    frames = [{"file_path": f"{start}train/r_{k}", "transform_matrix": T[k].tolist()} for k in range(11)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames[::-1]}))
+    _, poses = read_trajectory(tmp_path / "transforms.json", rate=10)
+    assert np.abs(poses - circle(np.arange(11) * 0.1)).max() < 1e-9
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{**frame, "file_path": "a"} for frame in frames]}))
+    assert len(read_trajectory(tmp_path / "transforms.json", rate=10)[1]) == 11

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.reading import RECENT
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.types import Deformer, Material, Mesh, Part
-from blinkgl.types.trees import Tree
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Triangles as stored in a file, before they are checked and become a :class:`~blinkgl.scene.types.Mesh`.
@@ -94,7 +94,7 @@ def part_of(
     bumped = material.bumps is not None
     # Only per-vertex data of the file needs the indices of the mesh's vertices.
     indexed = deformer is not None or colours is not None or bumped
-    options: Tree = {
+    options: dict[str, Any] = {
         "name": name,
         "where": where,
         "uv_size": uv_size,

@@ -2,9 +2,9 @@
 
     python -m blinkgl.tools.training_trade --work out/training --minutes 5 --steps 1600 > page.md
 
-Each arm (a quality, an emulator, textures) gets the same processor time for its data, so that cheaper ones have more
-sequences; a network of the same size is trained for the same number of steps on each, with several seeds, and judged on
-test sets of ``quality: reference`` by three emulators, whose textures and objects no training has, and with
+Each arm (a quality, an emulator, textures, motion) gets the same processor time for its data, so that cheaper ones have
+more sequences; a network of the same size is trained for the same number of steps on each, with several seeds, and
+judged on test sets of ``quality: reference`` by three emulators, whose textures and objects no training has, and with
 ``--recordings`` on the recorded bursts whose flow is known. Every stage continues what is there already. The page has
 means over seeds and the half-width of their 95 % interval (Student's t).
 """
@@ -53,8 +53,10 @@ ARMS: dict[str, dict[str, object]] = {
     "voltmeter": {"quality": "fast", "events": VOLTMETER},
     "mix": {"quality": "fast", "events": MIX},
     "procedural": {"quality": "fast", "scene.textures.photographs": False},
+    "camera alone": {"quality": "fast", "scene.object_motion.static_share": 1.0},
+    "bodies alone": {"quality": "fast", "scene.camera_motion.speed": 0.0, "scene.camera_motion.rotation_rate": 0.0},
 }
-"""Changes of the recipe; those of emulators and textures are made with ``fast``, which costs least."""
+"""Changes of the recipe; those of emulators, textures and motion are made with ``fast``, which costs least."""
 TESTS = {"ESIM": ESIM, "V2E": V2E, "Voltmeter": VOLTMETER}
 PILOT = 8
 """Sequences whose cost says how many there will be."""

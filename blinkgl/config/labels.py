@@ -83,8 +83,8 @@ class LabelsConfig(Config, extra="allow"):
 
     events: bool = Field(
         False,
-        description="source of each event: instance, depth and image velocity of the surface, and the cause (sets "
-        "`events.causes` unless it is given), in event_labels.h5; docs/labels.md",
+        description="source of each event: instance, depth and image velocity of the surface, the light that changed, "
+        "and the cause (sets `events.causes` unless it is given), in event_labels.h5; docs/labels.md",
     )
     pixels: Literal["sensor", "rectified"] = Field(
         "sensor",

@@ -17,6 +17,7 @@ from blinkgl.config.images import ImagesConfig
 from blinkgl.config.over_time import imu_count, track_times
 from blinkgl.config.quality import DEFAULT, load_quality, measured_presets
 from blinkgl.config.run import RunTemplate
+from blinkgl.config.scene import lights_change
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import DisplacementTimeline
 from blinkgl.dataset.rehearsal import Cost, mean_cost, rehearsals
@@ -323,7 +324,10 @@ def _pictures(config: SequenceConfig, duration: float, result: Explanation) -> N
     if request:
         result.add("labels", ", ".join(request) + _over_intervals(request, config), labels)
     if config.labels.events:
-        result.add("what made each event", "surfaces at every event frame (labels.events)", result.frames)
+        why = "surfaces at every event frame"
+        if config.frames is None and lights_change(config.scene):
+            why += ", and it again for each light that changed"
+        result.add("what made each event", f"{why} (labels.events)", result.frames)
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
         result.add("preview", f"{config.preview.rate:g} pictures per simulated second", pictures)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from blinkgl.config.run import RunTemplate
+from blinkgl.config.scene import lights_change
 from blinkgl.config.sequence import PreviewConfig, SequenceConfig
 from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
@@ -185,6 +186,7 @@ def _settings(sequence: SensorSimulation) -> dict[str, Any]:
         "labels": sequence.config.labels,
         "events": sequence.camera is not None,
         "truth": sequence.records_truth,
+        "lights": sequence.records_truth and lights_change(sequence.config.scene),
         "codec": sequence.config.output.compression,
     }
 

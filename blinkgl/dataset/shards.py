@@ -5,7 +5,7 @@ One sample per flow label, its files side by side under one key:
     flying_000017_000003.json        sequence, times in µs, size, emulator, seed; K (3x3), near and T_world_cam (4x4)
                                      where poses are known
     flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8; with
-                                     labels.events also instance, depth and velocity of what made them
+                                     labels.events also instance, depth and velocity of what made them, light
     flying_000017_000003.new.npz     events of the label's interval [from, to)
     flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, depth.npy, ids.png … where the data set
                                      has them: every label whose row names a ``shard``, in each form that is a file of
@@ -32,6 +32,7 @@ from blinkgl.io.atomic import atomic_folder, output_errors, refuse_existing
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
+from blinkgl.io.lights import LIGHTS
 from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
@@ -129,9 +130,10 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         if EVENT_LABELS in manifest["files"]:
             first = reader.number(2 * start - end), reader.number(start)
             windows = {name: with_truth(one, k, folder) for (name, one), k in zip(windows.items(), first)}
+    told = (*TOLD, "light") if LIGHTS in manifest["files"] else TOLD
     yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
     for name, events in windows.items():
-        yield f"{key}.{name}.npz", _npz(events)
+        yield f"{key}.{name}.npz", _npz(events, told)
     for label in sorted(
         (label for label in LABELS.values() if label.shard), key=lambda label: (label is not _FLOW, label.shard)
     ):
@@ -172,10 +174,10 @@ def _last_image(folder: Path, manifest: Tree, t_us: int) -> tuple[int, ExposureL
     return there[-1] if there else None
 
 
-def _npz(events: Events) -> bytes:
+def _npz(events: Events, told: tuple[str, ...]) -> bytes:
     buffer = io.BytesIO()
     columns = {k: getattr(events, k) for k in events.columns if k != "truth"}
     if events.truth is not None:
-        columns.update({k: events.truth[k] for k in TOLD})
+        columns.update({k: events.truth[k] for k in told})
     np.savez_compressed(buffer, **columns)
     return buffer.getvalue()

@@ -11,7 +11,8 @@ too. In anti-aliased event frames a surface that covers a part of a pixel change
 around it are also considered (``reach``).
 
 A pixel may follow a change after it is over (V2E's low-pass; :meth:`Emulator.memory_s`): for that time its events are
-still those of the surface that left. Noise events get the surface that their pixel shows.
+still those of the surface that left, and of the light that changed it. Noise events get the surface that their pixel
+shows, and no light.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blinkgl.types.events import TRUTH, Events
+from blinkgl.types.events import TRUTH, Cause, Events
 
 _JUMP = 0.05
 """Relative change of depth between frames beyond which one instance shows another of its surfaces."""
@@ -29,11 +30,14 @@ _AROUND = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
 
 class Surfaces(NamedTuple):
     """The surface at every pixel at one time. ids : (H, W) whole numbers, 0: nothing.   depth : (H, W) float32 along
-    the optical axis, inf: nothing.   velocity : (H, W, 2) float32 px/s."""
+    the optical axis, inf: nothing.   velocity : (H, W, 2) float32 px/s.
+    light : (H, W) int32 number of the light that changed the pixel since the frame before, -1: none; None: no light of
+    the scene changes."""
 
     ids: np.ndarray
     depth: np.ndarray
     velocity: np.ndarray
+    light: np.ndarray | None = None
 
 
 class SurfaceTruth:
@@ -46,6 +50,7 @@ class SurfaceTruth:
         self._seen: list[tuple[int, Surfaces]] = []
         self._left: Surfaces | None = None
         self._until_ns = np.empty(0, np.int64)
+        self._lit: tuple[np.ndarray, np.ndarray] | None = None
 
     def see(self, t_ns: int, surfaces: Surfaces, memory_s: np.ndarray | None = None) -> None:
         """Add the surfaces at the time of a frame, in order. The arrays are kept until the frame after the next.
@@ -56,11 +61,17 @@ class SurfaceTruth:
             # The surface that the pixel showed was nearer and is gone.
             gone = (before.depth < surfaces.depth) & (before.ids != surfaces.ids)
             if self._left is None:
-                self._left = Surfaces(*(array.copy() for array in before))
+                self._left = Surfaces(*(array.copy() for array in _arrays(before)))
                 self._until_ns = np.full(gone.shape, np.iinfo(np.int64).min)
-            for kept, array in zip(self._left, before):
+            for kept, array in zip(_arrays(self._left), _arrays(before)):
                 kept[gone] = array[gone]
-            self._until_ns[gone] = t_ns + np.rint(1e9 * memory_s[gone]).astype(np.int64)
+            self._until_ns[gone] = _after(t_ns, memory_s[gone])
+        if memory_s is not None and surfaces.light is not None:
+            lit = surfaces.light >= 0
+            if self._lit is None:
+                self._lit = surfaces.light.copy(), np.full(lit.shape, np.iinfo(np.int64).min)
+            self._lit[0][lit] = surfaces.light[lit]
+            self._lit[1][lit] = _after(t_ns, memory_s[lit])
         self._seen = [*self._seen[-2:], (t_ns, surfaces)]
 
     def of(self, events: Events, done_ns: int) -> np.ndarray:
@@ -90,11 +101,30 @@ class SurfaceTruth:
             follows = (1000 * events.t <= self._until_ns.reshape(-1)[pixel]) & (left[1] < best)
             speeds = _where(follows & (left[0] != speeds[0]), left, speeds)
         truth["instance"], truth["depth"], truth["velocity"] = speeds
+        truth["light"] = self._light(events, after.light, pixel)
         return truth
+
+    def _light(self, events: Events, light: np.ndarray | None, pixel: np.ndarray) -> np.ndarray | int:
+        if light is None:
+            return -1
+        numbers = light.reshape(-1)[pixel]
+        if self._lit is not None:
+            last, until_ns = (array.reshape(-1)[pixel] for array in self._lit)
+            follows = (numbers < 0) & (1000 * events.t <= until_ns)
+            numbers = np.where(follows, last, numbers)
+        return numbers if events.cause is None else np.where(events.cause == Cause.SIGNAL, numbers, -1)
+
+
+def _after(t_ns: int, memory_s: np.ndarray) -> np.ndarray:
+    return t_ns + np.rint(1e9 * memory_s).astype(np.int64)
+
+
+def _arrays(surfaces: Surfaces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return surfaces.ids, surfaces.depth, surfaces.velocity
 
 
 def _looked_up(surfaces: Surfaces, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    ids, depth, velocity = surfaces
+    ids, depth, velocity = _arrays(surfaces)
     return ids.reshape(-1)[pixel], depth.reshape(-1)[pixel], velocity.reshape(-1, 2)[pixel]
 
 

@@ -19,7 +19,7 @@ from blinkgl.imaging import lens as thin_lens
 from blinkgl.imaging.sensor import mosaic
 from blinkgl.machine.kernels import kernel
 from blinkgl.render.colour import LUMA
-from blinkgl.render.moment import View
+from blinkgl.render.moment import Moment, View
 
 if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer
@@ -41,20 +41,20 @@ class Optics:
         lens = config.lens
         self._points = None if lens is None else thin_lens.points(config.lens_points, lens.aperture)
 
-    def light(self, t_ns: int) -> np.ndarray:
-        """Return the light on the pixels at a time, (H, W) float32, linear."""
-        light = self._drawn(t_ns)
+    def light(self, at: int | Moment) -> np.ndarray:
+        """Return the light on the pixels at a time, ns, or of a moment, (H, W) float32, linear."""
+        light = self._drawn(at if isinstance(at, Moment) else self._renderer.moment(at))
         for weights in self._kernels:
             light = np.stack([spread(light[..., c], weights) for c in range(light.shape[2])], axis=2)
         bayer = self._config.bayer
         return np.ascontiguousarray(light[..., 0] if bayer is None else mosaic(light, bayer), np.float32)
 
-    def _drawn(self, t_ns: int) -> np.ndarray:
+    def _drawn(self, moment: Moment) -> np.ndarray:
         """Return (H, W, 1 or 3) float32 before the spread."""
         draw, lens, coloured = self._renderer, self._config.lens, self._config.bayer is not None
         if lens is None or self._points is None:
-            return self._one(t_ns) if not coloured else draw.colour(t_ns, draw.antialiasing).read()
-        moment, total = draw.moment(t_ns), None
+            return self._one(moment) if not coloured else draw.colour(moment, draw.antialiasing).read()
+        total = None
         for point in self._points:
             seen = thin_lens.through(moment.view.camera, point, lens.focus)
             there = moment.from_place(View.of(seen), thin_lens.at_point(moment.T_world_cam, point))
@@ -64,8 +64,8 @@ class Optics:
         mean = total / len(self._points)
         return (mean if coloured else (mean @ LUMA)[..., None]).astype(np.float32)
 
-    def _one(self, t_ns: int) -> np.ndarray:
-        return self._renderer.luminance(t_ns).read()[..., None]
+    def _one(self, moment: Moment) -> np.ndarray:
+        return self._renderer.luminance(moment).read()[..., None]
 
 
 def kernels_of(psf: GaussianPsfConfig | AiryPsfConfig | KernelPsfConfig) -> list[np.ndarray]:

@@ -4,6 +4,7 @@ instance  (N,)   u2   instance id of the surface, 0: nothing
 depth     (N,)   f4   along the optical axis, world units; inf: nothing
 velocity  (N, 2) f4   px/s, +x right, +y down
 cause     (N,)   u1   blinkgl.types.events.Cause, where the emulator records it
+light     (N,)   i4   number of the light among the names of lights.npz that made it, -1: none; where a light changes
 """
 
 from __future__ import annotations
@@ -30,16 +31,18 @@ BLOCK = 1 << 17
 
 class EventLabelsWriter(Finishing):
     """Writes the truth of the events in ``events.h5``. The same events give the same bytes for any chunks. Raises
-    OutputError: the disk refuses; the file is then unusable."""
+    OutputError: the disk refuses; the file is then unusable.
 
-    def __init__(self, path: str | os.PathLike, *, codec: str = "zstd"):
+    lights : whether a light of the scene changes over time, so that events say which."""
+
+    def __init__(self, path: str | os.PathLike, *, codec: str = "zstd", lights: bool = False):
         self.path, self._codec = Path(path), codec
-        self._rows = 0
+        self._rows, self._names = 0, (*TOLD, "light") if lights else TOLD
         with output_errors(self.path):
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
             self._columns = {
                 name: growing_dataset(self._file, name, (0, *shape), base, (BLOCK, *shape), codec)
-                for name, (base, shape) in {name: _parts(TRUTH[name]) for name in TOLD}.items()
+                for name, (base, shape) in {name: _parts(TRUTH[name]) for name in self._names}.items()
             }
         self._blocks = Blocks(self._columns, BLOCK, self._store)
 
@@ -49,7 +52,7 @@ class EventLabelsWriter(Finishing):
             return
         if events.truth is None:
             raise TypeError("event labels: events that do not say what made them")
-        rows = {name: events.truth[name] for name in TOLD}
+        rows = {name: events.truth[name] for name in self._names}
         with output_errors(self.path):
             if not self._rows and events.cause is not None:
                 self._columns["cause"] = growing_dataset(self._file, "cause", (0,), np.uint8, (BLOCK,), self._codec)
@@ -79,7 +82,7 @@ class EventLabelsReader(Closing):
     """The truth of a sequence's events, by their number in ``events.h5``: ``reader.read(i, j)``. Use as a context
     manager.
 
-    path : the file, or the folder of its sequence.   count : rows.   causes : whether it has them.
+    path : the file, or the folder of its sequence.   count : rows.   causes, lights : whether it has them.
     Raises AssetError: missing, damaged, or no such file."""
 
     def __init__(self, path: str | os.PathLike):
@@ -91,6 +94,9 @@ class EventLabelsReader(Closing):
             self.causes = "cause" in self._file
             if self.causes:
                 self._columns["cause"] = self._column("cause", np.dtype(np.uint8), ())
+            self.lights = "light" in self._file
+            if self.lights:
+                self._columns["light"] = self._column("light", np.dtype(np.int32), ())
             lengths = {len(column) for column in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("columns of events differ in length", where=str(self.path), value=sorted(lengths))
@@ -111,6 +117,8 @@ class EventLabelsReader(Closing):
         truth = np.empty(max(rows.stop - rows.start, 0), TRUTH)
         where = str(self.path)
         truth["instance"] = whole(read["instance"], "instance", np.uint16, 0, 65535, where, rows.start)
+        most = np.iinfo(np.int32).max
+        truth["light"] = whole(read["light"], "light", np.int32, -1, most, where, rows.start) if self.lights else -1
         for name in ("depth", "velocity"):
             with np.errstate(over="ignore"):
                 truth[name] = read[name]

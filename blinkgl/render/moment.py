@@ -120,14 +120,25 @@ class Rates(NamedTuple):
     T_world_obj: np.ndarray
 
 
+class Held(NamedTuple):
+    """A light that shines by a factor of its own.   part : of the scene, that emits it; -1: a lamp or the
+    surroundings."""
+
+    wave: Waveform
+    part: int = -1
+    factor: float = 1.0
+
+
 class Moment:
     """All objects of a scene at t_ns. Values are computed when they are first used, and only once.
 
     T_world_cam : (4, 4) float64.   T_world_obj, T_cam_obj : (n, 4, 4) float64, a row per object of the scene.
     view : :class:`View` of the camera.   Arrays per item have a row per drawn part, ``DrawItem.number``.
-    exposed_ns : the span over which light that changes over time is averaged; None: it is that of the instant."""
+    exposed_ns : the span over which light that changes over time is averaged; None: it is that of the instant.
+    held : a light that is not as it is at t_ns; None: all are."""
 
     exposed_ns: tuple[int, int] | None = None
+    held: Held | None = None
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
         self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
@@ -144,9 +155,17 @@ class Moment:
         other.exposed_ns = begin_ns, max(end_ns, begin_ns + 1)  # a cell may be shorter than a nanosecond
         return other
 
-    def factor(self, wave: Waveform | None) -> float:
+    def holding(self, held: Held) -> Moment:
+        """Return the same instant with one light as it is told."""
+        other = copy.copy(self)
+        other.held = held
+        return other
+
+    def factor(self, wave: Waveform | None, part: int = -1) -> float:
         """Return the factor of light that changes over time; None: 1. At a jump it is that before it, but at the
-        sequence's start that after it."""
+        sequence's start that after it.   part : of the scene, that emits it; -1: of a lamp or the surroundings."""
+        if self.held is not None and wave is self.held.wave and part == self.held.part:
+            return self.held.factor
         if wave is not None and self.exposed_ns is not None:
             return wave.mean(*self.exposed_ns)
         return factor_at(wave, self.t_ns, self._stage.t0_ns)
@@ -154,6 +173,7 @@ class Moment:
     def through(self, view: View) -> Moment:
         """Return the same instant through another camera at the same place."""
         other = Moment(self.t_ns, view, self.T_world_cam, self.T_world_obj, self._stage)
+        other.exposed_ns, other.held = self.exposed_ns, self.held
         # Values that depend on the camera's place, not on its view, are the same.
         other.__dict__.update({name: self.__dict__[name] for name in _OF_THE_PLACE if name in self.__dict__})
         return other
@@ -163,7 +183,7 @@ class Moment:
         1/s, None: it stands still."""
         other = Moment(self.t_ns, view, T_world_cam, self.T_world_obj, self._stage)
         other.__dict__["dT_world_cam"] = np.zeros((4, 4)) if dT_world_cam is None else dT_world_cam
-        other.exposed_ns = self.exposed_ns
+        other.exposed_ns, other.held = self.exposed_ns, self.held
         return other
 
     @cached_property

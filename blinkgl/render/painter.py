@@ -116,7 +116,7 @@ class Painter:
             uniforms["tint_shares"].value = tuple(self.lighting.channel(material.base_color))
         if "emission" in uniforms:
             colour = uniforms["emission"].dimension == 3
-            factor = moment.factor(material.emission_over_time)
+            factor = moment.factor(material.emission_over_time, item.part)
             uniforms["emission"].value = (
                 tuple(factor * c for c in material.emission)
                 if colour

@@ -263,10 +263,10 @@ class Renderer(Releasing):
 
     # ---- frames --------------------------------------------------------------------------------------------------
 
-    def luminance(self, t_ns: int) -> Frame:
-        """Return linear luminance at t_ns, (H, W) float32."""
+    def luminance(self, at: int | Moment) -> Frame:
+        """Return linear luminance at a time, ns, or of a moment, (H, W) float32."""
         samples = samples_of(self.antialiasing)
-        return self.draw(self.seen(Luminance(samples, self._shadows, self._specks), smooth=True), t_ns)
+        return self.draw(self.seen(Luminance(samples, self._shadows, self._specks), smooth=True), at)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
         """Return luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures

@@ -27,6 +27,7 @@ from blinkgl.render.tracks import Tracks, track_points
 from blinkgl.rng import Role, generator, kernel_seed
 from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.sequence.inertial import Inertial, measured
+from blinkgl.sequence.light_truth import LightTruth
 from blinkgl.sequence.request import GroundTruth, Item, Picture, SequenceRequest, StageClock
 from blinkgl.sequence.sensor import SensorSimulation
 from blinkgl.tensors.choice import make_on_device, on_device
@@ -49,7 +50,14 @@ def drawn(
     surfaces : with the surface at every pixel.   device : torch's, on which frames are tensors; None: they are
     arrays.   optics : what the light passes; None: nothing."""
     frame = None
+    source = optics.light if optics is not None else lambda moment: renderer.luminance(moment).read()
+    changes = LightTruth(renderer, source) if surfaces and renderer.scene.waveforms else None
     for t_ns in times:
+        if changes is not None:
+            now = source(renderer.moment(t_ns))
+            seen = surfaces_at(renderer, t_ns)
+            yield EventFrame(t_ns, now, None, seen._replace(light=changes.of(t_ns, now)))
+            continue
         if optics is not None:
             light: Any = optics.light(t_ns)
             if device is not None:

@@ -86,7 +86,7 @@ class SequenceWriter:
     t_offset_us : time of the sequence's start, µs; events before it are refused by the DSEC format.
     labels : ``labels:``, which says in which forms labels are written; None: each in its first.
     events : False makes no ``events.h5``.
-    truth : True makes ``event_labels.h5`` beside it, of events that say what made them.
+    truth : True makes ``event_labels.h5`` beside it, of events that say what made them; lights : also which light.
     codec : of ``events.h5``, "zstd", "lz4" or "gzip".
 
     Attributes
@@ -111,6 +111,7 @@ class SequenceWriter:
         labels: LabelsConfig | None = None,
         events: bool = True,
         truth: bool = False,
+        lights: bool = False,
         codec: str = "zstd",
     ):
         self.final = Path(final)
@@ -121,6 +122,7 @@ class SequenceWriter:
         self.t_end_us: int | None = None
         self.lost: dict[str, int] = {}
         self._with_events, self._with_truth, self.codec = events, truth, codec
+        self._with_lights = lights
         self._files: dict[str, Tree] = {}
         self._promised = {name for name, on in (("events.h5", events), (EVENT_LABELS, truth)) if on}
         self._timestamps: dict[str, list[str]] = {}
@@ -152,7 +154,7 @@ class SequenceWriter:
         self._events: DsecEventWriter | None = None
         try:
             if self._with_truth:
-                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS, codec=self.codec)
+                self._truth = EventLabelsWriter(self._tmp / EVENT_LABELS, codec=self.codec, lights=self._with_lights)
             if self._with_events:
                 assert self.height is not None and self.width is not None
                 place = self._tmp / "events.h5"

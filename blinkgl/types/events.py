@@ -26,11 +26,12 @@ class Cause(IntEnum):
     HOT = 3  # V2E: leak of a hot pixel
 
 
-TRUTH = np.dtype([("instance", np.uint16), ("depth", np.float32), ("velocity", np.float32, (2,))])
+TRUTH = np.dtype([("instance", "u2"), ("depth", "f4"), ("velocity", "f4", (2,)), ("light", "i4")])
 """The surface that made an event: its instance id, 0: nothing; depth along the optical axis, world units, inf: nothing;
-image velocity, px/s, +x right, +y down."""
+image velocity, px/s, +x right, +y down. The light that made it by changing over time: its number among the names of
+``lights.npz``, -1: none."""
 TOLD = ("instance", "depth", "velocity")
-"""Fields of :data:`TRUTH`."""
+"""Fields of :data:`TRUTH` of every scene."""
 OPTIONAL = ("cause", "truth")
 """Columns that may be absent."""
 _TYPES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8, "cause": np.uint8, "truth": TRUTH}
@@ -45,7 +46,8 @@ class Events:
     p    : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
     cause : (N,) uint8 of :class:`Cause`, or None where it was not requested (``events.causes``) or is unknown.
     truth : (N,) of :data:`TRUTH`, the surface that made each (:mod:`blinkgl.events.truth`), or None likewise
-        (``labels.events``): ``truth["instance"]`` (N,), ``truth["depth"]`` (N,), ``truth["velocity"]`` (N, 2).
+        (``labels.events``): ``truth["instance"]`` (N,), ``truth["depth"]`` (N,), ``truth["velocity"]`` (N, 2),
+        ``truth["light"]`` (N,).
 
     Raises EventDataError: a column of another type or length.
     """

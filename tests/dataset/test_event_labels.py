@@ -75,6 +75,7 @@ def test_the_bytes_do_not_hang_on_the_chunks(tmp_path):
     n = BLOCK + 1000
     rng = np.random.default_rng(0)
     truth = np.zeros(n, TRUTH)
+    truth["light"] = -1
     truth["instance"], truth["depth"] = rng.integers(0, 9, n), rng.random(n) + 1
     events = Events(*(np.zeros(n, t) for t in ("u2", "u2", "i8", "u1")), truth=truth)
     for name, edges in (("a", [0, n]), ("b", [0, 10, 10, 70_000, 140_000, n])):

@@ -94,7 +94,7 @@ def test_every_edge_of_a_pulse_width_makes_its_events_at_its_microsecond():
 
 
 def test_the_light_of_an_event_at_a_jump_is_read_from_the_table():
-    """The lines of docs/data.md, against the edges by the formula: two lamps at 1000 and 700 Hz."""
+    """``lights.npz`` beside the edges by the formula: two lamps at 1000 and 700 Hz."""
     lamp = {"kind": "sun", "azimuth": 180, "elevation": 0, "strength": 0.4}
     slow = {"kind": "pwm", "frequency": 700, "duty": 0.5}
     lights = [{**lamp, "over_time": PWM}, {**lamp, "over_time": slow}]

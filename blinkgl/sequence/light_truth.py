@@ -1,0 +1,69 @@
+"""Which light that changes over time changed each pixel between two frames of the event pass.
+
+Light adds up: the frame at t less the same frame with one light as it was at the frame before is what this light
+changed. What no light explains is motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from blinkgl.render.moment import Held, Moment
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.types import Scene
+from blinkgl.scene.waveforms import factor_at
+
+_ROUNDING = 2.0**-18
+"""Share of a pixel's luminance below which a change is the rounding of float32 sums."""
+
+
+class LightTruth:
+    """Returns the light of every pixel's change from one frame to the next.
+
+    light : the frame of a moment, (H, W) float32 that stays valid."""
+
+    def __init__(self, renderer: Renderer, light: Callable[[Moment], np.ndarray]):
+        self._scene, self._moment, self._light = renderer.scene, renderer.moment, light
+        self._sources = list(_sources(renderer.scene))
+        self._before: tuple[int, np.ndarray] | None = None
+
+    def of(self, t_ns: int, now: np.ndarray) -> np.ndarray:
+        """Return (H, W) int32: the number of the light in ``scene.waveforms`` that did most of the change since the
+        frame of the last call, in its direction; -1 where motion did, or nothing changed. Call it at every frame.
+
+        now : (H, W) float32, the frame at t_ns."""
+        last, self._before = self._before, (t_ns, now)
+        which = np.full(now.shape, -1, np.int32)
+        if last is None:
+            return which
+        t0_ns, total = self._scene.t0_ns, now - last[1]
+        most, rest = np.abs(now) * _ROUNDING, total.copy()
+        shares = []
+        for number, source in self._sources:
+            held = source._replace(factor=factor_at(source.wave, last[0], t0_ns))
+            if held.factor != factor_at(source.wave, t_ns, t0_ns):
+                share = now - self._light(self._moment(t_ns).holding(held))
+                shares.append((number, share))
+                rest -= share
+        most = np.maximum(most, rest * np.sign(total))
+        for number, share in shares:
+            part = share * np.sign(total)
+            which[part > most] = number
+            most = np.maximum(most, part)
+        return which
+
+
+def _sources(scene: Scene) -> Iterator[tuple[int, Held]]:
+    """Yield each light of ``scene.waveforms``, with its number there."""
+    numbers = {name: number for number, name in enumerate(scene.waveforms)}
+    for name, wave in scene.waveforms.items():
+        if name == "light" or any(lamp.name == name for lamp in scene.light.lamps):
+            yield numbers[name], Held(wave)
+    part = 0
+    for obj in scene.objects:
+        for k, one in enumerate(obj.parts):
+            if (wave := one.material.emission_over_time) is not None:
+                yield numbers[obj.name if not k else f"{obj.name}, part {k}"], Held(wave, part)
+            part += 1

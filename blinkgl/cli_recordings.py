@@ -385,7 +385,7 @@ def import_(
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option("--fps", help="Frames per second (default: the file's; 24 for binary USD and Collada)."),
+        typer.Option("--fps", help="Frames per second (default: the file's; 24 for Collada)."),
     ] = None,
     keys_per_frame: Annotated[
         int,

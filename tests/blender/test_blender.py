@@ -3,9 +3,11 @@ of them at each frame."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -171,20 +173,51 @@ def test_a_character_of_mixamo(imported):
 @pytest.mark.parametrize("rate", [60, 30])
 @pytest.mark.parametrize("ending", ["usda", "usdc", "abc"])
 def test_the_clock_of_a_format(imported, rate, ending):
-    """The box is at x = 2 t by the file's own clock; a rate that cannot be read is said, and can be declared."""
+    """The box is at x = 2 t by the file's own clock."""
     came = imported(f"rate{rate}.{ending}")
-    unread = "its time codes per second cannot be read: 24 are assumed (--fps declares others)"
-    assert (unread in came.report.left_out) == (ending == "usdc")
-    if ending == "usdc":
-        assert came.report.fps == 24
-        came = imported(f"rate{rate}.{ending}", fps=rate)
-        assert unread not in came.report.left_out
+    assert not any("time codes" in line for line in came.report.left_out)
     document = gltf.read(came.path)
     made = from_document(document, PinHole.centred(8, 6, 6.0), 0, NS, camera_path=StaticPath(None, 0, NS))
     (box,) = made.objects
     for t in (0.0, 0.3, 0.5, 0.9):
         assert box.path.pose(int(t * NS))[0, 3] == pytest.approx(2 * t, abs=2e-3)
     assert came.report.fps == rate and came.report.duration_s == pytest.approx(1.0)
+
+
+STAGE = '#usda 1.0\n(\n    defaultPrim = "W"\n    {}\n    upAxis = "Z"\n)\n\n'
+STAGE += 'def Xform "W"\n{{\n    custom double timeCodesPerSecond = 7\n}}\n'
+CLOCKS = {
+    "timeCodesPerSecond = 29.97": 29.97,
+    "framesPerSecond = 30\n    timeCodesPerSecond = 48": 48.0,
+    "framesPerSecond = 30": 30.0,  # which stands in for it
+    "endTimeCode = 10": 24.0,  # the standard's default
+}
+
+
+def test_the_clock_of_usd_by_its_own_rules(tmp_path):
+    program = ["import json, sys, bpy", f"sys.path[:0] = [{str(Path(process.__file__).with_name('inside'))!r}]"]
+    program += ["from pathlib import Path", "from rates import rate_of"]
+    program += ["site = Path(bpy.utils.resource_path('LOCAL'), 'python/lib/python3.11/site-packages')"]
+    program += ["print(json.dumps([rate_of(Path(one), site) for one in sys.argv[1:]]))"]
+    files, due = [], []
+    for k, (settings, rate) in enumerate(CLOCKS.items()):
+        for ending in ("usda", "usd", "usdz"):
+            files.append(str(tmp_path / f"{k}.{ending}"))
+            due.append(rate)
+            if ending == "usdz":
+                with zipfile.ZipFile(files[-1], "w") as archive:
+                    archive.writestr("root.usda", STAGE.format(settings))
+                    archive.writestr("other.usda", "#usda 1.0\n(\n timeCodesPerSecond = 5\n)\n")
+            else:
+                Path(files[-1]).write_text(STAGE.format(settings))
+    for name, data in (("broken.usdc", b"PXR-USDC\0\10"), ("broken.usdz", b"PK"), ("a.fbx", b"Kaydara")):
+        (tmp_path / name).write_bytes(data)
+        files.append(str(tmp_path / name))
+        due.append(None)
+    command = [process.interpreter(), "-c", "\n".join(program), *files]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert [None if one is None else round(one, 6) for one in json.loads(done.stdout.splitlines()[-1])] == due
 
 
 def test_what_the_door_does_not_draw_is_named(imported):

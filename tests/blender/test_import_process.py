@@ -38,7 +38,7 @@ def test_blender_stays_in_its_own_programs():
         tops = {name.split(".")[0] for name in found}
         if file.parent == inside or file == root / "tools" / "cycles_trace.py":
             own = {other.stem for other in inside.glob("*.py")}
-            assert tops <= {"bpy", "mathutils", "numpy"} | own | set(sys.stdlib_module_names), (file, tops)
+            assert tops <= {"bpy", "mathutils", "numpy", "pxr"} | own | set(sys.stdlib_module_names), (file, tops)
         else:
             assert not tops & {"bpy", "mathutils", "bmesh", "cycles_trace"}, file
 

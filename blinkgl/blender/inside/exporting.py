@@ -59,6 +59,11 @@ def cause(problem: Exception) -> str:
 # --- opening ----------------------------------------------------------------------------------------------------------
 
 
+def libraries() -> Path:
+    """Return the folder of Blender's own Python packages."""
+    return Path(bpy.utils.resource_path("LOCAL"), "python", "lib", "python3.11", "site-packages")
+
+
 def open_file(source: Path, fps: float | None) -> None:
     """Load the file as Blender's data, without scripts. Refused: damaged, of another kind, or saved by a newer
     Blender."""
@@ -80,7 +85,7 @@ def open_file(source: Path, fps: float | None) -> None:
             operators.open_mainfile(filepath=str(source), load_ui=False, use_scripts=False)
         else:
             # Alembic's seconds become frames when it is read, and USD's codes are taken as frames.
-            set_rate(bpy.context.scene, fps or rate_of(source) or 24.0)
+            set_rate(bpy.context.scene, fps or rate_of(source, libraries()) or 24.0)
             if "FINISHED" not in openers.get(ending, usd)(str(source)):
                 raise Refused(f"Blender cannot read it as {ending[1:].upper()}", "a whole file of that kind")
     except RuntimeError as problem:  # errors of operators
@@ -398,7 +403,7 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
     if (
         job["fps"] is None
         and job["source"].lower().endswith((".usd", ".usdc", ".usdz"))
-        and not rate_of(Path(job["source"]))
+        and not rate_of(Path(job["source"]), libraries())
     ):
         lines.append("its time codes per second cannot be read: 24 are assumed (--fps declares others)")
     realize(objs)

@@ -1,30 +1,37 @@
-"""The clocks of USD and Alembic files, which Blender's importers do not read. Standard library only."""
+"""The clocks of USD and Alembic files, which Blender's importers do not read. Standard library, and what Blender
+brings along."""
 
 from __future__ import annotations
 
-import re
 import struct
-import zipfile
+import sys
 from pathlib import Path
 from typing import BinaryIO
 
 
-def rate_of(source: Path) -> float | None:
-    """Return the time codes per second of a USD file of text, or the samples per second of an Alembic file; None: it is
-    of another kind or does not say so."""
+def rate_of(source: Path, libraries: Path) -> float | None:
+    """Return the time codes per second of a USD file, or the samples per second of an Alembic file; None: it is of
+    another kind or does not say so.   libraries : the folder of Blender's own Python packages."""
     with open(source, "rb") as file:
-        head = file.read(1 << 16)
-        if head[:5] == b"Ogawa":
+        if file.read(5) == b"Ogawa":
             return alembic_rate(file)
-    if source.suffix.lower() == ".usdz" and zipfile.is_zipfile(source):
-        with zipfile.ZipFile(source) as archive, archive.open(archive.infolist()[0]) as file:
-            head = file.read(1 << 16)
-    if not head.startswith(b"#usda"):
+    return usd_rate(source, libraries) if source.suffix.lower().startswith(".usd") else None
+
+
+def usd_rate(source: Path, libraries: Path) -> float | None:
+    """Return ``timeCodesPerSecond`` by USD's own library, with its fallbacks (``framesPerSecond``, 24); None: the
+    library or the file cannot be read."""
+    # The one of Blender, not of the environment: two in one process do not get on.
+    sys.path.insert(0, str(libraries))
+    try:
+        from pxr import Sdf
+
+        layer = Sdf.Layer.FindOrOpen(str(source))
+    except (ImportError, RuntimeError):
         return None
-    # The layer's own settings stand before its first prim; 24 is the standard's default.
-    settings = re.split(rb"\n\s*(?:def|over|class)\s", head)[0]
-    stated = dict(re.findall(rb"(?m)^\s*(\w+PerSecond)\s*=\s*([\d.eE+]+)", settings))
-    return float(stated.get(b"timeCodesPerSecond", stated.get(b"framesPerSecond", b"24"))) or None
+    finally:
+        sys.path.remove(str(libraries))
+    return float(layer.timeCodesPerSecond) or None if layer else None
 
 
 def alembic_rate(file: BinaryIO) -> float | None:

@@ -1,6 +1,6 @@
 """A star tracker's view: stars of several magnitudes drift over the picture of a camera that turns.
 
-A star is a small ball that emits: a body under a pixel gets its light by its area in the pixels that it covers.
+A star is a point of light: its emission, by the square of its distance in focal lengths, is the light of its pixels.
 """
 
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 
 from blinkgl import Camera, Keyframes, Light, Material, Pose, Primitive, Scene, record
 
-WIDTH, HEIGHT, FOCAL, AWAY, SIZE = 160, 120, 600.0, 50.0, 0.3  # px; m; stars are 0.3 px wide
+WIDTH, HEIGHT, FOCAL, AWAY = 160, 120, 600.0, 50.0  # px; m
 
 
 def sky(stars: int = 60, seed: int = 1) -> Scene:
@@ -21,13 +21,10 @@ def sky(stars: int = 60, seed: int = 1) -> Scene:
     for _ in range(stars):
         x, y = random.uniform(0, WIDTH), random.uniform(0, HEIGHT)
         flux = 10 ** (-0.4 * random.uniform(0, 4))  # of one pixel of luminance 1
-        radiance = flux / (np.pi / 4 * SIZE**2)
         scene += Primitive(
-            "icosphere",
-            subdivisions=2,
-            scale=SIZE * AWAY / FOCAL,
+            "point",
             pose=Pose((AWAY, (WIDTH / 2 - x) / FOCAL * AWAY, (HEIGHT / 2 - y) / FOCAL * AWAY)),
-            material=Material(color=(0, 0, 0), emission=(radiance,) * 3),
+            material=Material(color=(0, 0, 0), emission=(flux * (AWAY / FOCAL) ** 2,) * 3),
         )
     return scene
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from blinkgl import Camera, Keyframes, Light, Material, Pose, Primitive, Recording, Scene, record
 
-WIDTH, HEIGHT, FOCAL, AWAY, SIZE = 160, 120, 600.0, 50.0, 0.3  # px; m; stars are 0.3 px wide
+WIDTH, HEIGHT, FOCAL, AWAY = 160, 120, 600.0, 50.0  # px; m
 BORESIGHT = np.radians((83.8, -5.4))  # where the camera looks at the start: right ascension, declination
 SPREAD = {"psf": {"kind": "gaussian", "sigma": 0.8}}
 
@@ -42,13 +42,9 @@ def sky(catalogue: Path) -> Scene:
     with catalogue.open(newline="", encoding="utf-8") as file:
         for star in csv.DictReader(file):
             flux = 10 ** (-0.4 * float(star["magnitude"]))  # of one pixel of luminance 1
-            radiance = flux / (np.pi / 4 * SIZE**2)
             towards = direction(*np.radians((float(star["ra_deg"]), float(star["dec_deg"]))))
-            material = Material(color=(0, 0, 0), emission=(radiance,) * 3)
-            scene += Primitive(
-                "icosphere", subdivisions=2, scale=SIZE * AWAY / FOCAL, pose=Pose(AWAY * towards), material=material,
-                name=star["name"],
-            )  # fmt: skip
+            material = Material(color=(0, 0, 0), emission=(flux * (AWAY / FOCAL) ** 2,) * 3)
+            scene += Primitive("point", pose=Pose(AWAY * towards), material=material, name=star["name"])
     return scene
 
 

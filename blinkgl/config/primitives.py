@@ -33,6 +33,7 @@ PRIMITIVES = {
     "pyramid": PrimitiveKind("pool", 12, 8),
     "grid": PrimitiveKind("prop", 16),
     "die": PrimitiveKind("prop", 17),
+    "point": PrimitiveKind("prop", 18),
     "figure": PrimitiveKind("living", 13, 9),
     "flag": PrimitiveKind("living", 14, 10),
     "fish": PrimitiveKind("living", 15, 11),

@@ -185,8 +185,8 @@ class _Object(Piece):
 
 
 class Primitive(_Object):
-    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid, die, or
-    one that moves by itself: figure, flag, fish.
+    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid, die, a
+    point of light, or one that moves by itself: figure, flag, fish.
 
     parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``, and a figure's movement,
     such as ``clip="dance"`` (docs/configuration.md, "primitives").

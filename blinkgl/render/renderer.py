@@ -25,7 +25,7 @@ from blinkgl.gl import GLContext
 from blinkgl.labels import LABELS, LabelFrame, LabelRequest
 from blinkgl.machine.closing import Releasing
 from blinkgl.machine.compiling import working_clock
-from blinkgl.render.antialiasing import samples_of
+from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.canvas import Canvas, StillCanvas
 from blinkgl.render.crowding import crowded_as, crowding
 from blinkgl.render.draw_items import DrawItem
@@ -115,7 +115,11 @@ class Renderer(Releasing):
         shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
         self.notes: tuple[str, ...] = ()  # what is drawn less well than it could be, a line each
         # A body under a pixel moves without a rectangle of its own.
-        self._specks = self._most_specks(samples.grid) if samples.shared else 0
+        self._most: dict[int, int] = {}  # by the grid of samples
+        self._specks = self._specks_of(samples)
+        if not samples.shared and (small := len(self.moment(scene.t0_ns).specks(1, len(scene.objects))[0])):
+            line = f"{small:,} bodies under a pixel shine only where they meet a pixel's centre"
+            self.notes += (f"{line}: render.antialiasing edges draws them by their area, not {config.antialiasing}",)
         lights_stand = lamps_stand and not scene.waveforms
         stands = scene.camera_path.is_static and some_stand and lights_stand and shadows_stand and not self._specks
         self.whole = whole or not stands
@@ -142,11 +146,19 @@ class Renderer(Releasing):
         """Return evenly spaced times of the scene, ns, its ends among them."""
         return np.linspace(self.scene.t0_ns, self.scene.t1_ns, count).astype(np.int64).tolist()
 
-    def _most_specks(self, grid: int) -> int:
-        """Return how many bodies under a pixel get their light by their area: half more than at the
-        busiest time."""
-        every = len(self.scene.objects)
-        most = max(len(self.moment(t_ns).specks(grid, every)[0]) for t_ns in self._some_times(_SPECK_LOOKS))
+    def _specks_of(self, samples: Samples) -> int:
+        """Return how many bodies under a pixel get their light by their area in a picture of these samples: half more
+        than at the busiest time; 0 for one of a look-up each."""
+        if not samples.shared:
+            return 0
+        if samples.grid not in self._most:
+            grids = {samples.grid, self._image_samples.grid}  # an image may be drawn later
+            every, counts = len(self.scene.objects), dict.fromkeys(grids, 0)
+            for t_ns in self._some_times(_SPECK_LOOKS):
+                moment = self.moment(t_ns)
+                counts = {grid: max(n, len(moment.specks(grid, every)[0])) for grid, n in counts.items()}
+            self._most |= counts
+        most = self._most[samples.grid]
         if most > _MOST_SPECKS:
             line = f"{most:,} bodies under a pixel: the nearest {_MOST_SPECKS:,} shine by their area"
             self.notes = (f"{line}, the others where they meet the centre of a sample",)
@@ -288,11 +300,12 @@ class Renderer(Releasing):
         """Return linear radiance at a time, ns, or of a moment, (H, W, 3) float32; ``antialiasing`` overrides the
         configuration's."""
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
-        return self.draw(self.seen(Colour(samples, self._shadows), smooth=True), at)
+        return self.draw(self.seen(Colour(samples, self._shadows, self._specks_of(samples)), smooth=True), at)
 
     def flat_colour(self, at: Moment) -> Frame:
         """Return the :meth:`colour` of a moment as a pinhole camera sees it, whatever the scene's camera is."""
-        return self.draw(filtered(Colour(self._image_samples, self._shadows)), at)
+        samples = self._image_samples
+        return self.draw(filtered(Colour(samples, self._shadows, self._specks_of(samples))), at)
 
     def labels(
         self,

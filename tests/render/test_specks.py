@@ -40,8 +40,33 @@ def picture(objects, *, camera=None, t_ns=0, antialiasing="edges", camera_path=N
 
 
 @pytest.mark.parametrize(
+    ("px", "samples"), [(0.01, "ssaa2"), (0.1, "ssaa2"), (0.3, "ssaa2"), (0.2, "ssaa4"), (0.1, "ssaa8"), (0.6, "ssaa8")]
+)
+def test_pictures_in_colour_show_them_too(px, samples):
+    """Images, and the optics that need colour."""
+    rng = np.random.default_rng(5)
+    x, y = 20 + rng.uniform(-0.5, 0.5), 14 + rng.uniform(-0.5, 0.5)
+    red = Material(base_color=(0, 0, 0), emission=(3.0, 0.5, 0.0), unlit=False)
+    scene = Scene(
+        (ball(x, y, px, material=red),),
+        Rig.alone(PinHole(W, H, F, F, (W - 1) / 2, (H - 1) / 2), still(rotation=LEVEL)),
+        0,
+        SECOND,
+        light=Light(sun=0.0, sky=0.0),
+    )
+    with create_context() as gl, Renderer(gl, scene, RenderConfig(image_antialiasing=samples)) as renderer:
+        image = renderer.colour(0).read()
+    due = DISC * px**2 * np.array([3.0, 0.5, 0.0])
+    assert image.sum(axis=(0, 1)) == pytest.approx(due, rel=0.04 if px < 0.3 else 0.35)
+    assert image.max(axis=2).any(axis=0).sum() <= 3
+
+
+@pytest.mark.parametrize(
     ("px", "antialiasing"),
-    [*((px, "edges") for px in (0.01, 0.05, 0.2, 0.5, 1.0, 1.4)), *((px, "edges2") for px in (0.01, 0.2, 0.7))],
+    [
+        *((px, "edges") for px in (1e-6, 0.01, 0.05, 0.2, 0.5, 1.0, 1.4)),
+        *((px, "edges2") for px in (0.01, 0.2, 0.7)),
+    ],
 )
 def test_light_is_area_times_radiance_wherever_the_body_is(px, antialiasing):
     rng = np.random.default_rng(3)

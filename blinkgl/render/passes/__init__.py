@@ -11,7 +11,7 @@ from blinkgl.render.passes.gather import Gather
 from blinkgl.render.passes.geometry import Geometry, Velocity
 from blinkgl.render.passes.luminance import Brightness, Colour, Luminance, Mean
 from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
-from blinkgl.render.passes.specks import Portraits, Specks, filtered, one_value
+from blinkgl.render.passes.specks import ColourPortraits, LuminancePortraits, Specks, filtered, one_value
 
 PASSES: tuple[type[Pass], ...] = (
     Luminance,
@@ -21,7 +21,8 @@ PASSES: tuple[type[Pass], ...] = (
     Geometry,
     Mean,
     Edged,
-    Portraits,
+    LuminancePortraits,
+    ColourPortraits,
     Specks,
     Gather,
     ShadowMap,
@@ -32,15 +33,16 @@ __all__ = [
     "PASSES",
     "Brightness",
     "Colour",
+    "ColourPortraits",
     "Edged",
     "Gather",
     "Geometry",
     "Input",
     "Luminance",
+    "LuminancePortraits",
     "Mean",
     "Output",
     "Pass",
-    "Portraits",
     "ScenePass",
     "ScreenPass",
     "Shaded",

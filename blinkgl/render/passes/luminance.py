@@ -51,17 +51,11 @@ class LuminancePass(Shaded):
             uniforms["up_rate"].value = tuple(dR[2])
 
 
-@dataclass(frozen=True)
-class Luminance(LuminancePass):
-    """Output "luminance", (H, W) float32, at ``samples``.   specks : as many bodies under a pixel are left
-    out, for :class:`~blinkgl.render.passes.specks.Specks`."""
+class Picture(Shaded):
+    """A picture of light at ``samples``.   specks : as many bodies under a pixel are left out, for
+    :class:`~blinkgl.render.passes.specks.Specks`."""
 
-    samples: Samples = Samples()
-    shadows: tuple[ShadowMap, ...] = ()
-    specks: int = 0
-    still: ClassVar[bool] = True
-
-    outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)
+    specks: int
 
     @property
     def depth(self) -> bool | str:
@@ -72,6 +66,18 @@ class Luminance(LuminancePass):
             return moment.visible
         apart = set(moment.specks(self.samples.grid, self.specks)[0].tolist())
         return [item for item in moment.visible if item.object_index not in apart]
+
+
+@dataclass(frozen=True)
+class Luminance(Picture, LuminancePass):
+    """Output "luminance", (H, W) float32."""
+
+    samples: Samples = Samples()
+    shadows: tuple[ShadowMap, ...] = ()
+    specks: int = 0
+    still: ClassVar[bool] = True
+
+    outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         # Taps are for textures; a uniform colour needs none.
@@ -106,11 +112,12 @@ class Brightness(LuminancePass):
 
 
 @dataclass(frozen=True)
-class Colour(Shaded):
-    """Output "colour", (H, W, 3) float32 linear radiance, at ``samples``."""
+class Colour(Picture):
+    """Output "colour", (H, W, 3) float32 linear radiance."""
 
     samples: Samples = Samples()
     shadows: tuple[ShadowMap, ...] = ()
+    specks: int = 0
     program: ClassVar[str] = "colour.glsl"
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.frames import DEPTH_BUFFER
-from blinkgl.render.passes.base import Input, Output, Pass, Shot
+from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
 from blinkgl.render.passes.edged import Edged
-from blinkgl.render.passes.luminance import Luminance, LuminancePass, Mean
+from blinkgl.render.passes.luminance import Colour, Luminance, LuminancePass, Mean, Picture
 from blinkgl.render.passes.shadow import ShadowMap
 from blinkgl.scene.types import Scene
 
@@ -30,21 +30,18 @@ _ROOM = 1.02
 """Side of a portrait in diameters of the bounding sphere, whose picture is a little larger than its centre's scale."""
 
 
-@dataclass(frozen=True)
-class Portraits(LuminancePass):
-    """Output "luminance": each speck of a picture of ``grid`` samples, alone and enlarged, in a cell of its own, the
-    nearest ``most`` of them; -1 where it is not."""
+class Portraits(ScenePass):
+    """Each speck of a picture of ``grid`` samples, alone and enlarged, in a cell of its own, the nearest ``most`` of
+    them; -1 where it is not."""
 
-    most: int = _CELLS
-    grid: int = 1
-    shadows: tuple[ShadowMap, ...] = ()  # type: ignore[bad-override]
-    outputs: ClassVar[tuple[Output, ...]] = (Output("luminance", "R32F"),)  # type: ignore[bad-override]
+    most: int
+    grid: int
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         return _CELLS * _TEXELS, -(-self.most // _CELLS) * _TEXELS
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        return (-1.0,)
+        return (-1.0,) * 3
 
     def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
         programs, moment = self.programs(painter), shot.moment
@@ -74,25 +71,44 @@ class Portraits(LuminancePass):
 
 
 @dataclass(frozen=True)
-class Specks(Pass):
-    """A picture of luminance, with filtered edges or without, and the specks that it leaves out, far ones first.
-    Outputs and grid are those of the pass."""
+class LuminancePortraits(Portraits, LuminancePass):
+    """:class:`Portraits` of output "luminance"."""
 
-    of: Edged | Luminance
+    most: int = _CELLS
+    grid: int = 1
+    shadows: tuple[ShadowMap, ...] = ()
+    outputs: ClassVar[tuple[Output, ...]] = Luminance.outputs
+
+
+@dataclass(frozen=True)
+class ColourPortraits(Portraits, Colour):
+    """:class:`Portraits` of output "colour"."""
+
+    most: int = _CELLS
+    grid: int = 1
+
+
+@dataclass(frozen=True)
+class Specks(Pass):
+    """A picture of light, with filtered edges or without, and the specks that it leaves out, far ones first. Outputs
+    and grid are those of the pass."""
+
+    of: Edged | Picture
     program: ClassVar[str] = "specks.glsl"
     depth: ClassVar[bool | str] = False
 
     @property
     def inputs(self) -> tuple[Input, ...]:  # type: ignore[bad-override]
         base = self.drawn
-        portraits = Portraits(base.specks, base.samples.grid, base.shadows)
+        kind = ColourPortraits if isinstance(base, Colour) else LuminancePortraits
+        portraits = kind(most=base.specks, grid=base.samples.grid, shadows=base.shadows)
         return Input("picture", self.of), Input("depths", base, DEPTH_BUFFER), Input("portraits", portraits)
 
     @property
-    def drawn(self) -> Luminance:
+    def drawn(self) -> Picture:
         """Return the pass that draws the larger bodies."""
         base = self.of.of if isinstance(self.of, Edged) else self.of
-        assert isinstance(base, Luminance)
+        assert isinstance(base, Picture)
         return base
 
     @property
@@ -141,7 +157,7 @@ class Specks(Pass):
 def one_value(pass_: Pass) -> Pass:
     """Return ``pass_`` with its edges filtered and its specks, but without the mean of a finer grid."""
     sharp = Edged(pass_) if pass_.samples.edges else pass_
-    return Specks(sharp) if isinstance(pass_, Luminance) and pass_.specks else sharp  # type: ignore[bad-argument-type]
+    return Specks(sharp) if isinstance(pass_, Picture) and pass_.specks else sharp  # type: ignore[bad-argument-type]
 
 
 def filtered(pass_: Pass) -> Pass:

@@ -24,6 +24,7 @@ from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.geometry.figure import SPACINGS
 from blinkgl.scene.geometry.living import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.geometry.primitives import POINT_AREA
 from blinkgl.scene.geometry.tangents import split_mirrored
 from blinkgl.scene.importing.mesh_files import Asset, border_of, clip_of, load_asset, sides_of
 from blinkgl.scene.importing.polygons import texture_of
@@ -135,6 +136,13 @@ def _objects(
             assets[key] = _asset(*arguments, animation, f"{where}.animation")
             log += [line for line in assets[key].log if line not in log]
             omissions.update(dict.fromkeys(assets[key].omissions))
+        if config.meshes[item.mesh].primitive == "point" and not _glows(item, config):
+            raise ConfigError(
+                "a point of light that emits none",
+                where=f"{where}.material",
+                value=item.material,
+                accepted="a material with emission above 0 in a scene that is not unlit",
+            )
         parts = _parts(assets[key], item, None if item.material is None else materials[item.material], config)
         if item.deform is not None:
             if animation is not None:
@@ -147,9 +155,15 @@ def _objects(
     return objects
 
 
+def _glows(item: ObjectConfig, config: ExplicitSceneConfig) -> bool:
+    material = None if item.material is None else config.materials[item.material]
+    return material is not None and any(material.emission) and not (material.unlit or config.light.unlit)
+
+
 def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: ExplicitSceneConfig) -> list[Part]:
     """Return an asset's parts at an object's size. material : replaces its own."""
     matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
+    point = config.meshes[item.mesh].primitive == "point"
     parts = []
     for part in asset.parts:
         worn = part.material if material is None else material
@@ -157,6 +171,10 @@ def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: 
         if material is not None and material.both_sides is not None:
             sides = material.both_sides
         worn = replace(worn, unlit=worn.unlit or config.light.unlit, both_sides=sides)
+        if point:
+            # Its emission is an intensity.
+            red, green, blue = (one / POINT_AREA for one in worn.emission)
+            worn = replace(worn, emission=(red, green, blue))
         mesh = transform_mesh(part.mesh, matrix)
         if material is not None and worn.bumps is not None and mesh.deformer is None:
             mesh, _ = split_mirrored(mesh)  # a deforming mesh keeps its seams: its joints count its vertices

@@ -53,10 +53,9 @@ function caption(which, text) {
 // ---- pictures ---------------------------------------------------------------------------------------------------
 
 async function show(which, path, query) {
-  const pane = $("pane-" + which), image = pane.querySelector("img");
-  if (!image.src) pane.querySelector(".legend").textContent = "drawing …"; // the first may wait for programs to compile
   const answer = await get(path, query);
   const legend = JSON.parse(answer.headers.get("X-Legend"));
+  const pane = $("pane-" + which), image = pane.querySelector("img");
   const url = URL.createObjectURL(await answer.blob());
   await new Promise((done) => { image.onload = image.onerror = done; image.src = url; });
   URL.revokeObjectURL(url);

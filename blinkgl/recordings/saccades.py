@@ -29,9 +29,10 @@ from blinkgl.types.numbers import exact
 
 STEP_PX = 0.1
 """Largest motion between two frames, px of the sensor."""
-SACCADES = np.array([[0.0, -3.0, -3.0], [0.1, 0.0, 3.0], [0.2, 3.0, -3.0], [0.3, -3.0, -3.0]])
-"""t [s], x, y [px]: three saccades of 100 ms along an isosceles triangle, as N-MNIST's (Orchard et al., Frontiers in
-Neuroscience 9:437, 2015), at constant speed. Its sides are what N-MNIST's 34x34 px leave around MNIST's 28x28."""
+SACCADES = np.array([[0.0, 3.5, 3.5], [0.105, 0.0, -3.5], [0.21, -3.5, 3.5], [0.315, 3.5, 3.5]])
+"""t [s], x, y [px]: N-MNIST's three saccades (Orchard et al., Frontiers in Neuroscience 9:437, 2015) at constant speed.
+In 105 ms each the picture moves by (3.5, 7), (3.5, -7) and (-7, 0) px, as its authors' program ``stabilize.m`` takes
+it, which undoes the motion; the sensor moves the other way."""
 ENDINGS = {"bin": ".bin", "npz": ".npz", "npy": ".npy"}
 
 
@@ -84,8 +85,10 @@ class Clips:
         table = np.zeros((h + 1, w + 1))
         table[1:, 1:] = light.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
         low, high = self.path[:, 1:].min(axis=0), self.path[:, 1:].max(axis=0)
-        # scale : px of the picture over one of the sensor; the picture stays in view all along the path.
-        scale = max(w / (width - (high - low)[0]), h / (height - (high - low)[1]))
+        # scale : px of the picture over one of the sensor; the picture stays in view all along the path, but for half
+        # a pixel of its border: N-MNIST's 28x28 px move by 7 in 34x34.
+        room = np.array([width, height]) - (high - low) + 1
+        scale = max(w / room[0], h / room[1])
         columns, rows = (np.arange(side + 1) - side / 2 for side in (width, height))
         for t_s, x, y in positions(self.path):
             dx, dy = np.array([x, y]) - (low + high) / 2

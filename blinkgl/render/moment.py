@@ -156,7 +156,7 @@ class Moment:
         return other
 
     def holding(self, held: Held) -> Moment:
-        """Return the same instant with one light as it is told."""
+        """Return the same instant with one light at another factor."""
         other = copy.copy(self)
         other.held = held
         return other

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
@@ -445,19 +445,24 @@ class Scene:
             placed = tuple(replace(obj, path=sky) if obj.at_infinity else obj for obj in self.objects)
             object.__setattr__(self, "objects", placed)
 
-    @cached_property
-    def waveforms(self) -> dict[str, Waveform]:
-        """Return the lights that change over time, by name: "light", the sun's and the surroundings', those of lamps,
-        and of objects whose material emits."""
-        lights = {} if self.light.over_time is None else {"light": self.light.over_time}
+    @property
+    def changing_lights(self) -> Iterator[tuple[str, Waveform, int]]:
+        """Yield the lights that change over time: their name, "light" for the sun's and the surroundings', and the
+        number of the scene's part that emits, object by object; -1: none, but a lamp or the surroundings."""
+        if self.light.over_time is not None:
+            yield "light", self.light.over_time, -1
         for lamp in self.light.lamps:
             if lamp.over_time is not None and lamp.over_time is not self.light.over_time:
-                lights[lamp.name] = lamp.over_time
-        for obj in self.objects:
-            for k, part in enumerate(obj.parts):
-                if (wave := part.material.emission_over_time) is not None:
-                    lights.setdefault(obj.name if not k else f"{obj.name}, part {k}", wave)
-        return lights
+                yield lamp.name, lamp.over_time, -1
+        parts = ((obj.name, k, part) for obj in self.objects for k, part in enumerate(obj.parts))
+        for number, (name, k, part) in enumerate(parts):
+            if (wave := part.material.emission_over_time) is not None:
+                yield f"{name}, part {k}" if k else name, wave, number
+
+    @cached_property
+    def waveforms(self) -> dict[str, Waveform]:
+        """Return the waveforms of :attr:`changing_lights` by name."""
+        return {name: wave for name, wave, _ in self.changing_lights}
 
     @property
     def backdrop(self) -> float:

@@ -6,13 +6,12 @@ changed. What no light explains is motion.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
 from blinkgl.render.moment import Held, Moment
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.types import Scene
 from blinkgl.scene.waveforms import factor_at
 
 _ROUNDING = 2.0**-18
@@ -26,7 +25,8 @@ class LightTruth:
 
     def __init__(self, renderer: Renderer, light: Callable[[Moment], np.ndarray]):
         self._scene, self._moment, self._light = renderer.scene, renderer.moment, light
-        self._sources = list(_sources(renderer.scene))
+        numbers = {name: number for number, name in enumerate(self._scene.waveforms)}
+        self._sources = [(numbers[name], Held(wave, part)) for name, wave, part in self._scene.changing_lights]
         self._before: tuple[int, np.ndarray] | None = None
 
     def of(self, t_ns: int, now: np.ndarray) -> np.ndarray:
@@ -53,17 +53,3 @@ class LightTruth:
             which[part > most] = number
             most = np.maximum(most, part)
         return which
-
-
-def _sources(scene: Scene) -> Iterator[tuple[int, Held]]:
-    """Yield each light of ``scene.waveforms``, with its number there."""
-    numbers = {name: number for number, name in enumerate(scene.waveforms)}
-    for name, wave in scene.waveforms.items():
-        if name == "light" or any(lamp.name == name for lamp in scene.light.lamps):
-            yield numbers[name], Held(wave)
-    part = 0
-    for obj in scene.objects:
-        for k, one in enumerate(obj.parts):
-            if (wave := one.material.emission_over_time) is not None:
-                yield numbers[obj.name if not k else f"{obj.name}, part {k}"], Held(wave, part)
-            part += 1

@@ -286,6 +286,19 @@ class Renderer(Releasing):
         so its pixels are H / h and W / w pixels apart, a little more than ``every`` if that is no divisor."""
         return self.draw(self.seen(Brightness(every, self._shadows)), t_ns)
 
+    @property
+    def body_centres(self) -> np.ndarray:
+        """Return the middles of the bodies' bounding spheres, (n, 4) float64, in their own axes."""
+        centres = self._moments.stage.body_centre
+        return np.column_stack([centres, np.ones(len(centres))])
+
+    def specks(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the bodies under a pixel that event frames show by their area: their numbers in the scene, (n,) int64,
+        the nearest first, and their diameters, (n,) float64 px."""
+        grid = samples_of(self.antialiasing).grid
+        bodies, places = self.moment(t_ns).specks(grid, self._specks) if self._specks else (np.empty(0, int), None)
+        return bodies, np.empty(0) if places is None else places[:, 2] / grid
+
     def velocity(self, t_ns: int, every: int = 1) -> Frame:
         """Return image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h
         and w as for :meth:`brightness`: a few pixels suffice to find the largest motion."""

@@ -72,9 +72,37 @@ def drawn(
 
 
 def surfaces_at(renderer: Renderer, t_ns: int) -> Surfaces:
-    """Return the surface at every pixel's centre at t_ns."""
+    """Return the surface at every pixel's centre at t_ns, and the bodies under a pixel where they are nearer."""
     seen = renderer.labels(t_ns, SURFACES)
-    return Surfaces(seen.ids, seen.depth, seen.velocity)
+    surfaces = Surfaces(seen.ids, seen.depth, seen.velocity)
+    bodies, diameters = renderer.specks(t_ns)
+    return with_specks(surfaces, renderer, t_ns, bodies, diameters) if len(bodies) else surfaces
+
+
+def with_specks(
+    surfaces: Surfaces, renderer: Renderer, t_ns: int, bodies: np.ndarray, diameters: np.ndarray
+) -> Surfaces:
+    """Return the surfaces with those of bodies that no pixel's centre need meet, in every pixel that they touch.
+
+    bodies : their numbers in the scene, the nearest first.   diameters : px."""
+    ids, depth, velocity = (array.copy() for array in (surfaces.ids, surfaces.depth, surfaces.velocity))
+    moment, camera, centres = renderer.moment(t_ns), renderer.scene.camera, renderer.body_centres[bodies]
+    points = np.einsum("nij,nj->ni", moment.T_cam_obj[bodies, :3], centres)
+    rates = np.einsum("nij,nj->ni", moment.dT_cam_obj[bodies, :3], centres)
+    speeds = np.einsum("nij,nj->ni", camera.jacobian(points), rates)
+    numbers = np.array([renderer.scene.objects[body].instance_id for body in bodies])
+    # The first and the last pixel that each touches; pixel i is the square from i - 1/2 to i + 1/2. A lens's picture is
+    # drawn flat first, and a pixel of it spreads over another one.
+    place, half = camera.project(points), 0.5 * (diameters[:, None] + (renderer.lens != ""))
+    first, last = (np.floor(place + side + 0.5).astype(np.int64) for side in (-half, half))
+    for dy, dx in np.ndindex(4, 4):
+        x, y = (first + (dx, dy)).T
+        rows = np.flatnonzero((x <= last[:, 0]) & (y <= last[:, 1]) & (x >= 0) & (y >= 0))[::-1]  # the nearest last
+        rows = rows[(x[rows] < camera.width) & (y[rows] < camera.height)]
+        rows = rows[points[rows, 2] < depth[y[rows], x[rows]]]
+        at = y[rows], x[rows]
+        ids[at], depth[at], velocity[at] = numbers[rows], points[rows, 2], speeds[rows]
+    return Surfaces(ids, depth, velocity)
 
 
 class RenderedSequence(SensorSimulation):

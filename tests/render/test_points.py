@@ -5,7 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blinkgl import Camera, ConfigError, Light, Material, Pose, Primitive, Renderer, Scene, render_frame
+from blinkgl import (
+    Camera,
+    ConfigError,
+    Keyframes,
+    Light,
+    Material,
+    Pose,
+    Primitive,
+    Renderer,
+    Scene,
+    record,
+    render_frame,
+)
 from blinkgl.config.run import RunTemplate
 from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
@@ -69,3 +81,24 @@ def test_without_anti_aliasing_a_line_says_that_it_is_not_seen():
         with simulate_sequence(SequenceRequest(config, scene=stars().build(config))) as sequence:
             line = "3 bodies under a pixel shine only where they meet a pixel's centre"
             assert any(note.startswith(line) for note in sequence.alone.notes) == said
+
+
+@pytest.mark.parametrize("emulator", ["esim", "v2e"])
+@pytest.mark.parametrize("lens", [{}, {"lens": "radtan", "distortion": (-0.2, 0.05, 0.0, 0.0)}])
+def test_events_of_points_are_theirs(emulator, lens):
+    """No pixel's centre meets a point; instance, depth and velocity of its events are the point's, by projection."""
+    scene = Scene(
+        Camera(64, 48, focal=FOCAL, pose=Pose((0, 0, 0), look_at=(1, 0, 0)), **lens), **{**SPAN, "duration": 0.1}
+    )
+    scene += Primitive("cuboid", extents=(0.1, 8, 8), pose=Pose((9, 0, 0)), material=Material(color=(0.2,) * 3))
+    for number, (speed, height) in enumerate([(0.6, 0.1), (-0.9, -0.1)]):
+        way = Keyframes({0.0: Pose((4, 0, height)), 1.0: Pose((4, speed, height))}, interpolation="linear")
+        scene += Primitive("point", pose=way, material=glowing(4e-3, 4e-3, 4e-3), name=f"drone {number}")
+    truth = record(scene, emulator=emulator, labels=["events"]).events.truth
+    numbers, counts = np.unique(truth["instance"], return_counts=True)
+    assert counts[np.isin(numbers, (2, 3))].sum() > 0.95 * len(truth) > 50
+    for number, speed in ((2, 0.6), (3, -0.9)):
+        mine = truth[truth["instance"] == number]
+        assert len(mine) > 20 and np.allclose(mine["depth"], 4, atol=1e-3)
+        # +x is to the right, +y of the world to the left; a lens stretches by at most a few percent here.
+        assert np.allclose(mine["velocity"][:, 0], -speed * FOCAL / 4, rtol=0.06 if lens else 1e-4)

@@ -9,6 +9,7 @@ from importlib import import_module
 import pytest
 import typer
 
+from blinkgl.events.table import EMULATORS
 from blinkgl.io.formats import FORMATS
 from blinkgl.machine.help import EXAMPLES
 from blinkgl.tools.command_docs import _commands
@@ -53,7 +54,16 @@ def test_simulate_names_every_format_that_is_written():
     text = help_of("blinkgl simulate")
     stated = text[text.index("--out") : text.index("--emulator")]
     for written in FORMATS.values():
-        assert not written.writer or any(ending in stated for ending in written.endings), written.name
+        named = not written.writer or any(ending in stated for ending in written.endings)
+        assert named, f"name {written.name} in the help of simulate --out, blinkgl/cli_recordings.py"
+
+
+@pytest.mark.parametrize("command", ["simulate", "saccade", "calibrate"])
+def test_every_emulator_is_named(command):
+    text = " ".join(help_of(f"blinkgl {command}").split())
+    stated = text[text.index("--emulator") :][:200]
+    for name in ("esim", "v2e", "voltmeter", *EMULATORS):
+        assert name in stated, f"name {name} in the help of {command} --emulator, blinkgl/cli_recordings.py"
 
 
 def test_every_example_belongs_to_a_command():

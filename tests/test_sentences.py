@@ -267,4 +267,4 @@ def test_commands_say_what_is_wrong(tmp_path, monkeypatch, capsys):
     golden = GOLDEN.read_text()
     if eflow_cli is None:
         golden = golden.split("eflow $")[0].rstrip() + "\n"
-    assert text == golden, "BLINKGL_UPDATE_GOLDEN=1 writes the file anew: read what has changed"
+    assert text == golden, f"BLINKGL_UPDATE_GOLDEN=1 writes {GOLDEN.name} anew: read what has changed"

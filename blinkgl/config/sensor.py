@@ -211,6 +211,17 @@ def fill_sensor(sensor: Any, emulator: object) -> Tree:
     return keys if camera.readout is None else {**keys, "readout": camera.readout.model_dump()}
 
 
+def other_size(sensor: str | SensorConfig | None, width: int, height: int) -> tuple[str, ...]:
+    """Return a line where a recipe states another size, px, than its sensor has."""
+    if sensor is None:
+        return ()
+    camera = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    if (camera.width, camera.height) == (width, height):
+        return ()
+    size = f"{width}x{height} px (camera.width, camera.height)"
+    return (f"the sensor {camera.name} has {camera.width}x{camera.height} px, the recipe says {size}",)
+
+
 def _sensor(name: object) -> object:
     if known_sensor(name) is None:
         raise Refused(

@@ -1,7 +1,5 @@
-"""The interface to all event formats: :func:`open_events`, :func:`event_writer`, :func:`write_events`, :func:`convert`.
-
-:data:`FORMATS` lists the formats; docs/formats.md describes their content.
-"""
+"""All event formats, listed in :data:`FORMATS`: :func:`open_events`, :func:`event_writer`, :func:`write_events`,
+:func:`convert`. docs/formats.md describes their content."""
 
 from __future__ import annotations
 
@@ -316,8 +314,9 @@ class EventFile(Closing):
 
 
 def ending_of(path: Path) -> str:
-    """Return the ending that tells the format: ``.txt.gz`` of ``e.txt.gz``."""
-    return "".join(path.suffixes[-2 if path.suffix.lower() == ".gz" else -1 :]).lower()
+    """Return the ending that tells the format: ``.txt.gz`` of ``e.txt.gz``, ``.evt.json`` where a format has that."""
+    two = "".join(path.suffixes[-2:]).lower()
+    return two if two.endswith(".gz") or any(two in one.endings for one in FORMATS.values()) else path.suffix.lower()
 
 
 def open_events(path: str | os.PathLike, reading: EventReading = AS_FILE) -> EventFile:

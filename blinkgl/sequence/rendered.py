@@ -13,6 +13,7 @@ from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.pinhole import rectified
 from blinkgl.config.over_time import track_times
 from blinkgl.config.scene import lights_change
+from blinkgl.config.sensor import other_size
 from blinkgl.config.sequence import CameraOnRig
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
@@ -118,6 +119,7 @@ class RenderedSequence(SensorSimulation):
         # Of a random world only what is not drawn: it draws its own bodies from its pools, and logs each.
         log = () if config.scene.kind == "random" else scene.log
         self._notes = scene.omissions + log + nothing_in_view(scene) + renderer.notes
+        self._notes += other_size(config.sensor, scene.camera.width, scene.camera.height)
         if scene.dynamics is not None:
             self.libraries = {scene.dynamics.engine: scene.dynamics.version}
         if request.labels:

@@ -99,7 +99,8 @@ def test_every_pair_of_kinds_is_in_a_row():
     assert all_pairs() <= covered and all(map(fits, ROWS))
     assert len(ROWS) < 100 and covering_rows() == ROWS
     often = set().union(*map(pairs, ROWS[: FIRST * BATCH]))
-    assert len(all_pairs() & often) > 0.62 * len(all_pairs())
+    met = len(all_pairs() & often) / len(all_pairs())
+    assert met > 0.58, f"FIRST x BATCH rows, which every run takes, meet {met:.0%} of the pairs: raise FIRST"
 
 
 @pytest.mark.parametrize(

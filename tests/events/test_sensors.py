@@ -12,7 +12,7 @@ from shared_data import shared
 
 from blinkgl.config.events import EmulatorConfig, V2eConfig
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.sensor import SensorConfig, load_sensor, sensor_names, sensor_table
+from blinkgl.config.sensor import SensorConfig, load_sensor, other_size, sensor_names, sensor_table
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame, Readout
@@ -96,7 +96,7 @@ def test_five_sensors_serve_every_emulator():
     own = V2eConfig(leak_rate_hz=0, shot_noise_rate_hz=0)
     assert load_sensor("gen31_vga").emulator("v2e") == own, "what has no source is the emulator's own"
     known = {name for name in sensor_names() if load_sensor(name).threshold_known}
-    assert known == {"davis240c", "davis346", "dvxplorer", "imx636"}
+    assert {"davis240c", "davis346", "dvxplorer", "imx636"} <= known and "gen31_vga" not in known
     assert load_sensor("davis346").emulator("v2e", cutoff_hz=50).cutoff_hz == 50
 
 
@@ -249,3 +249,9 @@ def test_the_state_of_a_rate_controller_is_saved_with_the_read_out():
     second.load_state_dict(first.state_dict())
     rest = second.step(events.part(slice(1111, None)))
     assert (Events.concatenate([begun, rest]).t == whole.t).all() and second.dropped == len(events) - len(whole)
+
+
+def test_a_recipe_of_another_size_than_its_sensor_says_so():
+    assert other_size(None, 3, 2) == other_size("davis240c", 240, 180) == ()
+    (line,) = other_size("davis240c", 346, 260)
+    assert line == "the sensor DAVIS240C has 240x180 px, the recipe says 346x260 px (camera.width, camera.height)"

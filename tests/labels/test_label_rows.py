@@ -227,3 +227,10 @@ def test_intervals_come_back_from_their_file(name, tmp_path):
     assert back.t_ns == value.t_ns
     for key in ("interval_ns", *LABELS[name].arrays):
         np.testing.assert_array_equal(getattr(back, key), getattr(value, key))
+
+
+def test_a_shipped_label_has_its_key_in_the_configuration():
+    """A key that registration adds is in no documentation."""
+    for name in LabelsConfig.added:
+        module = type(LABELS[name]).__module__ if name in LABELS else ""
+        assert not module.startswith("blinkgl."), f"give LabelsConfig a field {name}, blinkgl/config/labels.py"

@@ -190,7 +190,7 @@ def _of_label(label: Label, view: View) -> Quantity:
 def _of_own(own: OwnPass) -> Quantity | None:
     if own.reference is None:
         return None
-    note = "a pass of a plug-in, against its own reference"
+    note = "against its own reference"
     return Quantity(own.name, own.unit, own.tolerance, _absolute, same_triangle=False, note=note)
 
 

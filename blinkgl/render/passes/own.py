@@ -16,7 +16,7 @@ from blinkgl.render.passes.base import Pass
 
 @dataclass(frozen=True, eq=False)
 class OwnPass:
-    """One output of a pass of a plug-in. Parts as of :func:`register`."""
+    """One output of a registered pass. Parts as of :func:`register`."""
 
     name: str
     pass_: Pass

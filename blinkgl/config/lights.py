@@ -49,8 +49,8 @@ class _PlacedLampConfig(_LampConfig):
     )
     reach: Positive | None = Field(
         None,
-        description="distance, m, at which it has faded to zero, by 1 - (distance / reach)^4; null: it falls "
-        "only with the square of the distance",
+        description="distance, m, at which it has faded to zero, by the factor 1 - (distance / reach)^4; null: no "
+        "limit",
     )
 
     @rule("position", "?motion")
@@ -88,10 +88,10 @@ LampConfig = one_of("kind", SunLampConfig, PointLampConfig, SpotLampConfig)
 class EnvironmentConfig(Config):
     """A panorama that lights a scene instead of light.sun and light.sky, and is seen as its sky."""
 
-    map: str = Field(description="equirectangular image: hdr or exr; an 8-bit image has no bright sun")
+    map: str = Field(description="equirectangular image, hdr or exr; an 8-bit one has no bright sun")
     strength: Radiance = Field(
         1.0,
-        description="factor on its radiance, which is scaled so that 90 % of its solid angle is darker than 0.8",
+        description="factor on its radiance (scaled so that 90 % of the solid angle is darker than 0.8)",
     )
     heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn as a sky at infinity")
@@ -129,8 +129,8 @@ class LightConfig(Config):
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
-        description="of objects and walls, from at most four suns and spot lights (soft: two); hard: edges a texel "
-        "of the shadow map wide; soft: wider for larger lights, up to 48 texels",
+        description="hard: edges one texel wide, of at most four suns and spot lights; soft: wider for larger lights, "
+        "up to 48 texels, of two",
     )
     shadow_size: int = Field(1024, ge=64, le=8192, description="side of each shadow map, texels")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
@@ -166,14 +166,12 @@ class RandomLightsConfig(Config):
     """Further lights of a random world, each at a random position in the region, above the ground."""
 
     count: tuple[Annotated[int, Field(ge=0, le=MAX_LIGHTS)], Annotated[int, Field(ge=0, le=MAX_LIGHTS)]] = Field(
-        (1, 3), description="[fewest, most] lights; all numbers equally likely"
+        (1, 3), description="[fewest, most]; uniform"
     )
     kinds: Annotated[tuple[Literal["sun", "point", "spot"], ...], Field(min_length=1)] = Field(
         ("point", "spot"), description="kinds that are drawn, equally likely"
     )
-    strength: PositiveRange = Field(
-        (3.0, 30.0), description="strength of point and spot lights, see light.lights; log-uniform"
-    )
+    strength: PositiveRange = Field((3.0, 30.0), description="of point and spot lights; log-uniform")
     sun_strength: ClassVar[tuple[float, float]] = (0.1, 0.6)
     """Strength of further suns; log-uniform."""
     saturation: ClassVar[float] = 0.5

@@ -68,9 +68,7 @@ class OpticsConfig(Config):
         None, description="point spread of the lens: gaussian, airy or kernel; null: a point stays one"
     )
     lens: LensConfig | None = Field(None, description="defocus by a thin lens; null: everything is in focus")
-    lens_points: int = Field(
-        16, ge=4, le=1024, description="points of the lens that are drawn for each event frame, each at a frame's cost"
-    )
+    lens_points: int = Field(16, ge=4, le=1024, description="points of the lens per event frame; each costs a frame")
     bayer: Bayer | None = Field(None, description="one colour per pixel in this pattern, as of the colour DAVIS")
 
     @rule("?psf", "?lens", "?bayer")

@@ -63,13 +63,13 @@ class DisplacementTimeline(_AdaptiveTimeline):
         100.0,
         gt=0,
         le=100,
-        description="percentile of the speeds of moving surfaces, by their area in the picture; 100 bounds every one",
+        description="percentile of the speeds of moving surfaces, by area in the picture",
     )
     max_px_peak: float | None = Field(
         None,
         gt=0,
         le=1e4,
-        description="an additional limit for the fastest surface, px; for a percentile below 100",
+        description="limit for the fastest surface, px; for a percentile below 100",
     )
 
 

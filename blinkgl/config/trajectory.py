@@ -39,13 +39,13 @@ class MotionConfig(Config):
         None,
         gt=0,
         le=1000,
-        description="waypoints per second, instead of waypoints: a short sequence is then a part of a smooth motion",
+        description="waypoints per second, instead of waypoints",
     )
     pauses: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="fraction of the bodies that stop smoothly once, for 10 to 50 % of the sequence",
+        description="fraction of the bodies that stop once, for 10 to 50 % of the sequence",
     )
     speed: SpeedRange = Field((0.2, 1.5), description="mean speed of the body's origin, world units/s")
     rotation_rate: RateRange = Field(
@@ -80,12 +80,12 @@ class CameraMotion(MotionConfig):
     )
     heading: Literal["any", "view", "across"] = Field(
         "any",
-        description="initial direction; view: along its line of sight, forwards or backwards; across: perpendicular"
-        " to it. smoothness decides how long it is kept",
+        description="initial direction; view: along its line of sight, forwards or backwards; across: perpendicular "
+        "to it",
     )
     roll: float = Field(20.0, ge=0, le=180, description="largest roll of the horizon at the waypoints, deg")
     shake: float = Field(
-        0.0, ge=0, le=30, description="additional hand shake: standard deviation of the rotation about each axis, deg"
+        0.0, ge=0, le=30, description="hand shake: standard deviation of the rotation about each axis, deg"
     )
     shake_rate: ClassVar[float] = 8.0
     """Shake impulses per second."""

@@ -144,8 +144,7 @@ def view(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
-    """View sequences in the browser (extra [view]). The page shows frames, events, labels and the scene in 3-D. Ctrl-C
-    ends it."""
+    """View sequences in the browser (extra [view]). Ctrl-C ends it."""
     from blinkgl.show import view as command
 
     return command.run(sequences, port=port, save=save, overwrite=overwrite)
@@ -334,7 +333,7 @@ def export(
     layout: Annotated[
         str | None,
         typer.Option(
-            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
+            help="webdataset (the default), dsec, eraft, blinkflow, mvsec, tapvid, "
             "multiflow, eventkubric, rosbag, nerf or intervals."
         ),
     ] = None,

@@ -206,8 +206,7 @@ def compare(
     damaged: of_events.Damaged = "refuse",
     sort: of_events.Sort = False,
 ) -> int:
-    """Describe a recording, or compare it with events or frames. The table has counts, rates, intervals, and
-    polarity against brightness."""
+    """Describe a recording, or compare it with events or frames."""
     from blinkgl.io.declared import Declared
     from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
@@ -398,8 +397,7 @@ def import_(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
 ) -> int:
-    """Convert a scene of Blender or a format it reads to GLB. It reports what was converted and what was not (extra
-    [cycles])."""
+    """Convert a scene of Blender or a format it reads to GLB (extra [cycles])."""
     from blinkgl.show import import_ as command
 
     return command.run(

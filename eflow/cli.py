@@ -107,8 +107,7 @@ def render(
     workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
     quiet: Quiet = False,
 ) -> None:
-    """Render windows of a recipe into a folder for trainings. Several trainings can share it. Ctrl-C keeps the finished
-    windows."""
+    """Render windows of a recipe into a folder for trainings. Ctrl-C keeps the finished windows."""
     from blinkgl.sequence_files.sequence_dir import refuse_existing
     from eflow.data.online import open_online
     from eflow.data.pool import render_pool

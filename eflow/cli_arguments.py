@@ -45,8 +45,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")
 Dataset = Annotated[
     str,
     typer.Argument(
-        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences or rendered windows, or a recipe (.yaml), whose "
-        "test groups are rendered."
+        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences or rendered windows, or a recipe, whose test "
+        "groups are rendered."
     ),
 ]
 Protocol = Annotated[str, typer.Option(help="MVSEC: frames and rows to score: all, ste-flownet or e-raft (20 Hz).")]
@@ -55,10 +55,7 @@ Frames = Annotated[
     typer.Option("--frames", metavar="FIRST-LAST", help="MVSEC: images (or 20 Hz fields) to score; may be repeated."),
 ]
 Dense = Annotated[bool, typer.Option("--dense", help="MVSEC: score pixels without events, too.")]
-_REFINE = (
-    "Draw the flow of a network that is near its dominant affine motion towards it, then scale it to the length that "
-    "makes the events sharpest."
-)
+_REFINE = "Refine a network's flow by its dominant affine motion and by the sharpness of the events."
 Refined = Annotated[bool, typer.Option("--refine", help=_REFINE)]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")

@@ -78,8 +78,7 @@ class WaveConfig(_Waving):
 
 
 class FlagConfig(_Waving):
-    """Cloth in wind, held at one end: the motion grows with the distance from that end, and a second, shorter wave
-    crosses it."""
+    """Cloth in wind, held at one end: the motion grows with the distance from it; a shorter wave crosses it."""
 
     kind: Literal["flag"] = "flag"
     along: Axis = Field("x", description="axis between the held end and the free one, of the object at rest")

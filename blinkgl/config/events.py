@@ -28,8 +28,7 @@ _MAX_EVENTS = Field(
 )
 _CAUSES = Field(
     False,
-    description="Mark every event with its cause (`cause` in the files): 0 signal, 1 leak, 2 shot noise, 3 hot "
-    "pixel. The events are the same.",
+    description="Mark every event with its cause: 0 signal, 1 leak, 2 shot noise, 3 hot pixel.",
 )
 Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(

@@ -17,7 +17,7 @@ MAX_SPAN_S = (2**32 - 1) * 1e-6
 
 
 class FramesConfig(Config):
-    """Folders of frames as input of the event emulator; a flow file per pair of frames becomes the label."""
+    """Folders of frames with flow (docs/video.md)."""
 
     folders: Paths = Field(
         (),
@@ -31,8 +31,7 @@ class FramesConfig(Config):
     )
     flow_format: str = Field(
         "auto",
-        description="of the flow files: dsec, kitti, vkitti2, tartanair2, flo, pfm, flo5, npy; auto: by ending, and "
-        "16-bit PNGs by their values",
+        description="dsec, kitti, vkitti2, tartanair2, flo, pfm, flo5, npy; auto: by ending, and 16-bit PNGs by values",
     )
     flow_direction: Literal["auto", "forward", "backward"] = Field(
         "auto",

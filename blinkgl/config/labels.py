@@ -60,7 +60,7 @@ def _a_table(value: object) -> object:
 
 
 class LabelsConfig(Config, extra="allow"):
-    """Ground truth at label times. A pass that no label needs is not compiled, allocated or run."""
+    """Ground truth at label times."""
 
     settings: ClassVar[Any] = ("events", "pixels", "flow", "float_flow", "occlusion")
     """Keys that do not name a label."""

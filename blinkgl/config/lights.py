@@ -86,7 +86,7 @@ LampConfig = one_of("kind", SunLampConfig, PointLampConfig, SpotLampConfig)
 
 
 class EnvironmentConfig(Config):
-    """A panorama that lights a scene instead of light.sun and light.sky, and is seen as its sky."""
+    """A panorama that lights a scene and is its sky."""
 
     map: str = Field(description="equirectangular image, hdr or exr; an 8-bit one has no bright sun")
     strength: Radiance = Field(
@@ -101,14 +101,13 @@ class EnvironmentConfig(Config):
 
 
 class LightConfig(Config):
-    """A sun and a sky, white by default: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and further lights."""
+    """A sun and a sky, E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and further lights."""
 
     sun: float = Field(0.6, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.4, ge=0, le=1e9, description="strength of the sky")
     over_time: WaveformConfig | None = Field(
         None,
-        description="factor over time on the sun, the sky or the environment: sine, pwm, code or keys (docs/light.md); "
-        "null: constant",
+        description="factor over time on sun, sky or environment (docs/light.md)",
     )
     sun_elevation: float | None = Field(
         None,
@@ -125,7 +124,7 @@ class LightConfig(Config):
     lights: tuple[LampConfig, ...] = Field((), description="further suns, point and spot lights, in world coordinates")
     environment: EnvironmentConfig | None = Field(
         None,
-        description="a panorama that lights the scene; null: the sun and the sky. In random worlds use sky.lights",
+        description="a panorama that lights the scene instead of sun and sky; in random worlds use sky.lights",
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
@@ -194,9 +193,7 @@ class RandomLightsConfig(Config):
 class FogConfig(Config):
     """A medium that absorbs light and adds its own, for event frames and images."""
 
-    density: float = Field(
-        gt=0, le=1e6, description="density per world unit: 37 % of the light is left after 1 / density"
-    )
+    density: float = Field(gt=0, le=1e6, description="per world unit: 37 % of the light is left after 1 / density")
     radiance: Radiance = Field(0.7, description="linear radiance of the fog itself, which replaces the background")
 
 

@@ -35,7 +35,7 @@ class KernelPsfConfig(Config):
 
     kind: Literal["kernel"]
     weights: Annotated[tuple[_Row, ...], Field(min_length=1, max_length=MOST_TAPS)] = Field(
-        description="rows of the picture of a point, odd numbers of rows and columns that sum to 1"
+        description="rows of the picture of a point: odd numbers of rows and columns, sum 1"
     )
 
     @rule("weights")
@@ -62,7 +62,7 @@ PsfConfig = one_of("kind", GaussianPsfConfig, AiryPsfConfig, KernelPsfConfig)
 
 
 class OpticsConfig(Config):
-    """Between the scene and the pixels of the event camera; what is left out costs nothing."""
+    """Between the scene and the pixels of the event camera."""
 
     psf: PsfConfig | None = Field(
         None, description="point spread of the lens: gaussian, airy or kernel; null: a point stays one"

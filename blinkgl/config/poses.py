@@ -83,7 +83,7 @@ class KeyframeConfig(PoseConfig):
     """A pose at a time."""
 
     time: float = Field(
-        ge=-1e7, le=1e7, description="s on the sequence's clock (the first label is at time.start + 1 / label_rate)"
+        ge=-1e7, le=1e7, description="s on the sequence's clock (first label: time.start + 1 / label_rate)"
     )
 
 

@@ -87,9 +87,7 @@ class FrameResetsConfig(Config):
     threshold fire."""
 
     interval_ms: float = Field(gt=2, le=10_000, description="Time between resets, ms: the frame interval.")
-    kick: float = Field(
-        gt=0, le=5, description="Height of the jump, in units of the smaller of the emulator's ON and OFF thresholds."
-    )
+    kick: float = Field(gt=0, le=5, description="Height of the jump, in units of the smaller threshold.")
     length_ms: ClassVar[float] = 1.0
     """Time until the signal has returned, ms; shorter than any interval."""
     former: ClassVar[dict[str, Former]] = {"length_ms": always(length_ms)}
@@ -114,7 +112,7 @@ class ReadoutConfig(Config):
         0.0,
         ge=0,
         le=1e6,
-        description="Time to open a row before its events are sent, nanoseconds; 0: events are arbitrated one by one.",
+        description="Time to open a row before its events are sent, nanoseconds; 0: events are sent one by one.",
     )
     queue_events: int = Field(
         4096,

@@ -379,8 +379,7 @@ class ExplicitSceneConfig(Config):
 
 
 class FileSceneConfig(Config):
-    """A complete glTF/GLB scene with cameras, materials and node animations. The file's y axis becomes the world's z,
-    so its (x, y, z) is at (x, -z, y); poses given here are in that world."""
+    """A complete glTF/GLB scene. The file's (x, y, z) is at (x, -z, y) in the world, in which poses are given."""
 
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")
@@ -389,9 +388,7 @@ class FileSceneConfig(Config):
     intrinsics: Literal["config", "file"] = Field(
         "config", description="source of the focal length: camera of the YAML, or the file (yfov)"
     )
-    animation: str | int | AnimationConfig | None = Field(
-        0, description="name or index of the animation to play, at the file's times; null: none"
-    )
+    animation: str | int | AnimationConfig | None = Field(0, description="name or index of the animation; null: none")
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     lights: Literal["config", "file"] = Field(

@@ -259,8 +259,8 @@ class SequenceConfig(Config):
     render: RenderConfig = Field(RenderConfig(), description="quality of drawing")
     sensor: Sensor | None = Field(
         None,
-        description=f"{', '.join(shipped_names('sensors'))}, or the path of a sensor file (or its table): sets "
-        "camera.width, camera.height, events and readout; keys given beside it override it",
+        description=f"{', '.join(shipped_names('sensors'))}, a sensor file or its table: sets camera.width, "
+        "camera.height, events and readout; keys beside it override it",
     )
     events: EmulatorConfig = Field(EsimConfig(), description="event camera model and parameters")
     readout: ReadoutConfig | None = Field(

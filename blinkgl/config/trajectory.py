@@ -34,7 +34,7 @@ class MotionConfig(Config):
     kind: Literal["spline", "static"] = Field(
         "spline", description="spline: through random waypoints; static: no motion"
     )
-    waypoints: int = Field(6, ge=2, le=1000, description="waypoints per sequence (approximately: see rotation_rate)")
+    waypoints: int = Field(6, ge=2, le=1000, description="waypoints per sequence, approximately")
     waypoints_per_s: float | None = Field(
         None,
         gt=0,
@@ -50,8 +50,7 @@ class MotionConfig(Config):
     speed: SpeedRange = Field((0.2, 1.5), description="mean speed of the body's origin, world units/s")
     rotation_rate: RateRange = Field(
         (20.0, 120.0),
-        description="mean angular rate, deg/s; key frames are added where two waypoints differ by more than 115 "
-        "degrees",
+        description="mean angular rate, deg/s; may add key frames",
     )
     smoothness: float = Field(
         0.5, ge=0, le=1, description="0: each leg starts in a random direction; 1: it continues in the last one's"
@@ -71,7 +70,7 @@ class ObjectMotion(MotionConfig):
 
 
 class CameraMotion(MotionConfig):
-    """Motion of the camera: as of an object, but it looks approximately at the scene's centre."""
+    """Motion of the camera, which looks approximately at the scene's centre."""
 
     speed: SpeedRange = Field((0.3, 1.5), description="mean speed of the camera centre, world units/s")
     rotation_rate: RateRange = Field((10.0, 60.0), description="mean angular rate without shake, deg/s")

@@ -75,7 +75,7 @@ def generate(
             help="Draw faces of files from both sides, or from the front only (default: as the file says).",
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
     workers: Annotated[
         int | None,
         typer.Option("--workers", "-w", min=1, help="Processes that generate sequences (default: only this one)."),

@@ -104,7 +104,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
     """Convert any video into events."""
     from blinkgl.show import simulate as command
@@ -283,7 +283,7 @@ def calibrate(
     starts: Annotated[int, typer.Option(min=1, max=20, help="Starting points of the search.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulations and the search.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
     """Fit an emulator to a camera's recording. It writes a sensor file and a page about the fit."""
     from blinkgl.io.reading import EventReading
@@ -395,7 +395,7 @@ def import_(
     time_limit: Annotated[float, typer.Option("--time-limit", min=1, help="Time limit of Blender, s.")] = 900.0,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
     """Convert a scene of Blender or a format it reads to GLB (extra [cycles])."""
     from blinkgl.show import import_ as command

@@ -1,4 +1,4 @@
-"""A gymnasium-style environment whose observation is a voxel grid: a target moves, the agent turns to keep it in view."""
+"""A gymnasium-style environment whose observation is a voxel grid: the agent turns to keep a moving target in view."""
 
 from pathlib import Path
 

@@ -269,9 +269,8 @@ DIE_FACES = 2, 3
 
 @primitive
 def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Surface:
-    """Cube with rounded edges and corners, of ``subdivisions`` cells each (``rounding`` is a fraction of ``size``, at
-    most a half, which is a ball). Its six faces are in one texture, 1 2 3 above 4 5 6; opposite ones sum to 7: see
-    `procedural: pips`."""
+    """Cube with rounded edges and corners. Its six faces are in one texture, 1 2 3 above 4 5 6; opposite ones sum to 7:
+    see `procedural: pips`."""
     if rounding > 0.5:
         raise AssetError("bad parameter", where="die.rounding", value=rounding, accepted="at most 0.5")
     half, radius = 0.5 * size, rounding * size
@@ -417,7 +416,7 @@ def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: in
 
 @primitive
 def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_segments: int = 16) -> Surface:
-    """Ring about z: ``radius`` to the middle of a tube of radius ``tube`` (< radius)."""
+    """Ring about z."""
     if tube >= radius:
         raise AssetError("bad parameter", where="torus.tube", value=tube, accepted=f"less than radius {radius:g}")
     angle = 2 * math.pi * np.arange(tube_segments + 1) / tube_segments
@@ -434,7 +433,7 @@ def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_seg
 
 @primitive
 def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
-    """Cylinder of ``height`` between two half spheres; ``rings`` rows of the two together."""
+    """Cylinder of ``height`` between two half spheres, which have ``rings`` rows together."""
     half = max(rings // 2, 1)
     latitude = np.linspace(0, math.pi / 2, half + 1)
     top = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)

@@ -62,9 +62,8 @@ def _primitives() -> str:
     lines = [
         "\n## Primitives\n\n",
         (
-            "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, "
-            "parameters: {radius: 0.2, height: 2}}`. Their axis is z, their centre the origin; sizes are in world "
-            "units (m), before the object's `scale`.\n\n"
+            "`scene.meshes.<name>`, for example `{primitive: cylinder, parameters: {radius: 0.2, height: 2}}`. Their "
+            "axis is z, their centre the origin; sizes are in world units (m), before the object's `scale`.\n\n"
         ),
         "|kind|parameters and defaults|what it is|\n|---|---|---|\n",
     ]

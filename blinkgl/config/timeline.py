@@ -46,8 +46,7 @@ class _AdaptiveTimeline(_Timeline):
 
 
 class DisplacementTimeline(_AdaptiveTimeline):
-    """Event frames between which surfaces move at most ``max_px``, everywhere in the step: by the speeds of the scene's
-    geometry in the picture, hidden surfaces included."""
+    """Event frames between which no surface, hidden ones included, moves further than ``max_px`` in the picture."""
 
     former: ClassVar[dict[str, Former]] = {
         **_NO_RECONSTRUCTION,

@@ -34,8 +34,8 @@ def doctor(
         typer.Option("--compile", help="First compile the kernels of all common commands."),
     ] = False,
 ) -> int:
-    """Report what this machine offers and what is missing, with commands that install it. Exit status 2 if something
-    required is missing."""
+    """Report what this machine offers and what is missing. It names the commands that install
+    missing parts. Exit status 2 if something required is missing."""
     from blinkgl.show import doctor as command
 
     return command.run(backend, device, as_json, compile_all)

@@ -397,7 +397,7 @@ def import_(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
-    """Convert a scene of Blender or a format it reads to GLB (extra [cycles])."""
+    """Convert a scene of Blender or a format it reads to GLB. It needs the extra [cycles]."""
     from blinkgl.show import import_ as command
 
     return command.run(

@@ -139,8 +139,8 @@ def evaluate(
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     refine: Refined = False,
 ) -> None:
-    """Score a network or a method on a data set, beside zero flow and global motions fitted to the truth. Samples with
-    an empty window are left out and counted."""
+    """Score a network or a method on a data set. Zero flow and global motions fitted to the truth are scored beside it.
+    Samples with an empty window are left out and counted."""
     from blinkgl.machine.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
@@ -186,7 +186,7 @@ def predict(
     options: Answering,
     refine: Refine = True,
 ) -> None:
-    """Compute the flow of any event file, by a network or a method without training.
+    """Compute the flow of any event file. Networks do this, and methods without training.
 
     FWL (flow warp loss) says how much sharper the events become when the flow moves them back to the window's start;
     above 1 the flow helps."""

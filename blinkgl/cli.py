@@ -31,11 +31,11 @@ def doctor(
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
     compile_all: Annotated[
         bool,
-        typer.Option("--compile", help="First compile the kernels of all common commands, so that none has to wait."),
+        typer.Option("--compile", help="First compile the kernels of all common commands."),
     ] = False,
 ) -> int:
-    """Report what this machine offers and what is missing. Every missing part has the command that installs it. Exit
-    status 2 if something required is missing."""
+    """Report what this machine offers and what is missing. It names the commands that install
+    missing parts. Exit status 2 if something required is missing."""
     from blinkgl.show import doctor as command
 
     return command.run(backend, device, as_json, compile_all)
@@ -61,7 +61,7 @@ def generate(
             "--num",
             "-n",
             min=1,
-            help="Sequences of the run, dealt over its groups by their shares (default: output.sequences).",
+            help="Sequences of the run, over its groups by their shares (default: output.sequences).",
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
@@ -72,10 +72,10 @@ def generate(
         bool | None,
         typer.Option(
             "--both-sides/--one-side",
-            help="Draw faces of files from both sides, or from their front alone (default: as each file says).",
+            help="Draw faces of files from both sides, or from the front only (default: as the file says).",
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
     workers: Annotated[
         int | None,
         typer.Option("--workers", "-w", min=1, help="Processes that generate sequences (default: only this one)."),
@@ -88,11 +88,11 @@ def generate(
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares a GPU.")] = 0.0,
     devices: Annotated[
         str | None,
-        typer.Option(help="local: EGL devices to distribute over the workers, e.g. 0,1 (default: all GPUs)."),
+        typer.Option(help="local: EGL devices of the workers, e.g. 0,1 (default: all GPUs)."),
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Begin or continue a run: generate only the sequences that are not complete."),
+        typer.Option("--resume", help="Begin or continue a run: generate what is not complete."),
     ] = False,
     mixed: Annotated[
         bool,
@@ -144,8 +144,7 @@ def view(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
-    """View sequences in the browser (extra [view]). The page shows frames, events, labels and the scene in 3-D. Ctrl-C
-    ends it."""
+    """View sequences in the browser (extra [view]). Ctrl-C ends it."""
     from blinkgl.show import view as command
 
     return command.run(sequences, port=port, save=save, overwrite=overwrite)
@@ -163,8 +162,8 @@ def verify(
         str | None, typer.Option(help="Folder for the recipe's relative paths (default: as recorded).")
     ] = None,
 ) -> int:
-    """Check the files and contents of a data set. Names, manifests, checksums, contents and drawn values are compared.
-    Exit status 2 when something is wrong; the last line lists what could not be compared."""
+    """Check the files and contents of a data set. Exit status 2 when something is wrong; the last line lists what
+    could not be compared."""
     from blinkgl.show import verify as command
 
     return command.run(folder, deep=sample if deep else 0, seed=seed, base=base)
@@ -179,15 +178,14 @@ def drop(
     where: Annotated[
         list[str] | None,
         typer.Option(
-            "--where", metavar="'KEY < VALUE'", help="Those whose line in index.jsonl meets it; all of several."
+            "--where",
+            metavar="'KEY < VALUE'",
+            help="Sequences whose line in index.jsonl meets the condition (all, if repeated).",
         ),
     ] = None,
-    undo: Annotated[
-        bool, typer.Option("--undo", help="Take them from the record; generate --resume makes them again.")
-    ] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Undo: generate --resume makes them again.")] = False,
 ) -> int:
-    """Take sequences out of a data set on purpose. Their folders are deleted, and generate --resume, verify, export and
-    report agree without them."""
+    """Take sequences out of a data set on purpose. Their folders are deleted; other commands no longer expect them."""
     from blinkgl.show import drop as command
 
     return command.run(folder, sequences or [], where=where or [], undo=undo)
@@ -226,7 +224,7 @@ def trade(
     ] = "trade",
     suite: Annotated[
         bool,
-        typer.Option("--suite", help="Measure the shipped scenes, each difficult in a different way, instead of one."),
+        typer.Option("--suite", help="Measure the shipped scenes instead of one."),
     ] = False,
     scene: Annotated[
         list[str] | None,
@@ -267,13 +265,11 @@ def trade(
         list[str] | None,
         typer.Option(
             metavar="scene.a=b",
-            help="Reference with an effect that the settings leave out, such as scene.light.shadows=soft; "
-            "may be repeated.",
+            help="Reference with an effect that the settings leave out; may be repeated.",
         ),
     ] = None,
 ) -> int:
-    """Measure the cost of accuracy of a scene. Settings are timed and compared with a converged reference; the result
-    is a table, a plot and a page."""
+    """Measure the cost of accuracy of a scene. Settings are timed and compared with a converged reference."""
     from blinkgl.tools.trade import command
 
     if suite:
@@ -337,7 +333,7 @@ def export(
     layout: Annotated[
         str | None,
         typer.Option(
-            help="webdataset (shards SPLIT-000000.tar …, the default), dsec, eraft, blinkflow, mvsec, tapvid, "
+            help="webdataset (the default), dsec, eraft, blinkflow, mvsec, tapvid, "
             "multiflow, eventkubric, rosbag, nerf or intervals."
         ),
     ] = None,
@@ -346,7 +342,7 @@ def export(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Seed of the samples' order in shards; a reader then only needs to shuffle shards."),
+        typer.Option(min=0, help="Seed of the samples' order in shards."),
     ] = None,
 ) -> int:
     """Write a data set for the loaders of other programs. The default is WebDataset shards, one sample per flow

@@ -25,13 +25,13 @@ Curve = Annotated[
     str | None,
     typer.Option(
         help="Curve of the frames: linear, srgb, pq, hlg or an exponent (default: what the file states; linear for "
-        "grey images, a camera's own; srgb for video and colour)."
+        "grey images; srgb for video and colour)."
     ),
 ]
 WhiteLevel = Annotated[
     float | None,
-    typer.Option("--white-level", help="Code of white: 4095 of 12 bits in 16 (default: what the file states, else "
-                 "the type's largest; asked for where 16-bit codes leave the upper two bits empty)."),
+    typer.Option("--white-level", help="Code of white, such as 4095 of 12 bits (default: what the file states, else "
+    "the type's largest)."),
 ]  # fmt: skip
 Range = Annotated[
     str | None,
@@ -70,7 +70,7 @@ def simulate(
     ] = None,
     size: Annotated[
         str | None,
-        typer.Option(help="WIDTHxHEIGHT to crop and scale frames to (default: the sensor's, else their own)."),
+        typer.Option(help="Size to crop and scale frames to (default: the sensor's, else their own)."),
     ] = None,
     config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
     overrides: Annotated[
@@ -89,8 +89,8 @@ def simulate(
     gamma: Annotated[
         str | None,
         typer.Option(
-            help="srgb, linear, pq, hlg or an exponent (default: what the file states; linear for floats and for a "
-            "recording's frames; the sensor's own for grey images of its size; else srgb)."
+            help="srgb, linear, pq, hlg or an exponent (default: what the file states; linear for floats and a "
+            "recording's frames; the sensor's for grey images of its size; else srgb)."
         ),
     ] = None,
     white_level: WhiteLevel = None,
@@ -104,7 +104,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
     """Convert any video into events."""
     from blinkgl.show import simulate as command
@@ -206,8 +206,7 @@ def compare(
     damaged: of_events.Damaged = "refuse",
     sort: of_events.Sort = False,
 ) -> int:
-    """Describe a recording, or compare it with events or frames. The table has counts, rates, intervals, and
-    polarity against brightness."""
+    """Describe a recording, or compare it with events or frames."""
     from blinkgl.io.declared import Declared
     from blinkgl.io.reading import EventReading
     from blinkgl.show import compare as command
@@ -238,9 +237,7 @@ def calibrate(
     recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Event file of a camera.")],
     out: Annotated[
         str,
-        typer.Option(
-            "--out", "-o", help="Output sensor file, .yaml; a page of the same name, .html, is written beside it."
-        ),
+        typer.Option("--out", "-o", help="Output sensor file, .yaml; the page has the same name, .html."),
     ] = "sensor.yaml",
     frames: Annotated[
         str | None,
@@ -286,9 +283,9 @@ def calibrate(
     starts: Annotated[int, typer.Option(min=1, max=20, help="Starting points of the search.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulations and the search.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
-    """Fit an emulator to a camera's recording. It writes a sensor file, and a page that shows how close the fit is."""
+    """Fit an emulator to a camera's recording. It writes a sensor file and a page about the fit."""
     from blinkgl.io.reading import EventReading
     from blinkgl.show import calibrate as command
 
@@ -346,9 +343,7 @@ def convert(
     sort: of_events.Sort = False,
     write_unit: Annotated[
         str,
-        typer.Option(
-            "--write-unit", help="Times of a .txt or .csv OUT: s (six decimals), or us (integers; .csv as faery's)."
-        ),
+        typer.Option("--write-unit", help="Times of a .txt or .csv OUT: s (six decimals), or us (integers)."),
     ] = "s",
     triggers: Annotated[
         str | None, typer.Option("--triggers", metavar="FILE", help="Also write the triggers of IN, .csv.")
@@ -390,22 +385,19 @@ def import_(
     keys_per_frame: Annotated[
         int,
         typer.Option(
-            "--keys-per-frame", min=1, max=64, help="Least key frames per frame; between them motion is linear."
+            "--keys-per-frame", min=1, max=64, help="Fewest key frames per frame; between them motion is linear."
         ),
     ] = 1,
-    bake_mb: Annotated[
-        float, typer.Option("--bake-mb", min=1, help="Most megabytes of shapes that glTF has no words for, baked.")
-    ] = 256.0,
+    bake_mb: Annotated[float, typer.Option("--bake-mb", min=1, help="Most megabytes of baked shapes.")] = 256.0,
     clips: Annotated[
         bool, typer.Option("--clips", help="One animation per action instead of one for the scene; no baking.")
     ] = False,
     time_limit: Annotated[float, typer.Option("--time-limit", min=1, help="Time limit of Blender, s.")] = 900.0,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,
 ) -> int:
-    """Convert a scene of Blender or a format it reads to GLB. It reports what was converted and what was not (extra
-    [cycles])."""
+    """Convert a scene of Blender or a format it reads to GLB. It needs the extra [cycles]."""
     from blinkgl.show import import_ as command
 
     return command.run(

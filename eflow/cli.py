@@ -70,8 +70,7 @@ def train(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train a network. Ctrl-C and SIGTERM end after the step, with a checkpoint; --resume continues. Exit status 130 or
-    143."""
+    """Train a network. Ctrl-C and SIGTERM end after the step, with a checkpoint and exit status 130 or 143."""
     from eflow.load_config import load_train_config
     from eflow.models import preset
     from eflow.train import as_yaml, train as run_training
@@ -108,8 +107,7 @@ def render(
     workers: Annotated[int, typer.Option("--workers", "-w", min=0, help="Rendering processes.")] = 1,
     quiet: Quiet = False,
 ) -> None:
-    """Render windows of a recipe into a folder for trainings. Several trainings can share it. Ctrl-C keeps the finished
-    windows."""
+    """Render windows of a recipe into a folder for trainings. Ctrl-C keeps the finished windows."""
     from blinkgl.sequence_files.sequence_dir import refuse_existing
     from eflow.data.online import open_online
     from eflow.data.pool import render_pool
@@ -141,8 +139,8 @@ def evaluate(
     limit: Annotated[int | None, typer.Option(min=1, help="Score only this many samples, evenly spaced.")] = None,
     refine: Refined = False,
 ) -> None:
-    """Score a network or a method on a data set. Beside it stand baselines: zero flow, and global motions fitted to the
-    truth. Samples with an empty window are left out and counted."""
+    """Score a network or a method on a data set. Zero flow and global motions fitted to the truth are scored beside it.
+    Samples with an empty window are left out and counted."""
     from blinkgl.machine.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
@@ -178,9 +176,8 @@ def predict(
         list[str],
         typer.Argument(
             metavar="[NETWORK] EVENTS",
-            help="A network or method, as evaluate has them, and an event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, "
-            "npz … Without a network (or with auto) the events choose: real_small where the flow is nearly affine, "
-            "real_bodies where depth or moving bodies show in it.",
+            help="A network or method, as of evaluate, and an event file. Without a network (or with auto): "
+            "real_small where the flow is nearly affine, else real_bodies.",
         ),
     ],
     outputs: Outputs,
@@ -189,10 +186,10 @@ def predict(
     options: Answering,
     refine: Refine = True,
 ) -> None:
-    """Compute the flow of any event file. Networks do it, and methods that need no training.
+    """Compute the flow of any event file. Networks do this, and methods without training.
 
-    FWL (flow warp loss) says how much sharper the events of the new window become when the flow moves them back to its
-    start; above 1 the flow helps."""
+    FWL (flow warp loss) says how much sharper the events become when the flow moves them back to the window's start;
+    above 1 the flow helps."""
     from blinkgl.types.events import Events
     from eflow import infer
     from eflow.choice import AUTO, BODIES, chosen
@@ -242,8 +239,8 @@ def import_(
     checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar ….")],
     out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
 ) -> None:
-    """Convert a published checkpoint of E-RAFT. The commands predict, evaluate, submit and train (init_from) read the
-    new file. Only tensors are read. The file also stores E-RAFT's padding, border and time bins."""
+    """Convert a published checkpoint of E-RAFT. Only tensors are read. The file also stores E-RAFT's padding, border
+    and time bins."""
     from eflow.models import parameters_of
     from eflow.published import import_published
 
@@ -258,8 +255,8 @@ def export(
     torchscript: Annotated[str | None, typer.Option(help="New file of TorchScript.", show_default=False)] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Sensor size; the file takes no other.")] = "640x480",
 ) -> None:
-    """Write a network as a file for programs without this package. It appears after its flow was compared with the
-    network's own, on other inputs than those of the export."""
+    """Write a network as a file for programs without this package. Its flow is compared with the network's before it
+    is written."""
     from blinkgl.io.reading import parsed_size
     from eflow.export import export as write_export
 
@@ -279,7 +276,7 @@ def export(
 def models(
     name: Annotated[str | None, typer.Argument(help="Show only this network, with its whole card.")] = None,
 ) -> None:
-    """List the trained networks that come with the package. Their names can be used in place of a checkpoint."""
+    """List the trained networks that come with the package. Their names can replace a checkpoint."""
     from eflow import shipped
 
     cards = [shipped.card_of(n) for n in ([name] if name is not None else shipped.names())]
@@ -302,10 +299,8 @@ def pack(
         typer.Option("--out", "-o", help="Parent of the new folder; networks in eflow/weights ship with the package."),
     ],
 ) -> None:
-    """Pack a checkpoint as a network that can come with the package. It has weights (5 MB at most, above it in half
-    precision) and a card.
-
-    The weights are read back before the folder appears."""
+    """Pack a checkpoint as a network that can come with the package. It has weights (5 MB at most; larger ones in half
+    precision) and a card."""
     from eflow import shipped
     from eflow.packing import pack as write_pack
 

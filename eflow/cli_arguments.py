@@ -31,10 +31,7 @@ Answer = Annotated[
 ]
 Network = Annotated[
     str,
-    typer.Argument(
-        help="Run folder, checkpoint folder, .safetensors file, or a network that comes with the package (eflow "
-        "models)."
-    ),
+    typer.Argument(help="Run folder, checkpoint folder, .safetensors file, or a shipped network (eflow models)."),
 ]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
@@ -43,13 +40,13 @@ WindowMs = Annotated[
     str | None,
     typer.Option(metavar="LOW-HIGH", help="Lengths of windows, of a recipe only. Default: its label interval."),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")]
 
 Dataset = Annotated[
     str,
     typer.Argument(
-        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences or of rendered windows, or a recipe (.yaml), "
-        "whose test groups are rendered."
+        help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences or rendered windows, or a recipe, whose test "
+        "groups are rendered."
     ),
 ]
 Protocol = Annotated[str, typer.Option(help="MVSEC: frames and rows to score: all, ste-flownet or e-raft (20 Hz).")]
@@ -58,10 +55,7 @@ Frames = Annotated[
     typer.Option("--frames", metavar="FIRST-LAST", help="MVSEC: images (or 20 Hz fields) to score; may be repeated."),
 ]
 Dense = Annotated[bool, typer.Option("--dense", help="MVSEC: score pixels without events, too.")]
-_REFINE = (
-    "Draw the flow of a network that is near its dominant affine motion towards it, then scale it to the length that "
-    "makes the events sharpest."
-)
+_REFINE = "Refine a network's flow by its dominant affine motion and by the sharpness of the events."
 Refined = Annotated[bool, typer.Option("--refine", help=_REFINE)]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
@@ -192,7 +186,7 @@ class Outputs:
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None
     npy: Annotated[bool, typer.Option("--npy", help="Also write float32 .npy files.")] = False
     at_events: Annotated[
-        bool, typer.Option("--at-events", help="Flow of pixels without events nearby is written as not valid.")
+        bool, typer.Option("--at-events", help="Write flow of pixels without events nearby as not valid.")
     ] = False
     video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None
 

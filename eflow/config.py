@@ -49,30 +49,30 @@ class _Refined(Config):
         None,
         ge=0,
         le=64,
-        description="largest number of preceding iterations without gradients, random in half of the steps and none "
-        "in the others, so that further iterations converge; null: iterations - train_iterations",
+        description="largest number of preceding iterations without gradients: random in half of the steps, none in "
+        "the others; null: iterations - train_iterations",
     )
     damping: float = Field(
         0.5,
         ge=0,
         le=1,
-        description="in evaluation, factor on the step of iteration k beyond train_iterations and burn_in, to the "
-        "power of k",
+        description="in evaluation, the step of the k-th iteration beyond train_iterations and burn_in is multiplied "
+        "by damping^k",
     )
     context_norm: Literal["batch", "instance"] = Field(
         "batch", description="norm of the context CNN; instance for batches of one or two"
     )
     correlation: Literal["auto", "dense", "on_demand"] = Field("auto", description="auto: dense below 8192 tokens")
     checkpoint_iterations: bool = Field(
-        False, description="recompute each iteration in the backward pass: less memory, ~30 % slower"
+        False, description="recompute iterations in the backward pass: less memory, ~30 % slower"
     )
     border: Literal["replicate", "zero"] = Field(
         "replicate", description="flow outside the image in the convex upsampling; zero: as E-RAFT's code"
     )
     padding: Literal["end", "start"] = Field(
         "end",
-        description="where inputs are padded: right and bottom to multiples of 8, or left and top to multiples "
-        "of 32 as E-RAFT's code",
+        description="end: right and bottom, to multiples of 8; start: left and top, to multiples of 32, as E-RAFT's "
+        "code",
     )
 
     @rule("trunk")
@@ -112,8 +112,8 @@ class EFlowFormerConfig(_Refined):
         0.5,
         gt=0,
         le=1000,
-        description="matching layer: initial standard deviation, cells of 8 px, of a learned prior for short "
-        "flow; null: none, so it starts with flow to the image centre",
+        description="matching layer: initial standard deviation, cells of 8 px, of a learned prior for short flow; "
+        "null: none",
     )
 
 
@@ -131,8 +131,7 @@ class EvFlowNetConfig(Config):
     )
     consensus: bool = Field(
         False,
-        description="adds an affine field fitted to each feature of the coarsest scale: global motion for areas "
-        "without events (not in the paper)",
+        description="adds an affine field fitted to the coarsest scale: global motion for areas without events",
     )
 
 
@@ -171,7 +170,7 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 
 
 class AugmentConfig(Config):
-    """Probabilities and strengths; the draws depend only on (seed, epoch, position)."""
+    """Probabilities and strengths."""
 
     horizontal_flip: Probability = Field(0.5, description="probability of flipping horizontally")
     vertical_flip: Probability = Field(0.1, description="probability of flipping vertically")
@@ -211,8 +210,8 @@ class SourceConfig(Config):
         None,
         gt=0,
         lt=1,
-        description="for validation, instead of a folder: this share of the training folders' sequences, which are "
-        "then not trained on; their names decide",
+        description="for validation: this share of the training folders' sequences, chosen by name, which are then "
+        "not trained on",
     )
     recipe: str | None = Field(
         None, description="YAML file of `blinkgl generate`, instead of a folder; relative to the YAML file"
@@ -227,7 +226,7 @@ class SourceConfig(Config):
         1,
         ge=1,
         le=1000,
-        description="times that each rendered sample is used, far apart and each time augmented otherwise",
+        description="times that each rendered sample is used, each time augmented differently",
     )
     window_ms: tuple[float, float] | None = Field(
         None,
@@ -239,8 +238,8 @@ class SourceConfig(Config):
         0.0,
         ge=0,
         le=1e3,
-        description="fewest events per pixel of the new window and per px of its mean flow (at least 0.3 px); below"
-        " 0.01 flow can hardly be estimated",
+        description="fewest events per pixel and per px of mean flow (at least 0.3 px); below 0.01 flow can hardly be "
+        "estimated",
     )
 
     @rule("path", "recipe", "share", "online")
@@ -277,12 +276,12 @@ class DataConfig(Config):
     validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
     leave_out: tuple[int, int] = Field(
-        (0, 0), description="[rows at the bottom, columns at the left] that are not trained on, px: a car's hood"
+        (0, 0), description="[rows at the bottom, columns at the left] that are not trained on, px"
     )
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
     workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0: load in the training process")
     empty: Literal["error", "skip"] = Field(
-        "error", description="a sample with an empty window: an error, or left out (training takes the next one)"
+        "error", description="a sample with an empty window is an error, or left out"
     )
     augment: AugmentConfig | None = Field(
         AugmentConfig(), description="random changes of the training samples; null: none"
@@ -352,8 +351,8 @@ class OptimConfig(Config):
         1,
         ge=1,
         le=4096,
-        description="parts in which a step's batch is processed, to save memory; batch norm takes its statistics "
-        "from each part, and burn_in is drawn for each",
+        description="parts in which a batch is processed, to save memory; batch norm takes its statistics from each "
+        "part",
     )
     freeze_norm: bool = Field(
         False,
@@ -363,9 +362,8 @@ class OptimConfig(Config):
         None,
         gt=0,
         le=1e6,
-        description="minutes after which training ends, resumed parts included, if before the last step; the "
-        "schedule follows whichever is nearer to its end. Such a run is not exactly repeatable. null: "
-        "only steps",
+        description="minutes after which training ends, resumed parts included, if before the last step; such a run "
+        "is not exactly repeatable. null: only steps",
     )
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
     warmup: float = Field(0.05, ge=0, lt=1, description="fraction of the training in which the rate rises")
@@ -406,8 +404,7 @@ class RunConfig(Config):
     time_limit: float | None = Field(
         None,
         gt=0,
-        description="minutes after which this call stops with a checkpoint, to be resumed (optim.minutes is the "
-        "length of the training)",
+        description="minutes after which this call stops with a checkpoint, to be resumed",
     )
 
 
@@ -421,6 +418,6 @@ class TrainConfig(Config):
     run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
     init_from: str | None = Field(
         None,
-        description="checkpoint with the initial weights (fine-tuning), or the name of a network that ships with "
-        "the package; without `model` the network is its",
+        description="checkpoint, or name of a shipped network, with the initial weights (and the network, without "
+        "`model`)",
     )

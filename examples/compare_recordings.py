@@ -1,4 +1,4 @@
-"""How alike are two recordings? One scene, seen by an ideal sensor and by a noisy one."""
+"""Two recordings compared: one scene, seen by an ideal sensor and by a noisy one."""
 
 import json
 from pathlib import Path

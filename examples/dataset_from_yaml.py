@@ -1,4 +1,4 @@
-"""A data set from a YAML file, made and checked in Python; the contrast threshold is drawn anew for every sequence."""
+"""A data set from a YAML file, made and checked in Python; the contrast threshold is drawn for every sequence."""
 
 from pathlib import Path
 

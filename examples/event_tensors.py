@@ -1,5 +1,4 @@
-"""Events as images for a network: a time surface (how long ago was the last event?) and a
-voxel grid (when, in five bins)."""
+"""Events as images for a network: a time surface and a voxel grid of five bins."""
 
 from pathlib import Path
 

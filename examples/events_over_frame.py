@@ -1,4 +1,4 @@
-"""Events over the frame they follow, as a picture: blue where it became brighter, red where it became darker."""
+"""Events drawn over the frame before them: blue where it became brighter, red where it became darker."""
 
 from pathlib import Path
 

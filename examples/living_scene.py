@@ -1,4 +1,4 @@
-"""A scene that lives: people who dance and walk, a fish, a flag and a tower that bends; their events and exact flow."""
+"""A scene that deforms: people who dance and walk, a fish, a flag and a tower that bends."""
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
-"""A network trained on what is rendered while it trains: batches in a torch DataLoader, no file
-kept. (The network is a line of convolutions; how the loop is fed is the point.)"""
+"""A network trained on samples that are rendered while it trains, in a torch DataLoader, without files."""
 
 from pathlib import Path
 

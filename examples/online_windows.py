@@ -1,5 +1,4 @@
-"""Training data without files: windows of events and the flow over each, as a sequence
-happens. One window is held at a time."""
+"""Training data without files: windows of events and the flow over each, one at a time."""
 
 from collections.abc import Iterator
 from pathlib import Path

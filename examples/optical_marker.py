@@ -1,8 +1,4 @@
-"""An optical marker: four LEDs blink at frequencies of their own, and the events say which is which.
-
-Material(emission_over_time=...) makes a surface shine over time; every edge has a frame before and after it, so its
-events have its microsecond.
-"""
+"""An optical marker: four LEDs blink, each at its own frequency, by which the events tell them apart."""
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
-"""A label of your own: where in the world each pixel's surface is, from the shader into the
-data set; and a map drawn from it."""
+"""A label of your own: where in the world each pixel's surface is; and a map drawn from it."""
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
-"""A trajectory of your own: the camera circles a column on key frames from a formula; the
-flow follows from the geometry."""
+"""A trajectory of your own: the camera circles a column on key frames from a formula."""
 
 from pathlib import Path
 

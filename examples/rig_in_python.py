@@ -1,5 +1,5 @@
-"""A rig in Python: a stereo pair of event cameras, a fisheye frame camera and an inertial unit that fly together; depth
-out of the disparity, and the unit's gyroscope against the flight."""
+"""A rig in Python: a stereo pair of event cameras, a fisheye frame camera and an inertial unit; disparity and gyroscope
+are compared with depth and poses."""
 
 from pathlib import Path
 

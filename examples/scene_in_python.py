@@ -1,4 +1,4 @@
-"""A scene in Python: bodies, materials, a light and a moving camera; its events and its flow as arrays."""
+"""A scene in Python: bodies, materials, a light and a moving camera; events and flow as arrays."""
 
 from pathlib import Path
 

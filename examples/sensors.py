@@ -1,4 +1,4 @@
-"""The same scene before five event cameras: what their data sheets say, and how many events come of it."""
+"""The same scene before five event cameras: their thresholds, dead times and numbers of events."""
 
 import json
 from pathlib import Path

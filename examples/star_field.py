@@ -1,7 +1,4 @@
-"""A star tracker's view: stars of several magnitudes drift over the picture of a camera that turns.
-
-A star is a point of light: its emission, by the square of its distance in focal lengths, is the light of its pixels.
-"""
+"""Stars of several magnitudes, as points of light, before a camera that turns."""
 
 from pathlib import Path
 

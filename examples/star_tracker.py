@@ -1,7 +1,6 @@
-"""A star tracker's view from a catalogue: stars of a CSV file behind a lens's point spread, at a known attitude.
+"""A star tracker's view: stars of a CSV catalogue behind a lens's point spread, at a known attitude.
 
-The catalogue has right ascension and declination in degrees, and magnitudes; a star behind the camera is not seen. The
-mean place of a star's events is its place on the sensor, which a tracker measures.
+The mean position of a star's events is its position on the sensor, which a tracker measures.
 """
 
 import csv

@@ -1,5 +1,5 @@
-"""Events behind a renderer of your own: torch draws a moving texture for eight environments, each at its own speed, and
-TensorEsim makes the events of all of them in one call, on the device that the frames lie on."""
+"""Events of a renderer in torch: a moving texture in eight environments, each at its own speed. TensorEsim makes the
+events of all in one call, on the device of the frames."""
 
 from pathlib import Path
 

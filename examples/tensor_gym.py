@@ -1,5 +1,4 @@
-"""A gymnasium-style environment whose observation is a voxel grid: a target moves, the agent turns to keep it in view.
-Four environments step together; each begins anew when it has lost its target."""
+"""A gymnasium-style environment whose observation is a voxel grid: the agent turns to keep a moving target in view."""
 
 from pathlib import Path
 

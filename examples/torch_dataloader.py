@@ -1,4 +1,4 @@
-"""A generated data set in a torch DataLoader: voxel grids of the events before and after each label, and the flow."""
+"""A data set in a torch DataLoader: voxel grids of the events before and after each label, and the flow."""
 
 from pathlib import Path
 

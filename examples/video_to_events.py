@@ -1,4 +1,4 @@
-"""Any video to events: a video is made on the spot, then turned into an event file as a DAVIS346 would have seen it."""
+"""Video to events, with the sensor file of a DAVIS346."""
 
 from pathlib import Path
 

@@ -30,17 +30,15 @@ HEADER = """# Every key of the YAML
 Made from the configuration models by `python -m blinkgl.tools.config_docs`; do not edit.
 
 A key that is left out has its default, a table without `kind` (or `emulator`) is of the default kind. `null` as a
-default may also be written; where the row does not explain it, it means none. A range of two numbers may
-be a single number.
+default means none, where the row does not explain it. A range of two numbers may be a single number.
 
 In place of a value, a distribution may stand, which is drawn once per sequence: `{uniform: [a, b]}`,
 `{log_uniform: [a, b]}`, `{normal: [mean, deviation, lowest, highest]}`, `{integer: [a, b]}` (both ends included),
-`{choice: [x, y, …]}`, `{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (any ten sequences in a row
-have eight, give or take a few). Every sequence's `config.yaml` records what was drawn. All choices and both ends of
-all ranges are checked when the file is read. `seed`, `output` and `gl` belong to the run and cannot be drawn.
+`{choice: [x, y, …]}`, `{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (of ten consecutive
+sequences about eight). `seed`, `output` and `gl` cannot be drawn.
 
-`groups: {name: {…}}` at the top level makes several groups of sequences. Each has the keys of the top level with its
-own over them; `enabled: false` leaves one out (`configs/blinkflow.yaml`).
+`groups: {name: {…}}` at the top level makes groups of sequences. Each has the keys of the top level with its own over
+them; `enabled: false` leaves one out (`configs/blinkflow.yaml`).
 """
 
 
@@ -48,9 +46,9 @@ EFLOW_HEADER = """# Every key of eflow's YAML
 
 Made from the configuration models by `python -m blinkgl.tools.config_docs eflow`; do not edit.
 
-`eflow train CONFIG` reads these keys; `--set a.b=c` overrides them. A key that is left out has its default; an unknown
-key is refused with the nearest known one. `null` as a default may also be written; where the row does not explain it,
-it means none. Paths start from the YAML file's folder. Examples: `configs/eflow/`.
+`eflow train CONFIG` reads these keys; `--set a.b=c` overrides them. A key that is left out has its default; `null` as
+a default means none, where the row does not explain it. Paths start from the YAML file's folder. Examples:
+`configs/eflow/`.
 """
 
 
@@ -64,9 +62,8 @@ def _primitives() -> str:
     lines = [
         "\n## Primitives\n\n",
         (
-            "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, "
-            "parameters: {radius: 0.2, height: 2}}`. Their axis is z, their centre the origin; sizes are in world "
-            "units (m), before the object's `scale`.\n\n"
+            "`scene.meshes.<name>`, for example `{primitive: cylinder, parameters: {radius: 0.2, height: 2}}`. Their "
+            "axis is z, their centre the origin; sizes are in world units (m), before the object's `scale`.\n\n"
         ),
         "|kind|parameters and defaults|what it is|\n|---|---|---|\n",
     ]

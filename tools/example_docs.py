@@ -70,15 +70,14 @@ ORDER = (
 
 HEADER = """# Examples
 
-Each is a program in `examples/`, with what it prints, and ends with a check (`test_final`) that the tests run. Copy one
-and change it:
+Each is a program in `examples/`, with its output and a check (`test_final`) that the tests run. Copy one and change it:
 
 ```
 python examples/scene_in_python.py        # writes below out/examples/
 ```
 
-This page is made by `python -m blinkgl.tools.example_docs`; do not edit. `examples/demo.ipynb` is a notebook that walks
-through the demo; `examples/flow.ipynb` lets a network estimate how things move.
+This page is made by `python -m blinkgl.tools.example_docs`; do not edit. `examples/demo.ipynb` and
+`examples/flow.ipynb` (a network estimates flow) are notebooks.
 """
 
 

@@ -59,8 +59,8 @@ class CameraConfig(Config):
     )
     calibration: str | None = Field(
         None,
-        description="file of Kalibr, DSEC, EuRoC, OpenCV, ROS, COLMAP or Metavision; its size, lens, "
-        "distortion, fx, fy, cx and cy replace this key when the run is read",
+        description="file of Kalibr, DSEC, EuRoC, OpenCV, ROS, COLMAP or Metavision, with size, lens, distortion, fx, "
+        "fy, cx and cy",
     )
     calibration_name: str | None = Field(
         None, description="which camera of the calibration; default: its only one, or cam0"

@@ -78,8 +78,7 @@ class WaveConfig(_Waving):
 
 
 class FlagConfig(_Waving):
-    """Cloth in wind, held at one end: the motion grows with the distance from that end, and a second, shorter wave
-    crosses it."""
+    """Cloth in wind, held at one end: the motion grows with the distance from it; a shorter wave crosses it."""
 
     kind: Literal["flag"] = "flag"
     along: Axis = Field("x", description="axis between the held end and the free one, of the object at rest")
@@ -150,8 +149,7 @@ class BreatheConfig(DeformConfig):
         Annotated[float, Field(ge=-0.9, le=0.9)],
     ] = Field(
         (0.1, 0.1, 0.1),
-        description="as fractions of the size along x, y, z; a negative one shrinks while the others grow (a "
-        "jellyfish)",
+        description="as fractions of the size along x, y, z; a negative one shrinks while the others grow",
     )
     period: Period = 1.5
     phase: Phase = 0.0
@@ -168,14 +166,11 @@ class AnimationConfig(Config):
     clip: str | int = Field(0, description="name or index of the animation")
     file: str | None = Field(
         None,
-        description="another gltf or glb file with the clip, whose joints have the same names; null: the mesh's "
-        "own file",
+        description="another file with the clip, for joints of the same names; null: the mesh's own",
     )
     speed: float = Field(1.0, ge=-100, le=100, description="factor on the clip's speed; negative: backwards")
     phase: float = Field(0.0, ge=-1e6, le=1e6, description="time within the clip at time 0, s")
-    loop: bool = Field(
-        True, description="true: repeats; false: holds the first pose before it and the last pose after it"
-    )
+    loop: bool = Field(True, description="false: holds the first pose before it, the last after it")
 
     former: ClassVar[dict[str, Former]] = {
         "blend": Former("one clip; mix two in Blender and export the mixture", lambda value: value is None),

@@ -22,28 +22,26 @@ _MAX_EVENTS = Field(
     2**25,
     ge=1_000,
     le=2**31 - 1,
-    description="Most events of one step, divided equally among blocks of 1024 pixels (each may emit at least one "
-    "per pixel). Beyond it, every pixel of a block is cut to the same number; the manifest counts the "
-    "events that are cut. Sorting 2^25 events needs about 1 GB.",
+    description="Most events of one step, divided equally among blocks of 1024 pixels (at least one per pixel). "
+    "Beyond it, every pixel of a block is cut to the same number; the manifest counts them. Sorting 2^25 events needs "
+    "about 1 GB.",
 )
 _CAUSES = Field(
     False,
-    description="Mark every event with its cause (`cause` in the files): 0 signal, 1 leak, 2 shot noise, 3 hot "
-    "pixel. The events are the same.",
+    description="Mark every event with its cause: 0 signal, 1 leak, 2 shot noise, 3 hot pixel.",
 )
 Device = Literal["auto", "cpu", "cuda"]
 _DEVICE: Any = Field(
     "auto",
-    description="Where events are computed, with the same result: `cpu`, compiled loops; `cuda`, torch on a GPU "
-    "(docs/simulators.md); `auto`: `cuda` where a GPU renders the frames, torch can use it and a short "
-    "trial gives the same events, else `cpu`.",
+    description="Where events are computed, with the same result: `cpu`, compiled loops; `cuda`, torch on a GPU; "
+    "`auto`: docs/simulators.md.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
 _THRESHOLD_MAP: str | None = Field(
     None,
-    description="Measured thresholds of each pixel, ln units from 0.001 to 10: a .npy file of floats of the camera's "
-    "size, (H, W), or (2, H, W) with C+ and C-; a relative path starts from the YAML file. `threshold_sigma` is then "
-    "not used; `contrast_threshold` stays the nominal threshold, to which noise and `timeline: brightness` refer.",
+    description="Measured thresholds of each pixel, ln units from 0.001 to 10: a .npy file of floats, (H, W), or (2, "
+    "H, W) with C+ and C-, instead of `threshold_sigma`. `contrast_threshold` stays the nominal threshold, to which "
+    "noise and `timeline: brightness` refer.",
 )
 
 
@@ -224,8 +222,8 @@ class EsimConfig(_TwoThresholds):
         0.021,
         ge=0,
         le=5,
-        description="Standard deviation of C+ and C- over the pixels, ln units (rpg_esim: 0.021); each threshold "
-        "stays >= 0.01 (or >= half of a smaller nominal one). Default: 10.5 % of contrast_threshold.",
+        description="Standard deviation of C+ and C- over the pixels, ln units; each threshold stays >= 0.01 (or >= "
+        "half of a smaller nominal one). Default: 10.5 % of contrast_threshold.",
     )
     threshold_map: str | None = _THRESHOLD_MAP
     threshold_jitter: float = Field(
@@ -238,15 +236,13 @@ class EsimConfig(_TwoThresholds):
         1e-3,
         ge=1e-9,
         le=1e6,
-        description="Added to the intensity before the logarithm, in units of the intensity (rpg_esim: 1e-3 for "
-        "intensities in [0, 1]).",
+        description="Added to the intensity before the logarithm.",
     )
     refractory_us: float = Field(
         0.0,
         ge=0,
         le=1e9,
-        description="Dead time of a pixel after an event, microseconds; a level crossed during it is lost, as in "
-        "rpg_esim.",
+        description="Dead time after an event, microseconds; a level crossed during it is lost.",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
@@ -319,7 +315,7 @@ class V2eConfig(_TwoThresholds):
         255.0,
         gt=0,
         le=1e9,
-        description="Digital number of luminance 1.0; v2e's lin-log limit (20) and its 275 refer to 8-bit values.",
+        description="Digital number of luminance 1.0; v2e's constants refer to 8-bit values.",
     )
     cutoff_hz: float = Field(
         300.0,
@@ -332,7 +328,7 @@ class V2eConfig(_TwoThresholds):
         0.1,
         ge=0,
         le=1,
-        description="Relative standard deviation of the interval between two leak events of a pixel.",
+        description="Relative standard deviation of the interval between leak events.",
     )
     leak_cov_decades: float = Field(
         0.1,
@@ -349,16 +345,14 @@ class V2eConfig(_TwoThresholds):
     )
     photoreceptor_noise: bool = Field(
         False,
-        description="Make noise events, at the rate shot_noise_rate_hz, by low-pass filtered noise before the "
-        "comparator; needs cutoff_hz > 0.",
+        description="Shot noise from low-passed noise before the comparator, at the same rate; needs cutoff_hz > 0.",
     )
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds.")
     start: Literal["stationary", "balanced", "zero"] = Field(
         "stationary",
-        description="State of the pixels between their levels at the first frame. `stationary`: as after a long "
-        "time before a still scene, in which leak moves pixels towards ON, so that short clips have "
-        "more ON events. `balanced`: as after a signal that rose as often as it fell. `zero`: every "
-        "pixel has just fired, as in v2e.",
+        description="Pixels at the first frame. `stationary`: as after a long time before a still scene, in which "
+        "leak moves pixels towards ON, so that short clips have more ON events. `balanced`: as after a signal that "
+        "rose as often as it fell. `zero`: every pixel has just fired, as in v2e.",
     )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Fraction of pixels that fire without a signal.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
@@ -420,8 +414,8 @@ class VoltmeterConfig(EmulatorConfig):
     )
     start: Literal["stationary", "zero"] = Field(
         "stationary",
-        description="V at the first frame: as after a long time before a still scene, or 0 everywhere, as in the "
-        "authors' program.",
+        description="V at the first frame: as after a long time before a still scene, or 0, as in the authors' "
+        "program.",
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES

@@ -17,31 +17,29 @@ MAX_SPAN_S = (2**32 - 1) * 1e-6
 
 
 class FramesConfig(Config):
-    """Folders of frames as input of the event emulator; a flow file per pair of frames becomes the label."""
+    """Folders of frames with flow (docs/video.md)."""
 
     folders: Paths = Field(
         (),
-        description="folders of one sequence each, or patterns such as `/data/tartanair/*/*/P0*`; sequence n "
-        "uses the n-th in alphabetical order",
+        description="folders of one sequence each, or patterns; sequence n uses the n-th in alphabetical order",
     )
     images: str = Field("image_left", description="sub-folder of the images, or '.'")
     flow: str | None = Field(
         "flow",
-        description="sub-folder of the optical flow, one file per pair of frames in their order: .npy "
-        "(H, W, 2 or 3), .flo, .png, .pfm or .flo5; `{0}` is the folder's name, `{1}` its parent's …; null: none",
+        description="sub-folder of the flow, a file per pair of frames: .npy (H, W, 2 or 3), .flo, .png, .pfm or "
+        ".flo5; `{0}` is the folder's name, `{1}` its parent's …; null: none",
     )
     flow_format: str = Field(
         "auto",
-        description="of the flow files: dsec, kitti, vkitti2, tartanair2, flo, pfm, flo5, npy; auto: by ending, and "
-        "16-bit PNGs by their values",
+        description="dsec, kitti, vkitti2, tartanair2, flo, pfm, flo5, npy; auto: by ending, and 16-bit PNGs by values",
     )
     flow_direction: Literal["auto", "forward", "backward"] = Field(
         "auto",
-        description="forward: each flow file leads to the next frame, backward: to the one before, as "
-        "`labels.flow: [backward]`; auto: backward where the names say so",
+        description="forward: flow to the next frame; backward: to the one before; auto: backward where the names say "
+        "so",
     )
     check_flow: bool = Field(
-        True, description="refuse flow that explains its images worse than its double, its half, its negative or none"
+        True, description="refuse flow that explains the images worse than its double, half or negative, or none"
     )
     fps: float = Field(
         10.0,
@@ -53,15 +51,15 @@ class FramesConfig(Config):
     count: int | None = Field(None, ge=3, description="frames used; null: all")
     gamma: str | float | None = Field(
         None,
-        description="transfer curve of the images: srgb, linear, pq, hlg or an exponent; null: what the files state, "
-        "else srgb for integers and linear for floats",
+        description="transfer curve: srgb, linear, pq, hlg or an exponent; null: what the files state, else srgb for "
+        "integers, linear for floats",
     )
     white_level: float | None = Field(
         None,
         gt=0,
         le=1e9,
-        description="code of white, 4095 of 12 bits in 16; null: what the files state, else "
-        "the type's; asked for where 16-bit codes leave the upper two bits empty",
+        description="code of white, such as 4095 of 12 bits; null: what the files state, else the type's; required "
+        "where 16-bit codes leave the upper two bits empty",
     )
     range: Literal["full", "limited"] | None = Field(
         None, description="of the codes: limited is 16 to 235 of 8 bits; null: full"
@@ -72,8 +70,7 @@ class FramesConfig(Config):
     max_px: float = Field(1.0, gt=0, le=1e3, description="for motion: largest displacement per step, px")
     keep_noise: bool = Field(
         False,
-        description="make events of the images' noise, too; otherwise the noise is estimated, and changes that it "
-        "explains cause no events",
+        description="make events of the images' noise, too (docs/video.md)",
     )
     max_displacement: float | None = Field(
         17.0,

@@ -27,14 +27,12 @@ class LensConfig(Config):
 
 
 class AutoExposureConfig(Config):
-    """Exposure and gain follow the light, one image late and with a lag. The time changes first, then the gain."""
+    """Exposure time and then gain follow the light, one image late and with a lag."""
 
     target: float = Field(
         0.18, gt=0, lt=1, description="mean of the image that it aims at, linear; 1 is the largest code"
     )
-    lag: float = Field(
-        0.2, ge=0, le=1e4, description="time constant, s, after which 63 % of a change is done; 0: immediate"
-    )
+    lag: float = Field(0.2, ge=0, le=1e4, description="time constant, s; 0: immediate")
     shortest_us: ClassVar[float] = 20.0
     """Shortest exposure, µs."""
     former: ClassVar[dict[str, Former]] = {"shortest_us": always(shortest_us)}
@@ -43,8 +41,8 @@ class AutoExposureConfig(Config):
 
 
 class ImagesConfig(Config):
-    """A frame camera that shares the event camera's pixels: images with exposure, shutter, lens and noise, at their own
-    times. It sets `labels.images` to false unless that is given."""
+    """A frame camera in the event camera's pixels (docs/cameras.md). It sets `labels.images` to false unless that is
+    given."""
 
     presets: ClassVar[dict[str, Tree]] = {
         "plain": {},
@@ -78,7 +76,7 @@ class ImagesConfig(Config):
 
     preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
         "plain",
-        description="values of the other keys (docs/cameras.md); keys beside it override it",
+        description="values of the other keys; keys beside it override it",
     )
     rate: float | None = Field(
         30.0,
@@ -100,7 +98,7 @@ class ImagesConfig(Config):
         0.5,
         gt=0,
         le=1e3,
-        description="an image is the mean of enough instants that nothing moves farther than this between two, px",
+        description="largest motion between two instants of an exposure, px",
     )
     max_instants: int = Field(256, ge=1, le=65536, description="largest number of instants per image")
     white: float = Field(
@@ -123,7 +121,7 @@ class ImagesConfig(Config):
     gamma: float = Field(2.2, ge=0.1, le=10, description="for `response: gamma`: code = light ^ (1 / gamma)")
     bayer: Bayer | None = Field(
         None,
-        description="one colour per pixel in this pattern (row by row from the top left): one channel, as read out",
+        description="one colour per pixel in this pattern, from the top left: one channel",
     )
     vignetting: float = Field(
         0.0,
@@ -135,8 +133,8 @@ class ImagesConfig(Config):
     auto_exposure: AutoExposureConfig | None = Field(None, description="null: constant exposure and gain")
     also: tuple[Literal["sharp", "clean"], ...] = Field(
         (),
-        description="further pictures of each image. sharp: an instant in the middle of the exposure, no noise; "
-        "clean: the same image without noise",
+        description="further pictures. sharp: an instant in the middle of the exposure, no noise; clean: the image "
+        "without noise",
     )
 
     @model_validator(mode="before")

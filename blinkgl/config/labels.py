@@ -60,7 +60,7 @@ def _a_table(value: object) -> object:
 
 
 class LabelsConfig(Config, extra="allow"):
-    """Ground truth at label times. A pass that no label needs is not compiled, allocated or run."""
+    """Ground truth at label times."""
 
     settings: ClassVar[Any] = ("events", "pixels", "flow", "float_flow", "occlusion")
     """Keys that do not name a label."""
@@ -83,13 +83,13 @@ class LabelsConfig(Config, extra="allow"):
 
     events: bool = Field(
         False,
-        description="source of each event: instance, depth and image velocity of the surface, the light that changed, "
-        "and the cause (sets `events.causes` unless it is given), in event_labels.h5; docs/labels.md",
+        description="what made each event, in event_labels.h5 (docs/labels.md); sets `events.causes` unless it is "
+        "given",
     )
     pixels: Literal["sensor", "rectified"] = Field(
         "sensor",
-        description="for a lens with distortion: labels and tracks use the sensor's pixels, as events do, or those "
-        "of the rectified image (docs/cameras.md)",
+        description="of labels and tracks behind a lens: the sensor's, as of events, or those of the rectified image "
+        "(docs/cameras.md)",
     )
     images: bool = Field(True, description="sRGB PNG of the colour pass")
     flow: Annotated[
@@ -98,12 +98,11 @@ class LabelsConfig(Config, extra="allow"):
     ] = Field(
         ("forward",),
         max_length=1000,
-        description="optical flow: forward to the next label and backward to the previous one, DSEC 16-bit PNG; "
-        "numbers are other intervals, s, from each label's time (`0.01`, `1/30`; negative: "
-        "backward), float32 .h5 (docs/labels.md)",
+        description="forward to the next label and backward to the previous one, DSEC 16-bit PNG; numbers: other "
+        "intervals, s (docs/labels.md)",
     )
     float_flow: tuple[Literal["npy", "flo"], ...] = Field((), description="float32 flow in addition to the PNG")
-    occlusion: bool = Field(True, description="masks of pixels that are not visible at the other end of the flow")
+    occlusion: bool = Field(True, description="pixels that are not visible at the other end of the flow")
     depth: bool = Field(False, description="float32 .npy, world units along the optical axis")
     disparity: bool = Field(
         False,
@@ -118,14 +117,11 @@ class LabelsConfig(Config, extra="allow"):
     )
     semantics: Annotated[bool | dict[str, int], BeforeValidator(_a_table)] = Field(
         False,
-        description='category of each pixel, 16-bit PNG. Table: patterns such as `{"wall-*": 1, "chair*": 7, "*": '
-        "0}`; the first that matches an object's name, mesh or category counts. true: by kind of shape "
-        "(docs/labels.md)",
+        description="category of each pixel, 16-bit PNG: true, or a table of patterns (docs/labels.md)",
     )
     boxes: bool = Field(
         False,
-        description="bounding boxes of objects, in the image (visible, whole) and in 3-D, .npz and KITTI's text "
-        "(docs/labels.md)",
+        description="boxes of objects, in the image and in 3-D, .npz and KITTI's text (docs/labels.md)",
     )
 
 

@@ -49,8 +49,8 @@ class _PlacedLampConfig(_LampConfig):
     )
     reach: Positive | None = Field(
         None,
-        description="distance, m, at which it has faded to zero, by 1 - (distance / reach)^4; null: it falls "
-        "only with the square of the distance",
+        description="distance, m, at which it has faded to zero, by the factor 1 - (distance / reach)^4; null: no "
+        "limit",
     )
 
     @rule("position", "?motion")
@@ -86,12 +86,12 @@ LampConfig = one_of("kind", SunLampConfig, PointLampConfig, SpotLampConfig)
 
 
 class EnvironmentConfig(Config):
-    """A panorama that lights a scene instead of light.sun and light.sky, and is seen as its sky."""
+    """A panorama that lights a scene and is its sky."""
 
-    map: str = Field(description="equirectangular image: hdr or exr; an 8-bit image has no bright sun")
+    map: str = Field(description="equirectangular image, hdr or exr; an 8-bit one has no bright sun")
     strength: Radiance = Field(
         1.0,
-        description="factor on its radiance, which is scaled so that 90 % of its solid angle is darker than 0.8",
+        description="factor on its radiance (scaled so that 90 % of the solid angle is darker than 0.8)",
     )
     heading: float = Field(0.0, ge=-360, le=360, description="rotation, degrees from +x towards +y")
     visible: bool = Field(True, description="whether it is drawn as a sky at infinity")
@@ -101,14 +101,13 @@ class EnvironmentConfig(Config):
 
 
 class LightConfig(Config):
-    """A sun and a sky, white by default: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and further lights."""
+    """A sun and a sky, E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and further lights."""
 
     sun: float = Field(0.6, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.4, ge=0, le=1e9, description="strength of the sky")
     over_time: WaveformConfig | None = Field(
         None,
-        description="factor over time on the sun, the sky or the environment: sine, pwm, code or keys (docs/light.md); "
-        "null: constant",
+        description="factor over time on sun, sky or environment (docs/light.md)",
     )
     sun_elevation: float | None = Field(
         None,
@@ -125,12 +124,12 @@ class LightConfig(Config):
     lights: tuple[LampConfig, ...] = Field((), description="further suns, point and spot lights, in world coordinates")
     environment: EnvironmentConfig | None = Field(
         None,
-        description="a panorama that lights the scene; null: the sun and the sky. In random worlds use sky.lights",
+        description="a panorama that lights the scene instead of sun and sky; in random worlds use sky.lights",
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
-        description="of objects and walls, from at most four suns and spot lights (soft: two); hard: edges a texel "
-        "of the shadow map wide; soft: wider for larger lights, up to 48 texels",
+        description="hard: edges one texel wide, of at most four suns and spot lights; soft: wider for larger lights, "
+        "up to 48 texels, of two",
     )
     shadow_size: int = Field(1024, ge=64, le=8192, description="side of each shadow map, texels")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
@@ -166,14 +165,12 @@ class RandomLightsConfig(Config):
     """Further lights of a random world, each at a random position in the region, above the ground."""
 
     count: tuple[Annotated[int, Field(ge=0, le=MAX_LIGHTS)], Annotated[int, Field(ge=0, le=MAX_LIGHTS)]] = Field(
-        (1, 3), description="[fewest, most] lights; all numbers equally likely"
+        (1, 3), description="[fewest, most]; uniform"
     )
     kinds: Annotated[tuple[Literal["sun", "point", "spot"], ...], Field(min_length=1)] = Field(
         ("point", "spot"), description="kinds that are drawn, equally likely"
     )
-    strength: PositiveRange = Field(
-        (3.0, 30.0), description="strength of point and spot lights, see light.lights; log-uniform"
-    )
+    strength: PositiveRange = Field((3.0, 30.0), description="of point and spot lights; log-uniform")
     sun_strength: ClassVar[tuple[float, float]] = (0.1, 0.6)
     """Strength of further suns; log-uniform."""
     saturation: ClassVar[float] = 0.5
@@ -196,9 +193,7 @@ class RandomLightsConfig(Config):
 class FogConfig(Config):
     """A medium that absorbs light and adds its own, for event frames and images."""
 
-    density: float = Field(
-        gt=0, le=1e6, description="density per world unit: 37 % of the light is left after 1 / density"
-    )
+    density: float = Field(gt=0, le=1e6, description="per world unit: 37 % of the light is left after 1 / density")
     radiance: Radiance = Field(0.7, description="linear radiance of the fog itself, which replaces the background")
 
 

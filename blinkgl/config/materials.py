@@ -32,8 +32,7 @@ class MaterialConfig(Config):
     unlit: bool = Field(False, description="radiance = albedo, independent of light")
     both_sides: bool | None = Field(
         None,
-        description="draw faces from behind, too, with the normal reversed; null: as the mesh's file says, or unless "
-        "the primitive is closed",
+        description="draw faces from behind, too; null: as the mesh's file says, or unless the primitive is closed",
     )
     metallic: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="fraction that is metal")
     roughness: Annotated[float, Field(ge=0, le=1)] = Field(
@@ -41,19 +40,18 @@ class MaterialConfig(Config):
     )
     metallic_roughness_map: str | None = Field(
         None,
-        description="linear image file, as in glTF: its blue channel times metallic, its green channel times roughness",
+        description="linear image file, as in glTF: blue times metallic, green times roughness",
     )
     normal_map: str | None = Field(None, description="image file of normals, as in glTF: x right, y up, z outwards")
     normal_scale: Annotated[float, Field(ge=-100, le=100)] = Field(
-        1.0, description="factor on x and y of the normal map; to flip y alone, invert it in the image"
+        1.0, description="factor on x and y of the normal map"
     )
     emission: tuple[Radiance, Radiance, Radiance] = Field((0.0, 0.0, 0.0), description="emitted radiance, linear")
     emission_map: str | None = Field(None, description="image file, sRGB, times emission")
     emission_over_time: WaveformConfig | None = OVER_TIME
     mask: str | None = Field(
         None,
-        description="image file: the surface has holes where its opacity (its grey value if it has none) is "
-        "below cutoff",
+        description="image file: holes where its opacity (or grey value) is below cutoff",
     )
     cutoff: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="threshold of the mask; 1 is white or opaque")
 

@@ -35,7 +35,7 @@ class KernelPsfConfig(Config):
 
     kind: Literal["kernel"]
     weights: Annotated[tuple[_Row, ...], Field(min_length=1, max_length=MOST_TAPS)] = Field(
-        description="rows of the picture of a point, odd numbers of rows and columns that sum to 1"
+        description="rows of the picture of a point: odd numbers of rows and columns, sum 1"
     )
 
     @rule("weights")
@@ -62,15 +62,13 @@ PsfConfig = one_of("kind", GaussianPsfConfig, AiryPsfConfig, KernelPsfConfig)
 
 
 class OpticsConfig(Config):
-    """Between the scene and the pixels of the event camera; what is left out costs nothing."""
+    """Between the scene and the pixels of the event camera."""
 
     psf: PsfConfig | None = Field(
         None, description="point spread of the lens: gaussian, airy or kernel; null: a point stays one"
     )
     lens: LensConfig | None = Field(None, description="defocus by a thin lens; null: everything is in focus")
-    lens_points: int = Field(
-        16, ge=4, le=1024, description="points of the lens that are drawn for each event frame, each at a frame's cost"
-    )
+    lens_points: int = Field(16, ge=4, le=1024, description="points of the lens per event frame; each costs a frame")
     bayer: Bayer | None = Field(None, description="one colour per pixel in this pattern, as of the colour DAVIS")
 
     @rule("?psf", "?lens", "?bayer")

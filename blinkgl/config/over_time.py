@@ -18,8 +18,7 @@ _NOISE = dict(ge=0, le=1e3)
 
 
 class ImuConfig(Config):
-    """An inertial unit fixed to the camera. World units are metres. Noise densities are those of Kalibr's imu.yaml: of
-    continuous time, independent of the rate."""
+    """An inertial unit on the camera (docs/labels.md). World units are metres; noise densities are Kalibr's."""
 
     presets: ClassVar[dict[str, Tree]] = {
         "ideal": {},
@@ -33,7 +32,7 @@ class ImuConfig(Config):
 
     preset: Literal["ideal", "adis16448"] = Field(
         "ideal",
-        description="noise values: ideal: none; adis16448: EuRoC's; keys beside it override them",
+        description="noise. ideal: none; adis16448: EuRoC's; keys beside it override it",
     )
     rate: float = Field(200.0, gt=0, le=1000, description="measurements per second, Hz, from the sequence's start")
     position: _Vector = Field((0.0, 0.0, 0.0), description="m, in the camera's axes: x right, y down, z forward")
@@ -90,13 +89,13 @@ MAX_POSITIONS = 50_000_000
 
 
 class TracksConfig(Config):
-    """Points on surfaces that are followed: image position, world position and visibility of each, in tracks.npz."""
+    """Points on surfaces that are followed, in tracks.npz (docs/labels.md)."""
 
     points: int = Field(256, ge=1, le=1_000_000, description="largest number of points")
     choose: Literal["grid", "surface"] = Field(
         "grid",
-        description="grid: what a regular grid of pixels shows at the first time; surface: points drawn uniformly "
-        "on surfaces, if visible at some time",
+        description="grid: what a regular grid of pixels shows at the first time; surface: points drawn evenly on "
+        "surfaces",
     )
     rate: float | None = Field(
         None,

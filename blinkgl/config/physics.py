@@ -42,21 +42,20 @@ class PhysicsConfig(Config):
         20_000.0,
         ge=1000,
         le=1e6,
-        description="steps of the physics engine per second, Hz; computing time is proportional to it. An impact "
-        "lasts 1.6 ms, but at least 16 steps; a body at 5 m/s sinks in by 2.5 mm",
+        description="steps per second, Hz; computing time is proportional to it. An impact lasts 1.6 ms, but at least "
+        "16 steps; a body at 5 m/s sinks in by 2.5 mm",
     )
     max_speed: float = Field(
         200.0,
         gt=0,
         le=1e4,
-        description="m/s; a faster body means that the simulation diverged, and ends the sequence with an error",
+        description="m/s; a faster body is an error",
     )
 
 
 class RandomPhysicsConfig(PhysicsConfig):
-    """Physics of a random world: a fraction of the objects falls from where it was placed, or is thrown. They collide
-    with the ground, each other, objects on trajectories and the camera's clearance. Invisible walls keep them in the
-    region."""
+    """A fraction of a random world's objects falls or is thrown. They collide with the ground, each other, objects on
+    trajectories and the camera's clearance. Invisible walls keep them in the region."""
 
     max_speed: float = Field(50.0, gt=0, le=1e4, description="m/s; an object that becomes faster is left out")
     share: float = Field(
@@ -74,21 +73,18 @@ class RandomPhysicsConfig(PhysicsConfig):
 
 
 class BodyConfig(Config):
-    """Physics of one object (docs/scenes.md). An object without this table is an obstacle, and the friction and
-    restitution of the body that meets it count."""
+    """Physics of one object (docs/scenes.md). One without this table is an obstacle, with the friction and
+    restitution of the body that meets it."""
 
     kind: Literal["dynamic", "fixed", "none"] = Field(
         "dynamic",
-        description="dynamic: falls and is pushed; fixed: stays in place, or on its key frames, whatever hits "
-        "it; none: does not collide",
+        description="fixed: stays in place, or on its key frames; none: does not collide",
     )
     mass: float | None = Field(None, gt=0, le=1e12, description="kg; null: from the density")
     density: _Density = Field(700.0, description="kg/m³ (wood)")
     friction: _Friction = Field(0.5, description="coefficient of Coulomb friction")
     rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, as a fraction of the body's radius")
-    restitution: _Restitution = Field(
-        0.5, description="speed after an impact on a fixed surface divided by the speed before it"
-    )
+    restitution: _Restitution = Field(0.5, description="speed after an impact divided by the speed before it")
     velocity: tuple[_Velocity, _Velocity, _Velocity] = Field(
         (0.0, 0.0, 0.0), description="velocity of the centre of mass at the start, m/s"
     )

@@ -67,7 +67,7 @@ class PoseConfig(Config):
     )
     euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
     look_at: Position | None = Field(
-        None, description="point towards which the camera's z axis, or an object's x axis, is turned"
+        None, description="point at which the camera's z axis, or an object's x axis, points"
     )
 
     _one_orientation = at_most_one("quaternion", "euler", "look_at")
@@ -83,22 +83,22 @@ class KeyframeConfig(PoseConfig):
     """A pose at a time."""
 
     time: float = Field(
-        ge=-1e7, le=1e7, description="s on the sequence's clock (the first label is at time.start + 1 / label_rate)"
+        ge=-1e7, le=1e7, description="s on the sequence's clock (first label: time.start + 1 / label_rate)"
     )
 
 
 class TrajectoryConfig(Config):
-    """Poses from a file, connected by a C2 spline. They are T_world_body: of a camera with OpenCV's axes, of an object
-    with its own. The file must cover the sequence."""
+    """Poses from a file, connected by a C2 spline: T_world_body, of a camera with OpenCV's axes. The file must cover
+    the sequence (docs/labels.md)."""
 
     file: str = Field(description="a table of poses (TUM, EuRoC, ESIM …), KITTI's, COLMAP's images.txt, NeRF's JSON")
     form: Literal["auto", "tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf"] = Field(
-        "auto", description="auto: by the heading, else by a layout that is known by name, which is logged"
+        "auto", description="auto: by the heading, else by a known layout, with a note"
     )
     columns: str | None = Field(None, description="names of the columns, such as `t x y z qw qx qy qz`; `-`: left out")
     time_unit: Literal["s", "ms", "us", "ns"] | None = Field(
         None,
-        description="of the file's times; null: as its heading says, else the form's; asked for where neither says it",
+        description="of the file's times; null: the heading's, else the form's",
     )
     maps_from: Literal["camera", "world"] | None = Field(
         None, description="world: poses map the world to the camera; null: the form's (colmap: world)"
@@ -117,25 +117,24 @@ class TrajectoryConfig(Config):
         0.0,
         ge=0,
         le=60,
-        description="averages the poses within this time before and after each, s, with triangular weights",
+        description="averages the poses within this time around each, s, with triangular weights",
     )
     speed_limit: float = Field(
         100.0,
         gt=0,
         le=1e9,
-        description="largest speed from one pose to the next, world units/s; a higher one is refused, as a jump or "
-        "as poses in mm",
+        description="largest speed between poses, world units/s; a higher one is refused",
     )
     turn_limit: float = Field(
         7200.0,
         gt=0,
         le=1e9,
-        description="largest turning rate from one pose to the next, degrees/s; a higher one is refused",
+        description="largest turning rate between poses, degrees/s; a higher one is refused",
     )
     T_body_sensor: str | Matrix | None = Field(
         None,
-        description="pose of this camera or object on the body that the file describes: a transform from its axes "
-        "to the body's, or EuRoC's sensor.yaml (its T_BS); null: it is that body",
+        description="if the file describes another body: the transform from this body's axes to that one's, or "
+        "EuRoC's sensor.yaml (T_BS)",
     )
 
     @rule("T_body_sensor")
@@ -145,9 +144,8 @@ class TrajectoryConfig(Config):
 
 
 class KeyedMotionConfig(PoseConfig):
-    """A fixed pose, key frames, or a trajectory from a file. The first pose is held before its time and the last after
-    it. Between key frames a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than
-    180 degrees per step."""
+    """A fixed pose, key frames, or a trajectory from a file. The first pose holds before its time, the last after it.
+    Between key frames a body turns the shortest way (for ``spline``: near it), by less than 180 degrees."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field(
@@ -195,19 +193,16 @@ class KeyedMotionConfig(PoseConfig):
 
 
 class WayConfig(Config):
-    """A curve that a body follows at constant speed, its x axis forward; beyond an open end it continues straight."""
+    """A curve that a body follows at constant speed, its x axis forward; beyond an open end it goes straight on."""
 
-    points: tuple[Position, ...] = Field(
-        description="two or more points, m; the curve is smooth and passes through all"
-    )
+    points: tuple[Position, ...] = Field(description="two or more, m; a smooth curve passes through all")
     speed: float | None = Field(
         None,
         gt=0,
         le=1e4,
-        description="m/s; null: the speed at which a figure's feet do not slide and a fish's strokes fit; 1 for "
-        "other bodies",
+        description="m/s; null: 1, of a figure or fish that of its motion",
     )
-    closed: bool = Field(False, description="from the last point back to the first, repeatedly")
+    closed: bool = Field(False, description="back to the first point, repeatedly")
     level: bool = Field(True, description="true: its z axis stays up; false: its x axis follows the slope")
     start: Fraction = Field(0.0, description="fraction of the way that it has covered at time 0")
 

@@ -15,12 +15,11 @@ _Rate = Annotated[float, Field(ge=0, le=1e4)]
 
 
 class PixelsConfig(Config):
-    """Dead, hot and noisy pixels, independent of the emulator; drawn once from the sequence's seed.
+    """Dead, hot and noisy pixels, with any emulator.
 
-    Each pixel's noise events are a Poisson process; they do not change the emulator's state. Rates are log-normal over
-    the pixels; hot pixels have their own median. A noise event may be followed by one of opposite polarity after a
-    log-normal time; the rates include both. Hot pixels have no such answers; the share of ON events of each is
-    logit-normal."""
+    Each pixel's noise events are a Poisson process and do not change the emulator's state. Rates are log-normal over
+    the pixels. A noise event may be followed by one of opposite polarity after a log-normal time (not in hot pixels);
+    the rates include both. A hot pixel's share of ON events is logit-normal."""
 
     dead_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that never fire.")
     hot_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that are hot.")
@@ -39,7 +38,7 @@ class PixelsConfig(Config):
         0.5,
         ge=0,
         le=1,
-        description="Fraction of ON events among the other pixels' noise events, without those that follow another.",
+        description="Share of ON events among the other pixels' noise events, without those that follow another.",
     )
     answered: float = Field(
         0.0,
@@ -53,14 +52,13 @@ class PixelsConfig(Config):
         0.0,
         ge=0,
         le=1e6,
-        description="Dead time of a pixel's noise after its own noise event, microseconds; rates are without it.",
+        description="Dead time after a noise event, microseconds; rates are without it.",
     )
 
 
 class LightNoiseConfig(Config):
-    """Noise events whose rate depends on the light, by published curves of a camera: with ``v2e`` and ``voltmeter``;
-    ESIM, which models no noise, leaves them out and says so. A Poisson process per pixel; between the given lights,
-    log(rate) is linear in log(light)."""
+    """Noise events by the light, with ``v2e`` and ``voltmeter`` (docs/sensors.md). A Poisson process per pixel; between
+    the given lights, log(rate) is linear in log(light)."""
 
     lux: tuple[Annotated[float, Field(gt=0, le=1e7)], ...] = Field(
         min_length=1, max_length=256, description="Light on the scene, lux, increasing."
@@ -72,8 +70,7 @@ class LightNoiseConfig(Config):
         None,
         ge=0.01,
         le=1e6,
-        description="Shape r of the gamma law of the pixels' rates, whose counts are then negative binomial; null: all "
-        "pixels are alike.",
+        description="Shape of the gamma law of the pixels' rates; null: all pixels are alike.",
     )
 
     @rule("lux", "on_hz", "off_hz")
@@ -86,13 +83,11 @@ class LightNoiseConfig(Config):
 
 
 class FrameResetsConfig(Config):
-    """A camera of events and frames: each reset of the frame's pixels makes the signal of all event pixels jump and
-    return, and pixels near their threshold fire."""
+    """Each reset of the frame's pixels makes the signal of all event pixels jump and return, so that pixels near their
+    threshold fire."""
 
     interval_ms: float = Field(gt=2, le=10_000, description="Time between resets, ms: the frame interval.")
-    kick: float = Field(
-        gt=0, le=5, description="Height of the jump, in units of the smaller of the emulator's ON and OFF thresholds."
-    )
+    kick: float = Field(gt=0, le=5, description="Height of the jump, in units of the smaller threshold.")
     length_ms: ClassVar[float] = 1.0
     """Time until the signal has returned, ms; shorter than any interval."""
     former: ClassVar[dict[str, Former]] = {"length_ms": always(length_ms)}
@@ -111,19 +106,19 @@ class ReadoutConfig(Config):
         None,
         ge=1,
         le=1e12,
-        description="Peak rate of the bus, events per second; null: no bus, so no event is late or lost.",
+        description="Peak rate of the bus, events per second; null: no bus.",
     )
     row_ns: float = Field(
         0.0,
         ge=0,
         le=1e6,
-        description="Time to open a row before its events are sent, nanoseconds; 0: events are arbitrated one by one.",
+        description="Time to open a row before its events are sent, nanoseconds; 0: events are sent one by one.",
     )
     queue_events: int = Field(
         4096,
         ge=1,
         le=2**24,
-        description="Events that may wait for the bus; an event that finds the queue full is lost.",
+        description="Events that may wait for the bus; further ones are lost.",
     )
     roi: tuple[_Px, _Px, _Px, _Px] | None = Field(
         None, description="[x, y, width, height], px: pixels outside of it are switched off."
@@ -132,14 +127,13 @@ class ReadoutConfig(Config):
         None,
         ge=5000,
         le=1e12,
-        description="Events per second that the camera's event rate controller lets through, in periods of 200 µs; "
-        "null: all (docs/sensors.md).",
+        description="Limit of the event rate controller, events per second (docs/sensors.md).",
     )
     clock_us: int = Field(
         1,
         ge=1,
         le=1_000_000,
-        description="Resolution of time stamps, microseconds: they are rounded down to multiples of this.",
+        description="Resolution of time stamps, microseconds; they are rounded down.",
     )
     pixels: PixelsConfig | None = Field(None, description="Dead, hot and noisy pixels.")
     light_noise: LightNoiseConfig | None = Field(

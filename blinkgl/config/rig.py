@@ -45,8 +45,7 @@ _SHARED = ("time", "timeline")
 
 
 class PlaceConfig(Config):
-    """Pose of a sensor on its rig: T_rig_sensor, from the sensor's axes to the rig's. Both are OpenCV's, x right, y
-    down, z forward. The rig's axes are where a single camera would be: ``scene.camera`` moves the rig."""
+    """T_rig_sensor, from the sensor's axes to the rig's (docs/rigs.md)."""
 
     position: Position = Field((0.0, 0.0, 0.0), description="m, in the rig's axes: x right, y down, z forward")
     euler: Vector3 | None = Field(None, description="degrees about the rig's x, y, z axes, applied in this order")
@@ -55,8 +54,7 @@ class PlaceConfig(Config):
     )
     matrix: Matrix | None = Field(
         None,
-        description="T_rig_sensor, instead of the others. Rounded rotations are made exact. (Kalibr's T_cn_cnm1 is "
-        "the inverse of a camera's pose relative to the previous one)",
+        description="T_rig_sensor, instead of the others; rounded rotations are made exact",
     )
 
     _one_orientation = at_most_one("euler", "quaternion", "matrix")

@@ -44,13 +44,9 @@ class ObjectsConfig(Config):
         (2.0, 20.0), description="distance from the camera's first position, m; log-uniform"
     )
     flying: Fraction = Field(0.5, description="fraction of flying objects; the others rest on the ground")
-    in_view: Fraction = Field(
-        0.85, description="fraction placed in the camera's first field of view; the others are anywhere around it"
-    )
-    tint: Fraction = Field(0.3, description="strength of the random colour factor on each object's texture")
-    texture_scale: PositiveRange = Field(
-        (0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform"
-    )
+    in_view: Fraction = Field(0.85, description="fraction placed in the camera's first field of view")
+    tint: Fraction = Field(0.3, description="strength of the random colour factor on textures")
+    texture_scale: PositiveRange = Field((0.7, 2.0), description="texture repeats over an object; log-uniform")
     deform: RandomDeformConfig = RandomDeformConfig()
 
 
@@ -73,7 +69,7 @@ class PoolConfig(Config):
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, off, 3mf, glb, gltf")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="upward axis of the folders' files, on which objects rest; auto: y for glb and gltf, z for others",
+        description="upward axis of the files; auto: y for glb and gltf, z for others",
     )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="meshes with more triangles are refused")
     max_file_mb: ClassVar[float] = 512.0
@@ -84,11 +80,11 @@ class PoolConfig(Config):
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: Literal["auto"] | bool = Field(
         "auto",
-        description="auto: files with textures or colours of their own keep them, others and primitives get the "
-        "world's; true: figures, flags, fish and plain grey files keep theirs, too; false: none does",
+        description="auto: files with textures or colours keep them, others and primitives get the world's; true: "
+        "figures, flags, fish and plain grey files keep theirs, too; false: none does",
     )
     animation: Literal["random", "rest"] = Field(
-        "random", description="files with animations: random plays one of them, repeated; rest keeps the rest shape"
+        "random", description="random: files play one of their animations, repeated"
     )
     bad_assets: Literal["error", "skip"] = Field("error", description="skip: logs an unusable mesh and draws another")
 
@@ -123,8 +119,8 @@ class SkyConfig(Config):
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
         (),
-        description="equirectangular images or folders of them (jpg, png, hdr, exr), drawn at infinity instead of "
-        "the box",
+        description="equirectangular images or their folders (jpg, png, hdr, exr), drawn at infinity instead of the "
+        "box",
     )
     lights: bool = Field(
         False,
@@ -153,7 +149,7 @@ class GroundConfig(Config):
 
 
 class RegionConfig(Config):
-    """Box that contains the camera and the objects, on the ground, centred on the z axis."""
+    """Box on the ground, centred on the z axis, that contains camera and objects."""
 
     width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
     height: float = Field(8.0, gt=0, le=1e6, description="m")
@@ -180,9 +176,7 @@ class RandomSceneConfig(Config):
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
     physics: RandomPhysicsConfig | None = Field(None, description="null: nothing falls. Needs the extra [physics]")
-    camera_clearance: float = Field(
-        0.3, gt=0, le=1e4, description="radius of the empty sphere around the camera centre, m"
-    )
+    camera_clearance: float = Field(0.3, gt=0, le=1e4, description="radius of the empty sphere around the camera, m")
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
     former: ClassVar[dict[str, Former]] = {
@@ -234,13 +228,12 @@ class MeshConfig(Config):
     )
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(parameter_value)]] = Field(
         {},
-        description="sizes, numbers of faces and motion of the primitive: see [primitives](#primitives)",
+        description="see [primitives](#primitives)",
     )
     file: str | None = Field(None, description="obj, ply, stl, off, 3mf, glb or gltf file")
     up: Literal["auto", "y", "z"] = Field(
         "auto",
-        description="upward axis of the file: with y, its (x, y, z) is drawn at (x, -z, y); auto: y for glb and "
-        "gltf, else z",
+        description="y: the file's (x, y, z) is drawn at (x, -z, y); auto: y for glb and gltf, else z",
     )
     uv_size: ClassVar[float] = 1.0
     """Edge of one repeat of projected texture coordinates, m."""
@@ -272,20 +265,20 @@ class ObjectConfig(KeyedMotionConfig):
         1.0, description="factor on the mesh, one or one per axis"
     )
     category: Literal["object", "ground", "wall", "sky"] = Field(
-        "object", description="role of the object: for collisions and drawing order"
+        "object", description="for collisions and drawing order"
     )
     animation: str | int | AnimationConfig | None = Field(
-        None, description="clip of the mesh's gltf or glb file to play, repeated; null: the rest shape"
+        None, description="clip of the mesh's file, repeated; null: the rest shape"
     )
     physics: BodyConfig | None = Field(
         None,
-        description="its physics in a scene with physics; null: an obstacle at its place or on its path",
+        description="its physics; null: an obstacle",
     )
     deform: DeformConfig | None = Field(
         None,
-        description="change of shape by formula, replacing its own motion; null: rigid, except figure, flag, fish",
+        description="change of shape by formula; null: rigid, except figure, flag, fish",
     )
-    way: WayConfig | None = Field(None, description="a curve that it follows, instead of a pose or key frames")
+    way: WayConfig | None = Field(None, description="a curve to follow, instead of a pose or key frames")
 
     @rule("?way", "?trajectory")
     def _a_way_or_a_trajectory(way, trajectory):
@@ -342,13 +335,12 @@ class ExplicitSceneConfig(Config):
     objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="one or more")
     collisions: bool = Field(
         False,
-        description="true: find collisions along the trajectories and stop the objects that collide (not those "
-        "that fall: see physics)",
+        description="true: stop objects that collide on their trajectories (not those of physics)",
     )
-    camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
+    camera: KeyedMotionConfig = Field(description="pose or key frames, OpenCV axes")
     physics: PhysicsConfig | None = Field(
         None,
-        description="null: nothing falls. {}: gravity for objects with physics. Needs the extra [physics]",
+        description="{}: gravity for objects with physics; null: nothing falls. Needs the extra [physics]",
     )
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
@@ -387,8 +379,7 @@ class ExplicitSceneConfig(Config):
 
 
 class FileSceneConfig(Config):
-    """A complete glTF/GLB scene with cameras, materials and node animations. The file's y axis becomes the world's z,
-    so its (x, y, z) is at (x, -z, y); poses given here are in that world."""
+    """A complete glTF/GLB scene. The file's (x, y, z) is at (x, -z, y) in the world, in which poses are given."""
 
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")
@@ -397,22 +388,18 @@ class FileSceneConfig(Config):
     intrinsics: Literal["config", "file"] = Field(
         "config", description="source of the focal length: camera of the YAML, or the file (yfov)"
     )
-    animation: str | int | AnimationConfig | None = Field(
-        0, description="name or index of the animation to play, at the file's times; null: none"
-    )
+    animation: str | int | AnimationConfig | None = Field(0, description="name or index of the animation; null: none")
     light: LightConfig = LightConfig()
     fog: FogConfig | None = FOG
     lights: Literal["config", "file"] = Field(
         "config",
-        description="file: the file's lights (KHR_lights_punctual) replace light.sun; light.sky and light.lights "
-        "remain",
+        description="file: the file's lights replace light.sun; light.sky and light.lights remain",
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     both_sides: bool | None = BOTH_SIDES
     lights_gain: Positive = Field(
         1.0,
-        description="factor on the file's lights; their lux and candela are divided by 683 lm/W, the factor of "
-        "Blender's exporter",
+        description="factor on the file's lights (lux and candela are divided by 683 lm/W)",
     )
     max_faces: ClassVar[int] = 5_000_000
     max_texture_size: ClassVar[int] = 2048

@@ -53,8 +53,8 @@ def _emulator_tables(tables: dict[str, dict[str, object]]) -> dict[str, dict[str
 
 
 class SensorConfig(Config):
-    """One camera, one unit of it. Thresholds are in ln units: a contrast of 15 % is ln 1.15 = 0.14. Null means unknown:
-    the emulator's default applies."""
+    """One unit of a camera. Thresholds are in ln units: a contrast of 15 % is ln 1.15 = 0.14. Null: the emulator's
+    default."""
 
     name: str = Field(description="Name of the camera.")
     width: int = Field(ge=1, le=65535, description="Columns, px.")
@@ -64,8 +64,7 @@ class SensorConfig(Config):
     )
     frame_gamma: Literal["linear", "srgb"] | Annotated[float, Field(gt=0, le=10)] | None = Field(
         None,
-        description="Curve from the codes of the camera's own frames to light, or its exponent. Grey images of the "
-        "sensor's size are taken as its own unless specified.",
+        description="Curve from codes of the camera's own frames (grey, of its size) to light, or its exponent.",
     )
     contrast_threshold: float | None = Field(None, ge=0.001, le=10, description="Nominal ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(
@@ -86,13 +85,12 @@ class SensorConfig(Config):
     )
     emulators: Annotated[dict[str, Tree], AfterValidator(_emulator_tables)] = Field(
         {},
-        description="Keys of `events:` by emulator, fitted or published for that model. They override the values "
-        "above.",
+        description="Keys of `events:` by emulator; they override the values above.",
     )
     readout: ReadoutConfig | None = Field(None, description="Defects and latency of the pixels, the bus and its clock.")
     sources: dict[str, str] = Field(
         {},
-        description="Source of each value, by its dotted place in the file or that of its table.",
+        description="Source of each value or table, by its dotted place.",
     )
     uncertainty: dict[str, float] = Field(
         {}, description="Standard deviations of fitted values, by dotted place, in the value's unit."

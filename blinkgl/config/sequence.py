@@ -50,15 +50,14 @@ MAX_LABELS = 1_000_000
 
 
 class TimeConfig(Config):
-    """Labels at ``label_rate`` over ``duration`` seconds; the simulation starts one label interval earlier (pre-roll),
-    so that every label has a full window of events before and after it."""
+    """Labels at ``label_rate`` over ``duration`` seconds. The simulation starts one label interval earlier (pre-roll),
+    so that the first label has events before it."""
 
     duration: float = Field(
         1.0,
         gt=0,
         le=86400 * 2,
-        description="labelled time, s; at most 71.6 minutes with one label interval before and after, the limit "
-        "of an event file",
+        description="labelled time, s; with one label interval before and after at most 71.6 minutes",
     )
     label_rate: float = Field(10.0, gt=0, le=1e5, description="labels (flow, images) per second, Hz")
     start: float = Field(0.0, ge=0, le=1e7, description="clock at the start of the pre-roll, s")
@@ -148,17 +147,17 @@ class RenderConfig(Config):
 
     antialiasing: Antialiasing = Field(
         "none",
-        description="event frames. taps4: filters textures (4 lookups per pixel); edges: silhouettes, too, by their"
-        " area; edges2: the same at 2 x 2 resolution (both become ssaa4 or ssaa8 where outlines crowd);"
-        " ssaa2, ssaa4, ssaa8: means of 2 x 2, 4 x 4, 8 x 8 samples. Costs: docs/trade.md",
+        description="event frames. taps4: textures by 4 lookups per pixel; edges: silhouettes, too, by their area; "
+        "edges2: the same at 2 x 2 resolution (both become ssaa4 or ssaa8 where outlines crowd); ssaa2, ssaa4, ssaa8: "
+        "means of 2 x 2, 4 x 4, 8 x 8 samples (docs/trade.md)",
     )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(
         1.0,
         ge=1,
         le=16,
-        description="texture anisotropy, 1: off (with software GL: half the speed, and seconds per frame near a "
-        "horizon)",
+        description="texture anisotropy, 1: off (above 1 with software GL half the speed, and seconds per frame near "
+        "a horizon)",
     )
     mip_bias: float = Field(
         0.0,
@@ -207,13 +206,13 @@ class OutputConfig(Config):
     )
     compression: Literal["zstd", "lz4", "gzip"] = Field(
         "zstd",
-        description="of events.h5 and event_labels.h5. zstd: in Blosc, as DSEC's files; lz4: faster to write, some "
-        "percent larger; gzip: slower to write, read by h5py without hdf5plugin",
+        description="of HDF5 files. zstd: in Blosc, as DSEC's; lz4: faster, some percent larger; gzip: slower, but "
+        "read without hdf5plugin",
     )
     label: str | None = Field(
         None,
         pattern=r"^[^\x00-\x1f]{1,255}$",
-        description="class of all sequences, for classification: `class` in manifest.json and in the shards' json",
+        description="class of all sequences: `class` in manifest.json and shards",
     )
 
 
@@ -248,27 +247,25 @@ class SequenceConfig(Config):
     )
     quality: Quality | None = Field(
         DEFAULT,
-        description="sets timeline and render to a measured trade-off of speed and accuracy (docs/trade.md); keys "
-        "beside it override it. null: the defaults of each table",
+        description="sets timeline and render (docs/trade.md); keys beside it override it. null: the defaults of each "
+        "table",
     )
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="times of the event frames")
     scene: SceneConfig = Field(RandomSceneConfig(), description="objects, lights, camera motion")
     frames: FramesConfig | None = Field(
         None,
-        description="recorded frames to convert instead of rendering; `camera`, `time`, `timeline`, `scene` and "
-        "`render` are then not used",
+        description="recorded frames instead of rendering, without `camera`, `time`, `timeline`, `scene` and `render`",
     )
     render: RenderConfig = Field(RenderConfig(), description="quality of drawing")
     sensor: Sensor | None = Field(
         None,
-        description=f"{', '.join(shipped_names('sensors'))}, or the path of a sensor file (or its table): sets "
-        "camera.width, camera.height, events and readout; keys given beside it override it",
+        description=f"{', '.join(shipped_names('sensors'))}, a sensor file or its table: sets camera.width, "
+        "camera.height, events and readout; keys beside it override it",
     )
     events: EmulatorConfig = Field(EsimConfig(), description="event camera model and parameters")
     readout: ReadoutConfig | None = Field(
         None,
-        description="after the pixels: defects and latency, the bus (events above its rate are late, then lost), "
-        "its clock, filters",
+        description="defects of the pixels, the bus, its clock, filters",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="ground truth to write")
     images: ImagesConfig | None = Field(None, description="a frame camera beside the event camera (docs/cameras.md)")
@@ -280,7 +277,7 @@ class SequenceConfig(Config):
         None, description="sensors of a known rig (docs/rigs.md); `sensors` given beside it override them by name"
     )
     sensors: tuple[RigSensorConfig, ...] | None = Field(
-        None, min_length=1, description="several sensors on one moving rig (docs/rigs.md); null: a single camera"
+        None, min_length=1, description="several sensors on one rig (docs/rigs.md); null: a single camera"
     )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="OpenGL implementation")

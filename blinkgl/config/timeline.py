@@ -46,8 +46,7 @@ class _AdaptiveTimeline(_Timeline):
 
 
 class DisplacementTimeline(_AdaptiveTimeline):
-    """Event frames between which surfaces move at most ``max_px``, everywhere in the step: by the speeds of the scene's
-    geometry in the picture, hidden surfaces included."""
+    """Event frames between which no surface, hidden ones included, moves further than ``max_px`` in the picture."""
 
     former: ClassVar[dict[str, Former]] = {
         **_NO_RECONSTRUCTION,
@@ -63,13 +62,13 @@ class DisplacementTimeline(_AdaptiveTimeline):
         100.0,
         gt=0,
         le=100,
-        description="percentile of the speeds of moving surfaces, by their area in the picture; 100 bounds every one",
+        description="percentile of the speeds of moving surfaces, by area in the picture",
     )
     max_px_peak: float | None = Field(
         None,
         gt=0,
         le=1e4,
-        description="an additional limit for the fastest surface, px; for a percentile below 100",
+        description="limit for the fastest surface, px; for a percentile below 100",
     )
 
 

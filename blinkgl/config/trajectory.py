@@ -34,24 +34,23 @@ class MotionConfig(Config):
     kind: Literal["spline", "static"] = Field(
         "spline", description="spline: through random waypoints; static: no motion"
     )
-    waypoints: int = Field(6, ge=2, le=1000, description="waypoints per sequence (approximately: see rotation_rate)")
+    waypoints: int = Field(6, ge=2, le=1000, description="waypoints per sequence, approximately")
     waypoints_per_s: float | None = Field(
         None,
         gt=0,
         le=1000,
-        description="waypoints per second, instead of waypoints: a short sequence is then a part of a smooth motion",
+        description="waypoints per second, instead of waypoints",
     )
     pauses: float = Field(
         0.0,
         ge=0,
         le=1,
-        description="fraction of the bodies that stop smoothly once, for 10 to 50 % of the sequence",
+        description="fraction of the bodies that stop once, for 10 to 50 % of the sequence",
     )
     speed: SpeedRange = Field((0.2, 1.5), description="mean speed of the body's origin, world units/s")
     rotation_rate: RateRange = Field(
         (20.0, 120.0),
-        description="mean angular rate, deg/s; key frames are added where two waypoints differ by more than 115 "
-        "degrees",
+        description="mean angular rate, deg/s; may add key frames",
     )
     smoothness: float = Field(
         0.5, ge=0, le=1, description="0: each leg starts in a random direction; 1: it continues in the last one's"
@@ -71,7 +70,7 @@ class ObjectMotion(MotionConfig):
 
 
 class CameraMotion(MotionConfig):
-    """Motion of the camera: as of an object, but it looks approximately at the scene's centre."""
+    """Motion of the camera, which looks approximately at the scene's centre."""
 
     speed: SpeedRange = Field((0.3, 1.5), description="mean speed of the camera centre, world units/s")
     rotation_rate: RateRange = Field((10.0, 60.0), description="mean angular rate without shake, deg/s")
@@ -80,12 +79,12 @@ class CameraMotion(MotionConfig):
     )
     heading: Literal["any", "view", "across"] = Field(
         "any",
-        description="initial direction; view: along its line of sight, forwards or backwards; across: perpendicular"
-        " to it. smoothness decides how long it is kept",
+        description="initial direction; view: along its line of sight, forwards or backwards; across: perpendicular "
+        "to it",
     )
     roll: float = Field(20.0, ge=0, le=180, description="largest roll of the horizon at the waypoints, deg")
     shake: float = Field(
-        0.0, ge=0, le=30, description="additional hand shake: standard deviation of the rotation about each axis, deg"
+        0.0, ge=0, le=30, description="hand shake: standard deviation of the rotation about each axis, deg"
     )
     shake_rate: ClassVar[float] = 8.0
     """Shake impulses per second."""

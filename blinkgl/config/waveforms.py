@@ -43,7 +43,7 @@ class CodeConfig(Config):
     )
     rate: Hertz = Field(description="bits per second")
     low: Share = Field(0.0, description="factor of a 0")
-    repeat: bool = Field(True, description="from the beginning after the end; false: off after it")
+    repeat: bool = Field(True, description="repeat after the end; false: off")
 
 
 class LightKeyConfig(Config):

@@ -184,8 +184,7 @@ def serve(
     plugin: Plugin = None,
     overrides: Overrides = None,
 ) -> None:
-    """Serve a local page on which passes are inspected. It has a time slider, probing by click, differences, and
-    shaders that reload when saved. Ctrl-C ends it."""
+    """Serve a local page on which passes are inspected. Shaders reload when saved. Ctrl-C ends it."""
     from blinkgl.tools.shader_debugger.server import serve as run_server
 
     subject, when = _opened(config, seed, sequence, overrides, time)

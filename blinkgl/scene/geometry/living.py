@@ -36,8 +36,8 @@ def figure(
     *,
     level: int = 0,
 ) -> tuple[Surface, Deformer]:
-    """A person on z = 0, facing along x, who walks, runs, dances, waves or stands, in place (an object's `way` moves
-    it). The texture is an atlas of the body's parts."""
+    """A person on z = 0, facing along x, who moves in place (an object's `way` moves it on). The texture is an atlas
+    of the body's parts."""
     if height > 1000:
         raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
     proportions = Proportions(height, build, legs, arms, head)
@@ -56,8 +56,7 @@ def flag(
     subdivisions: int = 40,
     coat: int = 0,
 ) -> tuple[Surface, Deformer]:
-    """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
-    mirrored on the back."""
+    """Cloth in wind, held at x = 0, along x and from z = 0 up, waving in y; the texture is mirrored on the back."""
     # Two sheets with a thin rim, so that the mesh is closed.
     thick = 0.004 * min(width, height)
     rows = max(round(subdivisions * height / width), 1)
@@ -84,7 +83,7 @@ def flag(
 def fish(
     length: float = 0.3, deep: float = 1.0, tempo: float = 1.0, phase: float = 0.0, coat: int = 0
 ) -> tuple[Surface, Deformer]:
-    """A fish that swims along x, its nose at x = length / 2: a wave runs down its body, larger towards the tail."""
+    """A fish that swims along x, its nose at x = length / 2."""
     rings, segments = 48, 28
     # s: 0 at the nose, 1 at the end of the tail; rings are denser at both ends.
     s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2

@@ -25,32 +25,30 @@ from blinkgl.scene.types import Deformer, Mesh
 
 PARAMETERS = {
     "size": "edge length, m",
-    "rounding": "radius of the rounded edges, parts of size, at most 0.5",
+    "rounding": "radius of the rounded edges, a fraction of size; 0.5: a ball",
     "extents": "edge lengths in x, y, z, m",
     "width": "edge in x, m; flag: from the pole to the free end",
     "depth": "edge in y, m",
-    "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the "
-    "middle of the tube",
+    "radius": "m; prism, pyramid: of the circle through the corners; torus: to the middle of the tube",
     "tube": "radius of the tube, m, less than radius",
-    "height": "along z, m; capsule: of the cylinder between the two half spheres; figure: from the soles to the crown",
-    "length": "fish: from the nose to the end of the tail, m",
-    "deep": "fish: height of its body, parts of an average fish's, 0.6 to 1.6",
-    "build": "figure: how thick it is, parts of an average body's, 0.7 to 1.4",
-    "legs": "figure: how long they are, parts of an average body's of this height, 0.7 to 1.4; likewise arms, head",
+    "height": "along z, m; capsule: without the two half spheres",
+    "length": "m",
+    "deep": "fish: height relative to an average fish, 0.6 to 1.6",
+    "build": "figure: thickness relative to an average body, 0.7 to 1.4",
+    "legs": "figure: length relative to an average body of this height, 0.7 to 1.4; likewise arms, head",
     "arms": "figure: see legs",
     "head": "figure: see legs",
-    "clip": "figure: what it does, one of " + ", ".join(CLIPS),
-    "variant": "figure: which of many dances, and how it walks, runs, stands, waves; 0 is the plain one",
-    "tempo": "0.1 to 4; 1 is natural for a body of this size. Figures on a `way`, and fish, also move faster",
-    "phase": "0 to 1, of a round, where it is at time 0",
-    "wind": "flag: 1 is a breeze, up to 4; more of it lifts the cloth higher, and faster",
-    "coat": "figure, flag, fish: which colours they wear where the object names no material",
+    "clip": "figure: " + ", ".join(CLIPS),
+    "variant": "figure: number of the dance or gait; 0 is the plain one",
+    "tempo": "speed of the motion, 0.1 to 4; 1 is natural for a body of this size",
+    "phase": "fraction of a period at time 0",
+    "wind": "flag: 0.1 to 4, 1 is a breeze; with more the cloth flies higher and moves faster",
+    "coat": "figure, flag, fish: number of the colours, if the object has no material",
     "segments": "faces round the z axis",
     "tube_segments": "faces round the tube",
     "rings": "rows of faces along z; cylinder, cone: rows of vertices",
     "sides": "corners of the polygon",
-    "subdivisions": "cells per edge; die: per rounded edge; icosphere: how often each of 20 triangles is cut into "
-    "four, 0 to 7",
+    "subdivisions": "cells per edge; die: per rounded edge; icosphere: 20 * 4**subdivisions triangles, 0 to 7",
 }
 """The builders' parameters, for the documentation. Metres are world units, before the object's scale."""
 
@@ -271,9 +269,8 @@ DIE_FACES = 2, 3
 
 @primitive
 def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Surface:
-    """Cube with rounded edges and corners, of ``subdivisions`` cells each (``rounding`` is a fraction of ``size``, at
-    most a half, which is a ball). Its six faces are in one texture, 1 2 3 above 4 5 6; opposite ones sum to 7: see
-    `procedural: pips`."""
+    """Cube with rounded edges and corners. Its six faces are in one texture, 1 2 3 above 4 5 6; opposite ones sum to 7:
+    see `procedural: pips`."""
     if rounding > 0.5:
         raise AssetError("bad parameter", where="die.rounding", value=rounding, accepted="at most 0.5")
     half, radius = 0.5 * size, rounding * size
@@ -419,7 +416,7 @@ def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: in
 
 @primitive
 def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_segments: int = 16) -> Surface:
-    """Ring about z: ``radius`` to the middle of a tube of radius ``tube`` (< radius)."""
+    """Ring about z."""
     if tube >= radius:
         raise AssetError("bad parameter", where="torus.tube", value=tube, accepted=f"less than radius {radius:g}")
     angle = 2 * math.pi * np.arange(tube_segments + 1) / tube_segments
@@ -436,7 +433,7 @@ def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_seg
 
 @primitive
 def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
-    """Cylinder of ``height`` between two half spheres; ``rings`` rows of the two together."""
+    """Cylinder of ``height`` between two half spheres, which have ``rings`` rows together."""
     half = max(rings // 2, 1)
     latitude = np.linspace(0, math.pi / 2, half + 1)
     top = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)

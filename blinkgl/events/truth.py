@@ -8,7 +8,7 @@ An emulator sees a pixel only at the times of its frames, so the surface that ma
 
 "The same surface" is the same instance at about the same depth (``_JUMP``): an arm in front of its own body passes,
 too. In anti-aliased event frames a surface that covers a part of a pixel changes it as well; then the four pixels
-around it are also considered (``reach``).
+around it are also considered (``reach``), where they show something that moves.
 
 A pixel may follow a change after it is over (V2E's low-pass; :meth:`Emulator.memory_s`): for that time its events are
 still those of the surface that left, and of the light that changed it. Noise events get the surface that their pixel
@@ -95,6 +95,8 @@ class SurfaceTruth:
                 # another part of the same instance counts only at the pixel itself
                 jump = other[1] < best * (1 - _JUMP) if dy == dx == 0 else False
                 passes = (other[1] < best) & ((other[0] != speeds[0]) | jump)
+                if dy or dx:  # the edge of a surface at rest changes no pixel beside it
+                    passes &= other[2].any(axis=1)
                 speeds, best = _where(passes, other, speeds), np.where(passes, other[1], best)
         if self._left is not None:
             left = _looked_up(self._left, pixel)

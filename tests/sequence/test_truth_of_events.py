@@ -130,3 +130,18 @@ def test_what_a_pixel_still_follows_gives_way_to_the_same_instance_where_it_is_n
     late = Events(event.x, event.y, np.array([2_900]), event.p)
     made = truth.of(late, 3_000_000)
     assert made["instance"] == 1 and made["depth"] == 3.0
+
+
+@pytest.mark.parametrize("emulator", ["esim", "v2e"])
+def test_what_passes_behind_a_body_at_rest_makes_its_own_events(emulator):
+    """Posts (2 to 5) at rest before squares (1) that slide by: no event is of a post, though the pixels at its edges
+    show a part of it."""
+    scene = Scene(CAMERA, light=Light(unlit=True), **SPAN)
+    way = Keyframes({0.0: Pose((2, -0.2, 0)), 0.2: Pose((2, 0.4, 0.1))}, interpolation="linear")
+    scene += Primitive("cuboid", extents=(0.1, 9, 9), pose=way, material=Material(SQUARES))
+    for y in (-0.8, -0.31, 0.17, 0.7):
+        scene += Primitive("cuboid", extents=(0.1, 0.13, 4), pose=(0, y, 0), material=Material(color=(0.4,) * 3))
+    quiet = {"emulator": emulator, "threshold_sigma": 0}
+    quiet |= {"leak_rate_hz": 0, "shot_noise_rate_hz": 0} if emulator == "v2e" else {}
+    truth = record(scene, emulator=quiet, labels=["events"]).events.truth
+    assert len(truth) > 1000 and (truth["instance"] == 1).mean() > 0.999

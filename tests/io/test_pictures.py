@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import colorsys
+
 import matplotlib
 import numpy as np
 import pytest
@@ -82,3 +84,12 @@ def test_flow_by_the_published_wheel():
     for y, x in dice.integers(0, 30, (200, 2)):
         u, v = np.round(flow[y, x] / 10.0 * 255) / 255
         np.testing.assert_allclose(rgb[y, x], middlebury(u, v), atol=0.51)
+
+
+def test_hues_of_ids_follow_the_golden_ratio():
+    """By colorsys, for eight numbers one by one."""
+    ids = np.array([[1, 2, 3, 4], [5, 100, 4000, 65535]])
+    for number, shown in zip(ids.ravel().tolist(), id_colours(ids).reshape(-1, 3).tolist()):
+        value = 0.62 + 0.38 * (number * 0.7548776662 % 1)
+        due = colorsys.hsv_to_rgb(number * 0.61803398875 % 1, 0.62, value)
+        assert np.abs(np.array(due) * 255 - shown).max() <= 0.51, number

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from blinkgl.cli import run
-from blinkgl.errors import BlinkGLError
+from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.formats import open_events
 from blinkgl.io.reading import EventReading
 from tests.io.some_events import same, some_events
@@ -114,3 +114,24 @@ def test_arrays_of_events_and_of_frames_as_the_other_side(tmp_path, frames, kind
         np.save(tmp_path / "one.npy", rows)
     first = "one.npz" if frames else "one.npy"
     assert run(["compare", str(tmp_path / first), str(path), *options]) == 0
+
+
+@pytest.mark.parametrize(
+    ("beside", "known"),
+    [
+        ((), False),
+        (("K",), False),
+        (("K", "other"), False),
+        (("index", "K"), True),
+        (("K", "D", "index", "discretization", "meta"), True),
+    ],
+)
+def test_rows_without_names_are_ev_imos_only_beside_two_of_its_arrays(tmp_path, beside, known):
+    rows = np.array([[0.1, 2, 3, 1], [0.2, 4, 5, 0]])
+    np.savez(tmp_path / "one.npz", events=rows, **{name: np.eye(3) for name in beside})
+    if known:
+        events = open_events(tmp_path / "one.npz").read()
+        assert events.t.tolist() == [100_000, 200_000] and events.x.tolist() == [2, 4] and events.p.tolist() == [1, 0]
+    else:
+        with pytest.raises(AssetError, match="array 'events' has no names of columns"):
+            open_events(tmp_path / "one.npz")

@@ -84,7 +84,7 @@ class BodyConfig(Config):
     density: _Density = Field(700.0, description="kg/m³ (wood)")
     friction: _Friction = Field(0.5, description="coefficient of Coulomb friction")
     rolling: float = Field(0.01, ge=0, le=1, description="rolling friction, as a fraction of the body's radius")
-    restitution: _Restitution = Field(0.5, description="speed after an impact divided by the speed before it")
+    restitution: _Restitution = Field(0.5, description="speed after an impact on a fixed surface, over that before")
     velocity: tuple[_Velocity, _Velocity, _Velocity] = Field(
         (0.0, 0.0, 0.0), description="velocity of the centre of mass at the start, m/s"
     )

@@ -30,9 +30,8 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_folder, output_errors, refuse_existing
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.event_labels import EVENT_LABELS, with_truth
+from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsReader, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
-from blinkgl.io.lights import LIGHTS
 from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
@@ -124,13 +123,15 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     taken = _last_image(folder, manifest, start)
     if taken is not None:
         about["camera"] = {"image": taken[0], **asdict(taken[1])}
+    told: tuple[str, ...] = ()
     with DsecEventReader(folder / "events.h5", size=(manifest["height"], manifest["width"])) as reader:
         # The interval before the label is as long as the label's own.
         windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
         if EVENT_LABELS in manifest["files"]:
             first = reader.number(2 * start - end), reader.number(start)
             windows = {name: with_truth(one, k, folder) for (name, one), k in zip(windows.items(), first)}
-    told = (*TOLD, "light") if LIGHTS in manifest["files"] else TOLD
+            with EventLabelsReader(folder) as labels:
+                told = (*TOLD, "light") if labels.lights else TOLD
     yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
     for name, events in windows.items():
         yield f"{key}.{name}.npz", _npz(events, told)

@@ -161,7 +161,8 @@ class Renderer(Releasing):
         most = self._most[samples.grid]
         if most > _MOST_SPECKS:
             line = f"{most:,} bodies under a pixel: the nearest {_MOST_SPECKS:,} shine by their area"
-            self.notes = (f"{line}, the others where they meet the centre of a sample",)
+            line += ", the others where they meet the centre of a sample"
+            self.notes += (line,) if line not in self.notes else ()
         return min(most + most // 2 + (most > 0), _MOST_SPECKS)
 
     def release(self) -> None:

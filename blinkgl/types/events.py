@@ -29,7 +29,7 @@ class Cause(IntEnum):
 TRUTH = np.dtype([("instance", "u2"), ("depth", "f4"), ("velocity", "f4", (2,)), ("light", "i4")])
 """The surface that made an event: its instance id, 0: nothing; depth along the optical axis, world units, inf: nothing;
 image velocity, px/s, +x right, +y down. The light that made it by changing over time: its number among the names of
-``lights.npz``, -1: none."""
+``lights.npz``, -1: none, or a file that does not say."""
 TOLD = ("instance", "depth", "velocity")
 """Fields of :data:`TRUTH` of every scene."""
 OPTIONAL = ("cause", "truth")

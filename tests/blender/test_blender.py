@@ -182,6 +182,8 @@ def test_the_clock_of_a_format(imported, rate, ending):
     for t in (0.0, 0.3, 0.5, 0.9):
         assert box.path.pose(int(t * NS))[0, 3] == pytest.approx(2 * t, abs=2e-3)
     assert came.report.fps == rate and came.report.duration_s == pytest.approx(1.0)
+    # The option that the note of an unreadable clock names wins over the file's.
+    assert imported(f"rate{rate}.{ending}", fps=12).report.fps == 12
 
 
 STAGE = '#usda 1.0\n(\n    defaultPrim = "W"\n    {}\n    upAxis = "Z"\n)\n\n'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy.io import savemat
 
 from blinkgl.errors import AssetError, BlinkGLError
-from blinkgl.io.formats import convert, open_events, write_events
+from blinkgl.io.formats import FORMATS, EventFormat, convert, ending_of, open_events, write_events
 from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
 from tests.io.some_events import same, some_events
@@ -288,3 +289,11 @@ def test_a_size_that_is_not_said_is_that_of_the_smallest_sensor_that_holds_all(t
     file = open_events(tmp_path / "e.txt")
     assert (file.height, file.width) == (None, None)
     assert (file.sized().height, file.sized().width) == size
+
+
+@pytest.mark.parametrize(
+    ("name", "ending"), [("a.txt", ".txt"), ("a.b.txt", ".txt"), ("a.TXT.gz", ".txt.gz"), ("a.evt.json", ".evt.json")]
+)
+def test_an_ending_has_two_dots_where_a_format_s_has(monkeypatch, name, ending):
+    monkeypatch.setitem(FORMATS, "two", EventFormat("two", (".evt.json",), "text", "TextReader"))
+    assert ending_of(Path(name)) == ending

@@ -217,7 +217,9 @@ class RenderedSequence(SensorSimulation):
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
-        image = self.renderer.colour(t_ns, antialiasing="none").read()
+        # Cheap, unless bodies under a pixel are in view, of which it would show nothing.
+        samples = None if len(self.renderer.specks(t_ns)[0]) else "none"
+        image = self.renderer.colour(t_ns, antialiasing=samples).read()
         interval = self.config.time.interval_ns
         span = min(interval, self.scene.t1_ns - t_ns)
         if 4 * span < interval:

@@ -21,7 +21,7 @@ from blinkgl import (
 from blinkgl.config.run import RunTemplate
 from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
-from blinkgl.sequence.request import SequenceRequest
+from blinkgl.sequence.request import Picture, SequenceRequest
 
 FOCAL = 300.0
 SPAN = dict(light=Light(0, 0), background=0.0, duration=0.05, label_rate=20)
@@ -102,3 +102,12 @@ def test_events_of_points_are_theirs(emulator, lens):
         assert len(mine) > 20 and np.allclose(mine["depth"], 4, atol=1e-3)
         # +x is to the right, +y of the world to the left; a lens stretches by at most a few percent here.
         assert np.allclose(mine["velocity"][:, 0], -speed * FOCAL / 4, rtol=0.06 if lens else 1e-4)
+
+
+def test_the_preview_shows_them():
+    template = configured(stars(), labels=[])
+    config = RunTemplate(template.tree, template.base).sequence(0)
+    request = SequenceRequest(config, scene=stars().build(config), pictures_hz=20.0)
+    with simulate_sequence(request) as sequence:
+        images = [item.image for item in sequence.alone if isinstance(item, Picture)]
+    assert images and all((image[..., 0] > 1).sum() >= 3 for image in images)

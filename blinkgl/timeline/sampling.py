@@ -51,8 +51,9 @@ class Pace(Protocol):
     def bend(self, ta_ns: int, tb_ns: int) -> float:
         """Return how far the scene leaves a steady motion from one time to the other in between, in steps."""
 
-    def misses(self, ta_ns: int, tb_ns: int) -> None:
-        """Take note that more than a step may happen unseen between two times that are a shortest step apart."""
+    def misses(self, ta_ns: int, tb_ns: int) -> bool:
+        """Take note that more than a step may happen unseen between two times that are a shortest step apart. Return
+        whether both get a frame, which holds a jump between these two."""
 
 
 BEND = 0.05
@@ -128,8 +129,8 @@ def _holds_until(pace: Pace, t: int, end: int, min_step_ns: int) -> int:
             middle = (a + b) // 2
             intervals += [(middle, b), (a, middle)]
             continue
-        if b - a <= min_step_ns and pace.hides(a, b, NS_PER_S / (b - a)):
-            pace.misses(a, b)
+        if b - a <= min_step_ns and pace.hides(a, b, NS_PER_S / (b - a)) and pace.misses(a, b):
+            return a if a > t else b
         most = max(fastest, pace.at(b))
         if most * (b - t) > _LIMIT:
             # Up to a it holds, and until b nothing is faster than ``most``.

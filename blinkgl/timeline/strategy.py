@@ -194,8 +194,10 @@ class Timeline:
             )
         return (*notes, *(line for other in self.others for line in other.notes))
 
-    def misses(self, ta_ns: int, tb_ns: int) -> None:
+    def misses(self, ta_ns: int, tb_ns: int) -> bool:
         self.unseen = self.unseen or (ta_ns, tb_ns)
+        # Of a deformer without a time scale nothing is known at any time: a frame at each would be all of them.
+        return not self.scene.motion.unbounded
 
     def at(self, t_ns: int) -> float:
         """Return the steps per second that the strictest camera needs at one time."""

@@ -26,8 +26,8 @@ class Formula:
     def bend(self, ta_ns: int, tb_ns: int) -> float:
         return 0.0
 
-    def misses(self, ta_ns: int, tb_ns: int) -> None:
-        pass
+    def misses(self, ta_ns: int, tb_ns: int) -> bool:
+        return False
 
 
 def displacement_times(

@@ -1,4 +1,4 @@
-"""What adaptive times see of fast motion: the events of a dense fixed rate, in twelve scenes in which both ends of a
+"""What adaptive times see of fast motion: the events of a dense fixed rate, in sixteen scenes in which both ends of a
 step do not show what happens inside it."""
 
 from __future__ import annotations
@@ -163,9 +163,36 @@ def stopped_body() -> Scene:
     return seen([wall(GREY), thing("card", 2, quad(0.4, 0.4), path, SHARP)])
 
 
+def jumping(there: tuple[float, float, float], turn=FACING, back: bool = True) -> KeyframePath:
+    """A path that stands at (0, 2, 0), from 30.3 to 31.2 ms elsewhere, and needs a microsecond for the way."""
+    here, times = (0.0, 2.0, 0.0), [0, 30.3, 30.301, 31.2, 31.201, 80]
+    places = [here, here, there, there, *((here, here) if back else (there, there))]
+    return KeyframePath([round(t * MS) for t in times], places, Rotation.concatenate([turn] * 6), "linear")
+
+
+def camera_that_jumps() -> Scene:
+    return seen([wall(away=6.0)], jumping((0.5, 2.0, 0.0), LEVEL))
+
+
+def body_that_jumps() -> Scene:
+    return seen([wall(GREY), thing("card", 2, quad(0.4, 0.4), jumping((0.5, 2.0, 0.0)), SHARP)])
+
+
+def body_that_vanishes() -> Scene:
+    """It is behind the camera from then on."""
+    card = thing("card", 2, quad(0.4, 0.4), jumping((0.0, -5.0, 0.0), back=False), SHARP)
+    return seen([wall(GREY), card])
+
+
+def lamp_that_jumps() -> Scene:
+    lamp = Lamp("point", (3.0,) * 3, jumping((1.0, 2.0, 0.0)))
+    return seen([wall(Material(base_color=(0.8,) * 3))], light=replace(Light(), sun=0.0, sky=0.05, lamps=(lamp,)))
+
+
 WORLDS = (
     fan, hand_shake, pendulum, bouncing_ball, flash, waving_arm, passing_car, from_behind, to_and_fro_along_the_axis,
-    vibration, ball_through_the_picture, stopped_body,
+    vibration, ball_through_the_picture, stopped_body, camera_that_jumps, body_that_jumps,
+    body_that_vanishes, lamp_that_jumps,
 )  # fmt: skip
 
 

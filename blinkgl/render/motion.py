@@ -78,7 +78,7 @@ class Motion:
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem], moments: Moments):
         self.camera: CameraModel = scene.camera
-        self._moments, self._path = moments, scene.camera_path
+        self._moments, self._path, self._objects = moments, scene.camera_path, scene.objects
         self._lamps = [lamp for lamp in scene.light.lamps if not lamp.path.is_static]
         # Before a camera that stands still, and in light that does, only what moves itself.
         every = not scene.camera_path.is_static or bool(self._lamps)
@@ -92,6 +92,14 @@ class Motion:
         self.unbounded = [scene.objects[self._body[k]].name for k in np.flatnonzero(self._timescale == 0)]
         self._looks: Recent[tuple[CameraModel, int], Look] = Recent(KEPT)
         self._casters = np.array([i.casts for i in self._items], bool)
+
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
+        """Return the times in (t0, t1), ns, increasing, after which a body, the camera or a lamp stands elsewhere a
+        nanosecond later."""
+        paths = [self._path, *(lamp.path for lamp in self._lamps), *(self._objects[k].path for k in set(self._body))]
+        moving = [*paths, *(item.deformer for item in self._items if item.deformer is not None)]
+        # Paths and deformers of somebody's own may not say it.
+        return sorted({t for one in moving if hasattr(one, "jumps") for t in one.jumps(t0_ns, t1_ns)})
 
     @cached_property
     def _surfaces(self) -> _Surfaces:

@@ -104,6 +104,9 @@ class Moving(Protocol):
 
     def look(self, t_ns: int) -> Any: ...
 
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
+        """Return the times in (t0, t1), ns, after which something stands elsewhere a nanosecond later."""
+
     def hides(self, a: Any, b: Any, tolerance: float) -> bool:
         """Return whether something may be faster between two looks, by more than ``tolerance`` px/s, than both show."""
 
@@ -137,8 +140,8 @@ class Watched(Protocol):
 class Timeline:
     """Iterator over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when
     requested. ``stops_ns``: times of impacts, which adaptive kinds do not cross.   ``lights``: those that change over
-    time: adaptive kinds have a frame at each of their jumps and one a nanosecond later, do not cross their turning
-    points, and in between take steps in which a light changes by a threshold at most."""
+    time: adaptive kinds have a frame at each of their jumps, as at those of what moves, and one a nanosecond later, do
+    not cross their turning points, and in between take steps in which a light changes by a threshold at most."""
 
     def __init__(
         self,
@@ -168,7 +171,7 @@ class Timeline:
         least, most = round(c.min_step_us * 1000), round(c.max_step_us * 1000)
         last, self.too_long, self.longest = self.t0_ns, 0, 0.0
         span = self.t0_ns, self.t1_ns
-        jumps = {t for light in self.lights for t in light.jumps(*span)}
+        jumps = {t for light in self.lights for t in light.jumps(*span)} | {*self.scene.motion.jumps(*span)}
         turns = {t for light in self.lights for t in light.corners(*span)}
         exact = sorted({*jumps, *(t + 1 for t in jumps), *turns})
         for t_ns in bounded_times(self, least, most, *span, self.stops_ns, exact):

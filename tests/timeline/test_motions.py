@@ -1,4 +1,4 @@
-"""What adaptive times see of fast motion: the events of a dense fixed rate, in sixteen scenes in which both ends of a
+"""What adaptive times see of fast motion: the events of a dense fixed rate, in seventeen scenes in which both ends of a
 step do not show what happens inside it."""
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import BUILDERS
 from blinkgl.scene.motion.paths import CutPath, KeyframePath
+from blinkgl.scene.shapes.clips import Clip, Playing, Track
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Skin
 from blinkgl.scene.types import Lamp, Light, Material, Scene
@@ -189,10 +190,20 @@ def lamp_that_jumps() -> Scene:
     return seen([wall(Material(base_color=(0.8,) * 3))], light=replace(Light(), sun=0.0, sky=0.05, lamps=(lamp,)))
 
 
+def stepped_body() -> Scene:
+    """A clip whose keys hold (STEP), as files of stop motion have it, which begins anew every 30 ms elsewhere."""
+    places = np.array([[-0.4, 0, 0], [0.4, 0, 0], [0.1, 0, 0.2], [0, 0, -0.2]])
+    track = Track(0, "translation", np.array([0, 0.011, 0.0117, 0.03]), places, "STEP")
+    skeleton = Skeleton([-1], Clip(Locals.rest(1), [track], Playing(0, 0.03)))
+    mesh = quad(0.3, 0.3)
+    mesh = replace(mesh, deformer=Skin.rigid(skeleton, 0, len(mesh.vertices)))
+    return seen([wall(GREY), thing("card", 2, mesh, still((0, 2, 0), FACING), SHARP)])
+
+
 WORLDS = (
     fan, hand_shake, pendulum, bouncing_ball, flash, waving_arm, passing_car, from_behind, to_and_fro_along_the_axis,
     vibration, ball_through_the_picture, stopped_body, camera_that_jumps, body_that_jumps,
-    body_that_vanishes, lamp_that_jumps,
+    body_that_vanishes, lamp_that_jumps, stepped_body,
 )  # fmt: skip
 
 

@@ -153,6 +153,9 @@ class Seen:
         speed = self.before if t_ns < self.until else self.after
         return SimpleNamespace(largest=speed, percentile=lambda percent: speed)
 
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
+        return []
+
     def hides(self, a, b, tolerance: float):
         return False
 

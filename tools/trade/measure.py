@@ -68,7 +68,8 @@ class FineTiles(Cutouts):
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
         """Yield times between which nothing in the rectangles moves by more than ``max_px``."""
-        return bounded_times(self.pace(max_px), 1000, MAX_STEP_NS, t0_ns, t1_ns)
+        jumps = [at for t in self._renderer.motion.jumps(t0_ns, t1_ns) for at in (t, t + 1)]
+        return bounded_times(self.pace(max_px), 1000, MAX_STEP_NS, t0_ns, t1_ns, exact_ns=jumps)
 
     def pace(self, max_px: float) -> Pace:
         """Return the pace of steps in which nothing in the rectangles moves by more than ``max_px``."""
@@ -94,8 +95,9 @@ class _PaceOfTiles:
         looks = zip(self._looks(ta_ns), self._looks(tb_ns), strict=True)
         return max(self.motion.bend(a, b) for a, b in looks) / self.max_px
 
-    def misses(self, ta_ns: int, tb_ns: int) -> None:
+    def misses(self, ta_ns: int, tb_ns: int) -> bool:
         """Nothing is said: its shortest step is a microsecond."""
+        return True
 
     def _looks(self, t_ns: int) -> Iterator[Look]:
         for camera in self.cameras:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,10 @@ class Animation:
         """Return the time in which no velocity changes much: half of that between the closest key frames."""
         return self._playing.timescale_ns(self.tracks)
 
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
+        """Return the times in (t0, t1), ns, after which a track jumps."""
+        return self._playing.jumps(self.tracks, t0_ns, t1_ns)
+
     def deformer(
         self,
         node: int,
@@ -150,6 +155,7 @@ class Animation:
             period_ns=playing.period_ns if moving else None,
             span_ns=playing.span_ns if moving else 0,
             timescale_ns=playing.timescale_ns(mine),
+            jumps=partial(playing.jumps, mine),
         )
         return morphs.taken(source).transformed(at_rest[:3, :3])
 

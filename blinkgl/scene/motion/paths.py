@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion import piecewise
-from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.scene.motion.pose_path import PosePath, no_jumps
 from blinkgl.types.poses import pose_of
 
 # Rounding in the bounds' own arithmetic is of order 1e-15; this margin keeps them upper bounds.
@@ -296,7 +296,8 @@ class AffinePath:
 
     motion : (M, dM/dt), ((4, 4), (4, 4) 1/s), at a time in ns.   local : (4, 4) rigid, from the body to M's axes.
     span_ns : time in which the motion takes all its values; 0: unknown.
-    timescale_ns : time in which its velocity changes little."""
+    timescale_ns : time in which its velocity changes little.
+    jumps : the times in (t0, t1), ns, after which it jumps; None: it does not."""
 
     is_static = False
 
@@ -308,10 +309,12 @@ class AffinePath:
         local: ArrayLike,
         span_ns: int = 0,
         timescale_ns: int = 1,
+        jumps: Callable[[int, int], list[int]] | None = None,
     ):
         self.t0_ns, self.t1_ns = int(t0_ns), int(t1_ns)
         self._motion, self._local, self._span_ns = motion, rigid(local), span_ns
         self._timescale_ns = max(int(timescale_ns), 1)
+        self.jumps = jumps or no_jumps
 
     def pose(self, t_ns: int) -> np.ndarray:
         matrix, _ = self._motion(min(max(int(t_ns), self.t0_ns), self.t1_ns))
@@ -368,6 +371,7 @@ class OffsetPath:
     def __init__(self, path: PosePath, T_body_offset: ArrayLike):
         self.path, self.T_body_offset = path, rigid(T_body_offset)
         self.t0_ns, self.t1_ns, self.is_static = path.t0_ns, path.t1_ns, path.is_static
+        self.jumps = getattr(path, "jumps", no_jumps)
         self._arm = float(np.linalg.norm(self.T_body_offset[:3, 3]))
 
     def pose(self, t_ns: int) -> np.ndarray:

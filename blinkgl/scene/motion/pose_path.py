@@ -7,6 +7,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 
+def no_jumps(t0_ns: int, t1_ns: int) -> list[int]:
+    """Return the jumps of a motion without any: the times in (t0, t1), ns, after which it stands elsewhere."""
+    return []
+
+
 @runtime_checkable
 class PosePath(Protocol):
     """A rigid motion over [t0_ns, t1_ns]; outside it the end poses are held (and the derivative is zero)."""

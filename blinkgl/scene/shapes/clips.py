@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -89,6 +90,32 @@ class Playing:
         closest = min((float(np.diff(track.times).min()) for track in tracks if len(track.times) > 1), default=0.0)
         return max(round(closest / abs(self.speed) * 0.5e9), 1) if closest and self.speed else NEVER
 
+    def jumps(self, tracks: Iterable[Track], t0_ns: int, t1_ns: int) -> list[int]:
+        """Return the times in (t0, t1), ns, increasing, at which the value of a track jumps a nanosecond later: at the
+        keys of a STEP, and where a loop begins anew with other values than it ends with."""
+        if self.is_static:
+            return []
+        tracks, places = list(tracks), set()
+        for track in tracks:
+            if track.interpolation == "STEP" and len(track.times) > 1:
+                places |= set(track.times[1:][(np.diff(track.values, axis=0) != 0).any(axis=1)].tolist())
+        if self.loop and any(_differs(track, track.at(self.first)[0], track.at(self.last)[0]) for track in tracks):
+            places.add(self.first)
+        period, times = self.period_ns, set()
+        for place in places:
+            at = round(((place - self.first - self.phase) / self.speed) * 1e9)
+            rounds = [0] if period is None else range((t0_ns - at) // period, (t1_ns - at) // period + 1)
+            times |= {self._last_before(place, at + k * (period or 0)) for k in rounds}
+        return sorted(t for t in times if t0_ns < t < t1_ns)
+
+    def _last_before(self, place: float, about_ns: int) -> int:
+        """Return the last time before the clip passes a time of its own, which is known to a nanosecond or two."""
+        for t_ns in range(about_ns - 2, about_ns + 2):
+            a, b = self.at(t_ns)[0], self.at(t_ns + 1)[0]
+            if (a < place) != (b < place) or abs(b - a) > 0.5 * (self.last - self.first):
+                return t_ns
+        return about_ns - 1
+
     def at(self, t_ns: int) -> tuple[float, float]:
         """Return (time of the clip, its rate)."""
         length, period = self.last - self.first, self.period_ns
@@ -104,6 +131,12 @@ class Playing:
         return min(max(time, self.first), self.last), self.speed if self.first <= time < self.last else 0.0
 
 
+def _differs(track: Track, a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether two values of a track differ by more than float32 files round; q and -q are one rotation."""
+    apart = min(np.abs(a - b).max(), np.abs(a + b).max() if track.path == "rotation" else np.inf)
+    return bool(apart > 1e-5 * max(np.abs(a).max(), np.abs(b).max(), 1.0))
+
+
 class Clip:
     """Tracks on a skeleton. rest : transforms of joints without a track.   tracks : of the others.   playing : timing.
 
@@ -115,6 +148,7 @@ class Clip:
         self.is_static = playing.is_static or not moving
         self.period_ns, self.span_ns = playing.period_ns, playing.span_ns
         self.timescale_ns = playing.timescale_ns(moving)
+        self.jumps = partial(playing.jumps, moving)
         scales = [track for track in moving if track.path == "scale"]
         # A cubic may go below 0 between positive keys.
         self.mirrors = any(track.interpolation == "CUBICSPLINE" or (track.values < 0).any() for track in scales)

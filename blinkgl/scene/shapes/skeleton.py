@@ -47,7 +47,8 @@ class Locals(NamedTuple):
 
 class Motion(Protocol):
     """The motion of a skeleton's joints. period_ns : its period; None: not periodic.   span_ns : time from 0 after
-    which nothing changes.   timescale_ns : time in which no velocity changes much."""
+    which nothing changes.   timescale_ns : time in which no velocity changes much.   jumps : the times in (t0, t1), ns,
+    after which a transform jumps; a motion of somebody's own need not have it."""
 
     @property
     def period_ns(self) -> int | None: ...

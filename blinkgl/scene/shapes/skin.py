@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from blinkgl.errors import AssetError
 from blinkgl.machine.kernels import kernel
+from blinkgl.scene.motion.pose_path import no_jumps
 from blinkgl.scene.shapes.skeleton import NEVER, Locals, Skeleton, Still
 from blinkgl.scene.types import Deformer, Mesh
 
@@ -33,7 +34,7 @@ _TEXTURE_WIDTH = 4096
 class Morphs:
     """Morph targets of a mesh. positions : (k, V, 3) displacements at weight 1.   normals : likewise, or None.
     weights : ((k,), (k,)) at a time in ns: weight of each, and its rate per second.
-    is_static, period_ns, span_ns, timescale_ns : as of :class:`~blinkgl.scene.shapes.skeleton.Motion`."""
+    is_static, period_ns, span_ns, timescale_ns, jumps : as of :class:`~blinkgl.scene.shapes.skeleton.Motion`."""
 
     positions: np.ndarray
     normals: np.ndarray | None
@@ -42,6 +43,7 @@ class Morphs:
     period_ns: int | None = None
     span_ns: int = 0
     timescale_ns: int = NEVER
+    jumps: Callable[[int, int], list[int]] = no_jumps
 
     def taken(self, vertices: np.ndarray) -> Morphs:
         """Return the targets of some of the vertices, in their order."""
@@ -117,6 +119,7 @@ class Skin(Deformer):
         # A motion of somebody's own may not say it.
         scales = [getattr(part, "timescale_ns", None) for part in moving]
         self.timescale_ns = None if None in scales else min(filter(None, scales), default=NEVER)
+        self._jumps = [getattr(part, "jumps", no_jumps) for part in moving]
         self.locomotion = getattr(skeleton.motion, "locomotion", "free")
         # The body moves along its x axis, whose scale is the length of the first column.
         self.speed = getattr(skeleton.motion, "speed", 0.0) * float(np.linalg.norm(self.after[:3, 0]))
@@ -130,6 +133,9 @@ class Skin(Deformer):
             }
         self.attributes = _streams(self.joints, self.weights)
         self.textures = {} if morphs is None else {"skin_morphs": _deltas_texture(morphs)}
+
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
+        return sorted({t for jumps in self._jumps for t in jumps(t0_ns, t1_ns)})
 
     @classmethod
     def rigid(

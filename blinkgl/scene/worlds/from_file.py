@@ -229,7 +229,8 @@ def _motion(
     if animation is None or not animation.moves(node):
         return StaticPath(rest @ local, t0_ns, t1_ns), baked
     motion, baked = _rigid(animation, node, t0_ns)
-    return AffinePath(motion, t0_ns, t1_ns, local, animation.span_ns, animation.timescale_ns), baked
+    path = AffinePath(motion, t0_ns, t1_ns, local, animation.span_ns, animation.timescale_ns, animation.jumps)
+    return path, baked
 
 
 def _with_lights(

@@ -74,6 +74,28 @@ def test_values_between_keys_are_the_specifications():
     assert not clip.locals(300 * MS).d_translation.any()
 
 
+@pytest.mark.parametrize("kind", ["LINEAR", "STEP", "CUBICSPLINE"])
+@pytest.mark.parametrize("seam", [False, True])
+@pytest.mark.parametrize(
+    "playing", [Playing(0, 1), Playing(0, 1.3, -1.7, 0.37), Playing(-0.1, 1, 2.3, 0.25), Playing(0, 1, 0.5, 0.1, False)]
+)
+def test_all_jumps_of_a_clip_are_known_to_the_nanosecond(kind, seam, playing):
+    """Neighbouring times at which the clip is farther apart than its speed says have a jump between
+    them, and no others have."""
+    tracks, _ = keyed(kind, joints=1)
+    if seam:
+        tracks[0].values[-1] += 1.0
+    clip = Clip(Locals.rest(1), tracks[:1], playing)
+    end, at = 2_500 * MS, lambda t: clip.locals(int(t)).translation[0].copy()
+    jumps = np.array(clip.jumps(0, end), np.int64)
+    assert all(np.abs(at(t + 1) - at(t)).max() > 1e-6 for t in jumps.tolist())
+    times = np.linspace(0, end, 20_001).astype(np.int64) + 37  # never at a jump
+    places = np.array([at(t) for t in times])
+    fast = np.abs(np.diff(places, axis=0)).max(axis=1) > 0.02
+    inside = np.searchsorted(jumps, times[1:]) > np.searchsorted(jumps, times[:-1])
+    assert (fast == inside).all() and (len(jumps) > 0) == (kind == "STEP" or (seam and playing.loop))
+
+
 def test_clips_loop_hold_and_run_backwards():
     assert Playing(2, 5).at(0) == (2, 1) and Playing(2, 5).at(4 * 10**9)[0] == 3
     assert Playing(2, 5, -1).at(10**9) == (4, -1)

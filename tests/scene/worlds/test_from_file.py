@@ -272,6 +272,16 @@ def test_animation_choices_and_limits(tmp_path):
         load(tmp_path, animated(), animation="spin")
 
 
+def test_a_camera_that_jumps_says_when(tmp_path):
+    builder = animated("STEP")
+    for channel in builder.tree["animations"][0]["channels"]:
+        channel["target"]["node"] = 0
+    path = load(tmp_path, builder).camera_path
+    jumps = path.jumps(0, T1)
+    assert jumps and all(not np.array_equal(path.pose(t), path.pose(t + 1)) for t in jumps)
+    assert load(tmp_path, animated()).camera_path.is_static
+
+
 def file_scene(tmp_path, builder=None, **tree):
     if builder is not None:
         (tmp_path / "scene.glb").write_bytes(builder.glb())

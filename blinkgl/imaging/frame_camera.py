@@ -163,11 +163,13 @@ class FrameCamera:
         """Return the mean over the exposure, (H, W, 3) float64, 1 being white; the number of instants; the largest
         motion between two of them, px."""
         config, draw = self.config, self.renderer
-        speed = draw.motion.fastest(exposure.start_ns, exposure.end_ns, config.max_px)
+        speed, jumps = draw.motion.fastest(exposure.start_ns, exposure.end_ns, config.max_px)
         points = self._points_needed(exposure.middle_ns)
         changes = max((wave.per_second() for wave in draw.scene.waveforms.values()), default=0.0)
         # As many instants as motion, lens and changing light ask for, whichever needs most.
         count = instants(exposure, speed, config.max_px, points, config.max_instants, changes)
+        if jumps:
+            count = config.max_instants
         lens = config.lens if points > 1 else None
         aperture = None if lens is None else thin_lens.points(count, lens.aperture)
         total = np.zeros((draw.height, draw.width, 3))

@@ -131,16 +131,20 @@ class Motion:
         largest = speeds.look(drawn, shapes, seen, light, (areas, sums), rows, velocities)
         return Look(t_ns, areas, sums, float(largest), rows, velocities)
 
-    def fastest(self, ta_ns: int, tb_ns: int, max_px: float) -> float:
-        """Return the largest speed, px/s, at any time from ta to tb, to a tenth of that of ``max_px`` in this time."""
+    def fastest(self, ta_ns: int, tb_ns: int, max_px: float) -> tuple[float, bool]:
+        """Return (the largest speed, px/s, at any time from ta to tb, to a tenth of that of ``max_px`` in this time;
+        whether something jumps then, or moves by more than ``max_px`` within a 256th of this time)."""
         tolerance = 0.1 * max_px / max((tb_ns - ta_ns) * 1e-9, 1e-9)
-        largest, intervals = self.look(ta_ns).largest, [(ta_ns, tb_ns)]
+        largest, intervals, jumps = self.look(ta_ns).largest, [(ta_ns, tb_ns)], bool(self.jumps(ta_ns, tb_ns))
         while intervals:
             a, b = intervals.pop()
             largest = max(largest, self.look(b).largest)
-            if 256 * (b - a) > tb_ns - ta_ns and b - a > 1 and self.hides(self.look(a), self.look(b), tolerance):
-                intervals += [((a + b) // 2, b), (a, (a + b) // 2)]
-        return largest
+            if 256 * (b - a) > tb_ns - ta_ns and b - a > 1:
+                if self.hides(self.look(a), self.look(b), tolerance):
+                    intervals += [((a + b) // 2, b), (a, (a + b) // 2)]
+            elif not self.unbounded and b > a:
+                jumps = jumps or self.hides(self.look(a), self.look(b), max_px / (b - a) * 1e9)
+        return largest, jumps
 
     def light(
         self, t_ns: int, T_world_cam: np.ndarray, dT_world_cam: np.ndarray, centres: np.ndarray

@@ -20,6 +20,7 @@ from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material
 from blinkgl.tools.shader_debugger.appearance import sample_bilinear
 from tests.render.render_scenes import LEVEL, SECOND, cube, drift, quad, scene, smooth_texture, still, thing
+from tests.timeline.test_motions import body_that_jumps, stepped_body
 
 MS = 1_000_000
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -88,6 +89,17 @@ def test_displacement_asks_for_enough_instants(gl):
         truth, image = take(max_px=1e-3, max_instants=256), take()
     assert 2 <= image.instants <= 8 and np.ptp(light_of(truth.image)) > 0.3
     assert (np.abs(light_of(image.image) - light_of(truth.image)) <= 0.5 * STEP).all()
+
+
+@pytest.mark.parametrize("world", [body_that_jumps, stepped_body])
+def test_what_stands_elsewhere_for_a_moment_of_an_exposure_is_a_ghost(gl, world):
+    """The mean of 2,000 pictures, to the part of the exposure that the most instants tell apart."""
+    with Renderer(gl, world(), FINE) as renderer:
+        image = camera_of(renderer, exposure_us=40_000, rate=25, max_instants=200, **LINEAR).take()
+        truth = np.mean([renderer.colour(20_000 * k + 10_000).read() for k in range(2_000)], axis=0)
+        at_rest = renderer.colour(1_000).read()
+    assert image.instants == 200 and np.abs(truth - at_rest).max() > 0.01
+    np.testing.assert_allclose(light_of(image.image), truth, atol=1 / 200)
 
 
 def test_what_stands_still_is_drawn_once(gl):

@@ -153,7 +153,7 @@ def test_nothing_between_two_looks_is_faster_than_they_show_unless_they_say_so(g
                 calm += 1
                 inside = max(motion.look(int(t)).largest for t in np.linspace(ta, ta + span, 42)[1:-1])
                 assert inside <= max(a.largest, b.largest) + 1.5 * tolerance
-            assert motion.fastest(ta, ta + span, 1.5) >= max(a.largest, b.largest)
+            assert motion.fastest(ta, ta + span, 1.5)[0] >= max(a.largest, b.largest)
     assert calm > 5, "otherwise every step would be examined to the end"
 
 
@@ -168,7 +168,7 @@ def test_what_is_out_of_view_at_both_ends_may_come_in_between(gl):
             a, b = motion.look(30 * MS), motion.look(70 * MS)
             assert a.largest == b.largest == 0.0
             assert motion.hides(a, b, 10.0) is hidden
-            assert (motion.fastest(30 * MS, 70 * MS, 1.0) > 1e4) is hidden
+            assert (motion.fastest(30 * MS, 70 * MS, 1.0)[0] > 1e4) is hidden
 
 
 class Trembling(Deformer):

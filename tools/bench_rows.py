@@ -242,10 +242,9 @@ def networks(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
 
 
 def main_thread(options: argparse.Namespace, stack: contextlib.ExitStack) -> Rows:
-    """An event frame with the choice of its time and its events: of the configuration at 640x480 (flying_objects unless
-    --config is given), of a crowd, and of 1,000 boxes at 320x240; and what of it keeps the main thread busy. With
-    GALLIUM_NOOP=1 and --set render.antialiasing=none Mesa draws nothing (nor takes the crowd's vertices, so it is left
-    out): what an endlessly fast card would leave."""
+    """Event frames with their times: of flying_objects (or --config) at 640x480, of a crowd, and of 1,000 boxes at
+    320x240; and the main thread's part. GALLIUM_NOOP=1 with --set render.antialiasing=none draws nothing, as an
+    endlessly fast card would (the crowd is left out, whose vertices Mesa then does not take)."""
     from blinkgl import load
     from blinkgl.gl import create_context
     from blinkgl.gl.framebuffer import Target

@@ -38,7 +38,6 @@ class Writer(Protocol):
 
     def add(self, answer: Answer) -> None:
         """Write one answer. Raises OutputError."""
-        ...
 
 
 @contextlib.contextmanager

@@ -20,9 +20,7 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.exposure import decibels
 from blinkgl.io.frame_camera import EXPOSURE_POSES, ExposureLine
-from blinkgl.io.lights import LIGHTS
-from blinkgl.io.poses import POSES
-from blinkgl.io.tracks import TRACKS
+from blinkgl.io.over_time import LIGHTS, POSES, TRACKS
 from blinkgl.labels import LABELS
 from blinkgl.machine.plugins import plugin_versions
 from blinkgl.sequence import (

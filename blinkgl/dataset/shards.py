@@ -32,7 +32,7 @@ from blinkgl.io.atomic import atomic_folder, output_errors, refuse_existing
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsReader, with_truth
 from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
-from blinkgl.io.poses import POSES, read_poses
+from blinkgl.io.over_time import POSES, read_poses
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
 from blinkgl.labels import LABELS

@@ -34,9 +34,8 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS
 from blinkgl.io.frame_camera import files_of
 from blinkgl.io.imu import FILES as IMU_FILES
-from blinkgl.io.lights import LIGHTS
+from blinkgl.io.over_time import LIGHTS, TRACKS
 from blinkgl.io.records import shown
-from blinkgl.io.tracks import TRACKS
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.plugins import missing_plugins

@@ -16,11 +16,10 @@ from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.alpha import background_of, over
 from blinkgl.io.clock import NANOSECONDS
-from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.frame_camera import camera_of
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors
 from blinkgl.io.names import Series, series
-from blinkgl.io.reading import Damage, EventReading, chosen
+from blinkgl.io.reading import NOTHING, Damage, Declared, EventReading, chosen
 from blinkgl.io.records import inside, shown_names
 from blinkgl.io.stamps import Stamps, read_timestamps, stamps_of_array
 from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills

@@ -174,6 +174,29 @@ class NpzReader(Closing):
         with self._archive.open(f"{name}.npy") as member:
             return np.lib.format.read_array(member, allow_pickle=False)
 
+    def header(self, name: str) -> tuple[tuple[int, ...], np.dtype, int]:
+        """Return shape and type of an array whose rows can be read, and where its data begin. Raises AssetError: it has
+        no rows of numbers."""
+        size = self._archive.getinfo(f"{name}.npy").file_size
+        with self._archive.open(f"{name}.npy") as member:
+            shape, fortran, dtype = npy_header(cast(BinaryIO, member), size, f"{self.path}: '{name}'")
+            if fortran or not shape or dtype.kind not in "fiu":
+                raise AssetError(
+                    f"array '{name}' is not a C-ordered array of numbers",
+                    where=str(self.path),
+                    value=f"{dtype} {shape}",
+                )
+            return shape, dtype, member.tell()
+
+    def row(self, name: str, k: int) -> np.ndarray:
+        """Return row ``k`` of an array, without the others. Raises as :meth:`header`."""
+        shape, dtype, start = self.header(name)
+        size = math.prod(shape[1:]) * dtype.itemsize
+        check_claim(size, str(self.path), os.path.getsize(self.path))
+        with self._archive.open(f"{name}.npy") as member:
+            member.seek(start + k * size)
+            return np.frombuffer(member.read(size), dtype).reshape(shape[1:])
+
 
 def checked_arrays(
     path: str | os.PathLike, shapes: dict[str, tuple[str, str]], optional: dict[str, tuple[str, str]] | None = None

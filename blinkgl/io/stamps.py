@@ -15,7 +15,6 @@ import numpy as np
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.clock import NANOSECONDS, named_unit, nanoseconds
 from blinkgl.io.records import input_errors, read_text
-from blinkgl.io.rows import read_rows, titles_of
 from blinkgl.types.numbers import exact, is_number
 
 
@@ -195,3 +194,26 @@ def _stated(titles: Sequence[str], columns: Sequence[int], heading: str, path: P
     if stated is None and re.search(r"time(code|stamp)s? format v2", heading, re.I):
         stated = "ms"  # mkvextract
     return stated or (named_unit(heading) if not titles[1:] else None) or named_unit(path.stem)
+
+
+_TITLE = re.compile(r"[^\s,;]+(?:\s*[\[(][^\])]*[\])])?")
+
+
+def read_rows(text: str, most: int = 5_000_000) -> tuple[str, list[tuple[int, list[str]]]]:
+    """Return the heading, the last comment or line without a number before the data, and (line, fields) of each line
+    of data; fields are separated by blanks, tabs, commas or semicolons, and ``#`` begins a comment."""
+    heading, rows = "", []
+    for number, line in enumerate(text.splitlines()[:most], 1):
+        body, _, comment = line.partition("#")
+        fields = [part for part in re.split(r"[\s,;]+", body.strip()) if part]
+        titled = comment.strip() if not fields else body.strip()
+        if not fields or (not rows and not any(map(is_number, fields)) and (len(fields) > 1 or not heading)):
+            heading = titled if titled and not rows else heading
+        else:
+            rows.append((number, fields))
+    return heading, rows
+
+
+def titles_of(heading: str) -> list[str]:
+    """Return the titles of a heading's columns, units in brackets included."""
+    return _TITLE.findall(heading)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.io.images import encoded
-from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.io.over_time import TRACKS, read_tracks
 from blinkgl.layouts.layout import Layout, Missing, append, growing, images, new_hdf5, write_bytes
 from blinkgl.layouts.source import Source
 

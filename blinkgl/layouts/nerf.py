@@ -28,7 +28,7 @@ from blinkgl.camera.pinhole import rectified
 from blinkgl.io.formats import write_events
 from blinkgl.io.frame_camera import EXPOSURE_POSES, EXPOSURES, read_exposure_poses, read_exposures
 from blinkgl.io.images import encode_npy, encoded
-from blinkgl.io.poses import POSES
+from blinkgl.io.over_time import POSES
 from blinkgl.layouts.frames import Frames, frames_of, two_frames, write_frames
 from blinkgl.layouts.layout import Layout, need, write_bytes, write_lines
 from blinkgl.layouts.planned import Planned

@@ -20,11 +20,10 @@ from blinkgl.io.hdf5 import CODECS
 from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU
 from blinkgl.io.intervals import intervals_in
-from blinkgl.io.poses import POSES, read_poses
+from blinkgl.io.over_time import POSES, TRACKS, read_poses, read_tracks
 from blinkgl.io.reading import listed
 from blinkgl.io.records import inside
 from blinkgl.io.stamps import read_label_times
-from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders

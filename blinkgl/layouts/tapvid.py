@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.io.over_time import TRACKS, read_tracks
 from blinkgl.layouts.layout import Layout, images, need, write_bytes
 from blinkgl.layouts.source import Source
 

@@ -23,8 +23,8 @@ from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.io.clock import NANOSECONDS, checked_unit
-from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import NOTHING, Declared
 from blinkgl.recordings.decoding import UNKNOWN, Codes, Decoder, OwnFrames, checked_gamma, meaning
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.frame_checks import FrameChecks

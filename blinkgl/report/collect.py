@@ -18,11 +18,10 @@ from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.flow import read_flow_png
 from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
 from blinkgl.io.images import read_image
-from blinkgl.io.overlays import TrackLines, with_tracks
-from blinkgl.io.pictures import picture
+from blinkgl.io.over_time import TRACKS, read_tracks
+from blinkgl.io.pictures import TrackLines, picture, with_tracks
 from blinkgl.io.records import shown
 from blinkgl.io.stamps import read_label_times
-from blinkgl.io.tracks import TRACKS, read_tracks
 from blinkgl.labels import LABELS
 from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.sequence_files.index import entry, sequence_folders, task_of

@@ -204,7 +204,7 @@ class SensorSimulation(ABC):
         return None
 
     def lights(self) -> dict[str, np.ndarray]:
-        """Return the arrays of :func:`blinkgl.io.lights.read_lights`; {}: no light changes over time."""
+        """Return the arrays of :func:`blinkgl.io.over_time.read_lights`; {}: no light changes over time."""
         return {}
 
     @abstractmethod

@@ -13,7 +13,7 @@
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
       frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)
       imu/  tracks.npz               an inertial unit; point tracks (blinkgl.io.imu, .tracks; on request)
-      lights.npz                     light that changes over time (blinkgl.io.lights)
+      lights.npz                     light that changes over time (blinkgl.io.over_time)
       poses.npz  config.yaml  manifest.json  preview.mp4
 
 Each label's row says its place (``blinkgl.labels``). DSEC's loaders take every file of ``flow/forward`` for a PNG.

@@ -12,7 +12,7 @@ from rich.table import Table
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.declared import Declared
+from blinkgl.io.reading import Declared
 from blinkgl.machine.terminal import plain_column, plain_console, say
 from blinkgl.recordings.calibration import Calibration, calibrate
 from blinkgl.recordings.clip import FrameReading

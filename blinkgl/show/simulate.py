@@ -59,8 +59,8 @@ def run(
 ) -> int:
     """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``frames``: gamma, interpolate, max_px and
     keep_noise, see :class:`~blinkgl.recordings.simulation.FrameUse`.   ``declared``: of the frames, as of
-    :class:`~blinkgl.io.declared.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
-    from blinkgl.io.declared import Declared
+    :class:`~blinkgl.io.reading.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
+    from blinkgl.io.reading import Declared
     from blinkgl.machine.compiling import announced_compiling
     from blinkgl.recordings.decoding import Codes
     from blinkgl.recordings.simulation import FrameUse, file_to_events, own_frames

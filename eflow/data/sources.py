@@ -54,8 +54,11 @@ class Source(Protocol):
 
     has_backward: bool
 
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int) -> RawSample: ...
+    def __len__(self) -> int:
+        """Return the number of samples."""
+
+    def __getitem__(self, index: int) -> RawSample:
+        """Return a sample. Raises AssetError."""
 
 
 @dataclass(frozen=True)

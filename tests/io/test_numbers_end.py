@@ -16,12 +16,11 @@ import eflow
 from blinkgl.config.camchain import read_camchain, read_place_on_body
 from blinkgl.config.reader import read_table
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import open_events
 from blinkgl.io.frame_camera import EXPOSURES, read_exposures
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import encode_png, read_pfm
-from blinkgl.io.reading import EventReading
+from blinkgl.io.reading import Declared, EventReading
 from blinkgl.io.stamps import read_label_times, read_timestamps
 from blinkgl.io.stills import open_stills
 from blinkgl.io.trajectories import read_trajectory

@@ -18,8 +18,8 @@ from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
+from blinkgl.io.over_time import read_tracks
 from blinkgl.io.reading import EventReading
-from blinkgl.io.tracks import read_tracks
 from blinkgl.layouts import LAYOUTS, dsec, event_kubric, export as exporting, export_layout
 from blinkgl.layouts.planned import Planned
 from blinkgl.layouts.source import sources_of

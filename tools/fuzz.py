@@ -52,7 +52,7 @@ from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import open_frames, read_any_image
 from blinkgl.io.reading import Declared, EventReading
 from blinkgl.io.records import sealed
-from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.times import read_timestamps
 from blinkgl.io.trajectories import PoseFile, read_trajectory
 from blinkgl.layouts import export_layout
 from blinkgl.report.page import write_report

@@ -1,4 +1,5 @@
-"""Pictures of arrays, by kind of label or of a shader debugger's buffer."""
+"""Pictures of arrays, by kind of label or of a shader debugger's buffer; objects' boxes and the tracks of points over a
+picture."""
 
 from __future__ import annotations
 

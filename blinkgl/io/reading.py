@@ -1,6 +1,8 @@
-"""What a user declares about an event file. What is not declared is read from the file, and nothing is guessed.
+"""What a user declares about an event file or a clip of frames. What is not declared is read from the file, and nothing
+is guessed.
 
-One value of :class:`EventReading` passes from a command's options, or a Python function's arguments, to every reader.
+One value of :class:`EventReading`, or of :class:`Declared` for frames, passes from a command's options, or a Python
+function's arguments, to every reader.
 """
 
 from __future__ import annotations
@@ -14,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.alpha import background_of
-from blinkgl.io.clock import checked_unit
+from blinkgl.io.times import checked_unit
 from blinkgl.types.numbers import is_number
 
 _MOST_SIDE = 65536
@@ -158,6 +159,18 @@ def chosen(
     raise AssetError(problem, where=where, accepted=("one of " if len(names) > 1 else "") + ", ".join(listed), **value)
 
 
+_NAMED = {"black": (0, 0, 0), "grey": (128, 128, 128), "gray": (128, 128, 128), "white": (255, 255, 255)}
+
+
+def background_of(text: str | None) -> tuple[int, int, int] | None:
+    """Return (r, g, b), 0 to 255, of ``black``, ``grey``, ``white`` or ``#rrggbb``. Raises ConfigError."""
+    if text is None or text in _NAMED:
+        return None if text is None else _NAMED[text]
+    if re.fullmatch(r"#[0-9a-fA-F]{6}", text):
+        return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
+    raise ConfigError("unknown colour", where="--background", value=text, accepted="black, grey, white or #rrggbb")
+
+
 RANGES = ("full", "limited")
 
 
@@ -165,7 +178,7 @@ RANGES = ("full", "limited")
 class Declared:
     """What a user declares of a clip of frames; None: what the file says.
 
-    fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.stamps`).
+    fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.times`).
     time_unit : of these, "s", "ms", "us", "ns", or "frames" of ``fps``.   zero_time : count times from the first frame.
     white_level : code of white.   range : "full" or "limited" (16 to 235 of 8 bits).   background : colour below
     transparent pixels, "black", "grey", "white" or "#rrggbb".   stream : name or number of one of several arrays or

@@ -18,7 +18,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.columns import windows
 from blinkgl.io.formats import ENDINGS, EventFile, ending_of, kind_of_files, open_events
-from blinkgl.io.frames import CALLED
+from blinkgl.io.frames import CALLED, open_frames
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
 from blinkgl.io.reading import AS_FILE, NOTHING, Declared, EventReading
 from blinkgl.machine.kernels import kernel
@@ -314,7 +314,6 @@ def _frame_intervals(
 ) -> tuple[np.ndarray, Iterator[np.ndarray], list[str]]:
     """Return the edges (µs) of the frame intervals inside [start, stop), lazily the change of ln(I + 10) over each, and
     notes on the frames."""
-    from blinkgl.io.frames import open_frames
     from blinkgl.recordings.decoding import Codes, OwnFrames, meaning
 
     for file in files:

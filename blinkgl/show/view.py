@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from blinkgl.errors import ConfigError, OutputError
+from blinkgl.io.atomic import refuse_file
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.terminal import plain_console, say
 
@@ -53,8 +54,7 @@ def _save(console: Console, folders: list[Path], out: Path, port: int | None, ov
         raise ConfigError(
             "a file shows one sequence", where="--save", value=len(folders), accepted=f"one, such as {folders[0]}"
         )
-    if out.exists() and not overwrite:  # before the work, not after it
-        raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
+    refuse_file(out, overwrite)
     from blinkgl.viewer.page import save
 
     with console.status("drawing"):

@@ -196,26 +196,23 @@ class _MvsecSequence:
         self.t0_s = float(stamps[0])
         self.image_us = _stamps(stamps - self.t0_s, f"{path}: 'davis/left/image_raw_ts'")
         self.flow_us = _stamps(self._truth.times - self.t0_s, f"{self._truth.path}: its time stamps")
-        self._file: Hdf5File | None = None
-        self._pid: int | None = None
-        self._table: Data | None = None
+        self._opened: Recent[int, tuple[Hdf5File, Data]] = Recent(1)
+        """By process: HDF5 handles do not survive a fork."""
         self._rows: Recent[int, Flow] = Recent(9)
 
-    def __getstate__(self) -> dict:
-        return {**self.__dict__, "_file": None, "_pid": None, "_table": None}
+    def _open(self) -> tuple[Hdf5File, Data]:
+        file = open_hdf5(self.path)
+        return file, _table(file, self.path)
 
     def window(self, t0: int, t1: int) -> Window:
         """Return the events of [t0, t1) µs. The event indices of the images are hints; times decide."""
-        if self._pid != os.getpid():  # HDF5 handles do not survive a fork
-            self._file, self._pid = open_hdf5(self.path), os.getpid()
-            self._table = _table(self._file, self.path)
+        _, table = self._opened.of(os.getpid(), self._open)
         images = np.searchsorted(self.image_us, t0, side="right") - 1, np.searchsorted(self.image_us, t1)
         low, high = (int(np.clip(self._inds[min(max(k, 0), len(self._inds) - 1)], 0, self._count)) for k in images)
         margin, where = 4096, str(self.path)
         while True:
             i, j = max(low - margin, 0), min(high + margin, self._count)
-            assert self._table is not None
-            rows = self._table[i : max(i, j)]
+            rows = table[i : max(i, j)]
             t = microseconds(rows[:, 2] - self.t0_s, where, i)
             enough = len(t) and (i == 0 or t[0] < t0) and (j == self._count or t[-1] >= t1)
             if enough or (i == 0 and j == self._count):

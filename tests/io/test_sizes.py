@@ -22,9 +22,9 @@ from blinkgl.errors import AssetError
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import NpzReader, read_png
-from blinkgl.io.over_time import read_poses, read_tracks
+from blinkgl.io.records import check_claim, most_unpacked, unpacked
 from blinkgl.io.ros import event_array, typestore
-from blinkgl.io.sizes import check_claim, most_unpacked, unpacked
+from blinkgl.io.sequence_tables import read_poses, read_tracks
 from blinkgl.io.stills import open_stills
 from blinkgl.types.events import Events
 from eflow.data.mvsec import NpzTruth

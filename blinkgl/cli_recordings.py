@@ -207,8 +207,7 @@ def compare(
     sort: of_events.Sort = False,
 ) -> int:
     """Describe a recording, or compare it with events or frames."""
-    from blinkgl.io.declared import Declared
-    from blinkgl.io.reading import EventReading
+    from blinkgl.io.reading import Declared, EventReading
     from blinkgl.show import compare as command
 
     return command.run(

@@ -118,8 +118,8 @@ def render(
     about = {"recipe": Path(recipe).name, "split": split, "seed": seed, "per_sequence": sampling.per_sequence}
     about |= {key: getattr(source, key) for key in ("set", "window_ms", "min_events", "max_flow", "min_density")}
     refuse_existing(Path(out))  # before any worker starts
-    with interruptible(*STOPS), open_online(source, seed, split=split) as stream:
-        done = render_pool(stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
+    with interruptible(*STOPS), open_online(source, seed, split=split) as online:
+        done = render_pool(online.stream, samples, out, about=about, progress=Counting(samples, "windows", not quiet))
     if not quiet:
         print(f"{done} windows in {out}", file=sys.stderr)
 

@@ -19,7 +19,7 @@ from eflow.methods.table import METHODS, Method, make_method
 if TYPE_CHECKING:
     from blinkgl.io.reading import EventReading
     from eflow.config import SourceConfig
-    from eflow.data.online import Held
+    from eflow.data.sources import Part
     from eflow.models import FlowModel
 
 Answer = Annotated[
@@ -238,8 +238,8 @@ def network_of(checkpoint: str, *, iterations: int | None = None, warm_start: bo
     network."""
     import torch
 
-    from eflow.allocator import keep_memory
     from eflow.checkpoint import load_model
+    from eflow.machine import keep_memory
 
     keep_memory()
     model = load_model(checkpoint)
@@ -257,7 +257,7 @@ def one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
         raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
 
 
-def rendered(recipe: str, window_ms: str | None, limit: int | None) -> Held:
+def rendered(recipe: str, window_ms: str | None, limit: int | None) -> Part:
     """Return samples of a recipe, rendered and kept in memory."""
     from eflow.data.online import held
 

@@ -25,9 +25,8 @@ from eflow.infer import Predictor
 from eflow.methods import Method
 from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
-from eflow.pictures import comparison, events_of, write_picture
 from eflow.types import Flow, Mask, Numbers
-from eflow.writers import Answer
+from eflow.writers import Answer, comparison, events_of, write_picture
 
 MEDIAN_FRAMES, PICTURES = 64, 12
 BASELINES = ("zero flow", "median of the set", "median of the frame", "affine of the frame")

@@ -20,7 +20,7 @@ from eflow.methods import Method
 from eflow.methods.contrast import sharpest_length
 from eflow.methods.dominant import toward_dominant
 from eflow.models import FlowModel, FlowPrediction
-from eflow.ops.warp import forward_warp
+from eflow.ops.resample import forward_warp
 from eflow.types import Batch, Flow, Grid
 
 PICTURED = VoxelGrid(bins=2, normalise="none")

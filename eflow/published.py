@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import cast
@@ -120,33 +121,42 @@ def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
     return model.eval()
 
 
+_RENAMED = {
+    "^features": "fnet",
+    "^context": "cnet",
+    "^update": "update_block",
+    r"net\.0\.": "net.conv1.",
+    r"net\.1\.": "net.norm1.",
+    # Layers 3 to 8 are three stages of two residual blocks each.
+    r"net\.3\.": "net.layer1.0.",
+    r"net\.4\.": "net.layer1.1.",
+    r"net\.5\.": "net.layer2.0.",
+    r"net\.6\.": "net.layer2.1.",
+    r"net\.7\.": "net.layer3.0.",
+    r"net\.8\.": "net.layer3.1.",
+    r"net\.9\.": "net.conv2.",
+    "shortcut": "downsample",
+    "mask_head": "mask",
+    "motion.corr": "encoder.convc",
+    "motion.flow": "encoder.convf",
+    "motion.join": "encoder.conv",
+    # Update and reset gate are one convolution here and two there.
+    r"gates\.0": "conv{gate}1",
+    r"gates\.1": "conv{gate}2",
+    r"candidates\.0": "convq1",
+    r"candidates\.1": "convq2",
+    r"flow_head\.0": "flow_head.conv1",
+    r"flow_head\.2": "flow_head.conv2",
+}
+"""Parts of our names, in this order -> what they are called in published files."""
+
+
 def published_names(name: str) -> tuple[str, ...]:
     """Return the published names of the parameter ``name``: that of ``features.3.conv1.weight`` is
-    ``fnet.layer1.0.conv1.weight``. The update and reset gates are one convolution here and two there."""
-    part, _, rest = name.partition(".")
-    if part in ("features", "context"):
-        index, _, rest = rest.partition(".")
-        at = int(index)
-        # Layers 3 to 8 are three stages of two residual blocks each.
-        if 3 <= at <= 8:
-            where = f"layer{(at - 3) // 2 + 1}.{(at - 3) % 2}.{rest.replace('shortcut', 'downsample')}"
-        else:
-            where = f"{ {0: 'conv1', 1: 'norm1', 9: 'conv2'}[at] }.{rest}"
-        return (f"{'fnet' if part == 'features' else 'cnet'}.{where}",)
-    part, _, rest = rest.partition(".")
-    if part == "motion":
-        layer, _, rest = rest.partition(".")
-        names = {"corr1": "convc1", "corr2": "convc2", "flow1": "convf1", "flow2": "convf2", "join": "conv"}
-        return (f"update_block.encoder.{names[layer]}.{rest}",)
-    if part == "gru":
-        kind, index, rest = rest.split(".", 2)
-        # Update and reset gate are one convolution here and two there.
-        letters = "zr" if kind == "gates" else "q"
-        return tuple(f"update_block.gru.conv{letter}{int(index) + 1}.{rest}" for letter in letters)
-    index, _, rest = rest.partition(".")
-    if part == "flow_head":
-        return (f"update_block.flow_head.conv{ {'0': 1, '2': 2}[index] }.{rest}",)
-    return (f"update_block.mask.{index}.{rest}",)
+    ``fnet.layer1.0.conv1.weight``; there are two of a convolution that is both gates."""
+    for part, published in _RENAMED.items():
+        name = re.sub(part, published, name)
+    return tuple(dict.fromkeys(name.format(gate=gate) for gate in "zr"))
 
 
 def _reordered(weight: Tensor) -> Tensor:

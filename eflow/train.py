@@ -42,15 +42,14 @@ from eflow.config import OptimConfig, TrainConfig
 from eflow.data.content import content_of
 from eflow.data.dataset import FlowDataset, StepSampler, batches, is_endless
 from eflow.data.sources import Source
-from eflow.devices import agree, compile_errors, setup, to_device
+from eflow.machine import agree, compile_errors, precision_on, setup, to_device
 from eflow.metrics import sequence_loss
 from eflow.models import FlowModel, build_model
-from eflow.pictures import comparison, events_of, write_picture
-from eflow.precision import precision_on
 from eflow.progress import Log, Readings, Signals, TrainProgress, Waiting, cost_of
 from eflow.schedule import Course, learning_rate
 from eflow.training_data import check_sizes, check_truth, training_sets, validate, validation_sets
 from eflow.types import Picture
+from eflow.writers import comparison, events_of, write_picture
 
 
 @dataclass

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from blinkgl.report import calibration
-from blinkgl.show import comparison_plot
+from blinkgl.show import compare
 from blinkgl.viewer import page, stage
 
 SEEN = {
@@ -25,7 +25,7 @@ STYLE = Path(page.__file__).parents[1] / "report/templates/style.css"
 PALETTES = {
     "the report's stacks": re.findall(r"--s\d: (#\w{6})", STYLE.read_text(encoding="utf-8")),
     "the calibration's curves": list(calibration._COLOURS.values()),
-    "the comparison's curves": [comparison_plot._A, comparison_plot._B],
+    "the comparison's curves": [compare._A, compare._B],
     "the viewer's axes": list(page.XYZ),
     "ON and OFF": ["#" + bytes(colour).hex() for colour in (stage.ON, stage.OFF)],
 }

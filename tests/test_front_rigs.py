@@ -8,8 +8,8 @@ import pytest
 import blinkgl
 from blinkgl import Camera, Rig, RigSensor, Timeline, record
 from blinkgl.errors import ConfigError
-from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.imu import read_imu
+from blinkgl.io.sequence_tables import read_exposures
 from blinkgl.sequence_files.rig_dir import read_sensors
 from tests.test_front import box_scene
 

@@ -38,8 +38,8 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.gl import create_context
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import convert
+from blinkgl.io.reading import Declared
 from blinkgl.layouts.export import LAYOUTS, export_layout
 from blinkgl.machine.cpu import cpu_field
 from blinkgl.recordings.simulation import file_to_events

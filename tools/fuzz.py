@@ -47,13 +47,12 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import Declared
 from blinkgl.io.flow import read_flo, read_flow, read_flow_png, write_flow
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.frames import open_frames, read_any_image
-from blinkgl.io.reading import EventReading
+from blinkgl.io.reading import Declared, EventReading
 from blinkgl.io.records import sealed
-from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.times import read_timestamps
 from blinkgl.io.trajectories import PoseFile, read_trajectory
 from blinkgl.layouts import export_layout
 from blinkgl.report.page import write_report

@@ -33,8 +33,8 @@ from blinkgl.config.reader import to_short_yaml
 from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.sensor import load_sensor
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.frames import read_any_image
+from blinkgl.io.reading import NOTHING, Declared
 from blinkgl.machine.terminal import plain_console, say
 from blinkgl.recordings.bursts import inside_any
 from blinkgl.recordings.calibration import judge_half

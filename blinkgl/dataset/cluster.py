@@ -13,9 +13,10 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
+from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.messages import Message
 from blinkgl.dataset.work import Job, Maker, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
@@ -29,7 +30,7 @@ _STOP_S = 15.0
 _CONNECT_S = 5.0
 
 
-class RayCluster:
+class RayCluster(Executor):
     """Executor of :mod:`blinkgl.dataset.run` on Ray. A lost worker costs an attempt, a lost node does not.
 
     workers : tasks at a time; default: the number of CPUs of the cluster, new nodes included.
@@ -55,7 +56,6 @@ class RayCluster:
                 "Ray is not installed", where="--executor", value="ray", accepted=f"run {install('ray')}"
             ) from None
         self._ray, self._workers, self._address, self._gpus = ray, workers, address, gpus
-        self.listener: Callable[[Message], None] = lambda message: None
         self._ours = False
         self._tasks: dict[Any, int] = {}  # object reference -> task
         self._reasons: dict[int, str] = {}  # task -> why it was killed

@@ -1,13 +1,6 @@
 """Executors: this process, or a pool of processes on this machine. (Many machines: :mod:`blinkgl.dataset.cluster`.)
 
-All have the same interface, so that the loop in :mod:`blinkgl.dataset.run` works with any of them:
-
-    open(job)               prepare for work, or BlinkGLError. Returns the workers' hellos.
-    free()                  number of further tasks it would start at once
-    submit(task, attempt)
-    poll(timeout_s)         messages received meanwhile; a dead worker is a "failed" of its task
-    kill(task, reason)      the task took too long
-    close()                 stops everything, waits, leaves no half sequence and no process
+All have the same interface, so that the loop in :mod:`blinkgl.dataset.run` works with any of them.
 """
 
 from __future__ import annotations
@@ -49,21 +42,32 @@ class Executor(Protocol):
     """Runs the tasks of a run: :class:`Inline`, :class:`Local`, and Ray's in :mod:`blinkgl.dataset.cluster`."""
 
     listener: Callable[[Message], None]
-    """Called with progress that ``poll`` does not return (:class:`Inline`)."""
+    """Called with progress that ``poll`` does not return (:class:`Inline`); a run sets it before it polls."""
 
-    def open(self, job: Job) -> list[Message]: ...
-    def free(self) -> int: ...
-    def submit(self, task: int, attempt: int) -> None: ...
-    def poll(self, timeout_s: float) -> list[Message]: ...
-    def kill(self, task: int, reason: str) -> None: ...
-    def close(self) -> None: ...
+    def open(self, job: Job) -> list[Message]:
+        """Prepare for work; return the workers' hellos. Raises BlinkGLError."""
+
+    def free(self) -> int:
+        """Return the number of further tasks that it would start at once."""
+
+    def submit(self, task: int, attempt: int) -> None:
+        """Start a task."""
+
+    def poll(self, timeout_s: float) -> list[Message]:
+        """Return the messages received meanwhile; a dead worker is a "failed" of its task."""
+
+    def kill(self, task: int, reason: str) -> None:
+        """End a task that took too long."""
+
+    def close(self) -> None:
+        """Stop everything and wait; leave no half sequence and no process."""
 
 
-class Inline:
+class Inline(Executor):
     """Runs tasks in this process, without a time limit."""
 
     def __init__(self) -> None:
-        self.listener: Callable[[Message], None] = lambda message: None
+        self.listener = lambda message: None
         self._maker: Maker | None = None
         self._next: tuple[int, int] | None = None
 
@@ -92,7 +96,7 @@ class Inline:
             self._maker.__exit__()
 
 
-class Local:
+class Local(Executor):
     """``workers`` processes, each with its own OpenGL context and its share of the cores.
 
     devices : EGL devices, distributed over the workers. Default: all graphics cards, if there are several and the
@@ -113,7 +117,6 @@ class Local:
                 value=workers,
                 accepted="none: this process alone",
             )
-        self.listener: Callable[[Message], None] = lambda message: None
         self._wanted, self._devices, self._cores = workers, devices, cores
         self._processes: list[_Process] = []
         self._selector = selectors.DefaultSelector()

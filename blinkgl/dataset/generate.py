@@ -19,10 +19,7 @@ from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.gl import GLContext, create_context
 from blinkgl.imaging.exposure import decibels
-from blinkgl.io.frame_camera import EXPOSURE_POSES, ExposureLine
-from blinkgl.io.lights import LIGHTS
-from blinkgl.io.poses import POSES
-from blinkgl.io.tracks import TRACKS
+from blinkgl.io.sequence_tables import EXPOSURE_POSES, LIGHTS, POSES, TRACKS, ExposureLine
 from blinkgl.labels import LABELS
 from blinkgl.machine.plugins import plugin_versions
 from blinkgl.sequence import (

@@ -13,7 +13,6 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.assets import check_assets, digest
@@ -49,12 +48,17 @@ class Outcome:
     """Folders found damaged and moved to ``.run/damaged``: name -> the problem."""
 
 
-class Listener(Protocol):
-    """The interface of a display; see :mod:`blinkgl.show.generate`."""
+class Listener:
+    """The interface of a display, and one that shows nothing; see :mod:`blinkgl.show.generate`."""
 
-    def begin(self, plan: Plan, outcome: Outcome) -> None: ...
-    def message(self, name: str, message: Message) -> None: ...
-    def end(self, outcome: Outcome) -> None: ...
+    def begin(self, plan: Plan, outcome: Outcome) -> None:
+        """Be told what is there and what will be made."""
+
+    def message(self, name: str, message: Message) -> None:
+        """Be told what a worker says of the sequence ``name``."""
+
+    def end(self, outcome: Outcome) -> None:
+        """Be told how the run ended, in every case."""
 
 
 def run_dataset(
@@ -80,7 +84,7 @@ def run_dataset(
     another recipe, in use by another run, cannot be written). Raises during work: OutputError when the disk is full,
     KeyboardInterrupt for Ctrl-C and SIGTERM; complete sequences stay, and ``resume`` continues.
     """
-    executor = executor or Inline()
+    executor, listener = executor or Inline(), listener or Listener()
     out = Path(out)
     check_output(out)
     plan = Plan.of(template, num)
@@ -108,8 +112,7 @@ def run_dataset(
                 folder.take_back_logs()
             elif folder.begun and folder.in_place:
                 _leave(plan, folder, outcome, assets, num)
-            if listener:
-                listener.end(outcome)
+            listener.end(outcome)
         if outcome.set_aside and not (outcome.made or outcome.found):
             folder.forget(plan, keep_logs=outcome.surprises > 0)
             reason, others = next(iter(outcome.set_aside.values())), ""
@@ -125,14 +128,13 @@ def _make_missing(
     folder: RunFolder,
     outcome: Outcome,
     time_limit_s: float,
-    listener: Listener | None,
+    listener: Listener,
 ) -> None:
     """Make what is missing, in a folder without what was found damaged."""
     for name in outcome.damaged:
         folder.put_away(name)
     folder.sweep(plan)
-    if listener:
-        listener.begin(plan, outcome)
+    listener.begin(plan, outcome)
     started, missing = time.monotonic(), outcome.planned > outcome.found
     if missing:
         _loop(plan, executor, folder, outcome, time_limit_s, listener)
@@ -201,7 +203,7 @@ def _after_failure(message: Message, name: str, attempt: int, folder: RunFolder,
 
 
 def _loop(
-    plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener | None
+    plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener
 ) -> None:
     running: dict[int, tuple[int, float]] = {}  # task -> attempt, since when
     # Existing entries were checked before; damaged ones have been moved away by now.
@@ -210,8 +212,7 @@ def _loop(
     again: deque[tuple[int, int]] = deque()
 
     def tell(message: Message) -> None:
-        if listener:
-            listener.message(plan.tasks[message["task"]].name, message)
+        listener.message(plan.tasks[message["task"]].name, message)
 
     executor.listener = tell
     environment = folder.environment

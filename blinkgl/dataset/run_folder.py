@@ -30,13 +30,13 @@ from blinkgl.dataset.messages import RUN_FOLDER, Message, SequenceLog
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import (
-    atomic_file,
     fsync,
     is_still,
     locked_folder,
     make_folders,
     output_errors,
     remove_stale,
+    write_whole,
 )
 from blinkgl.io.records import entries_below, inside, parse, read_text, shown
 from blinkgl.machine.posix import fcntl
@@ -269,8 +269,7 @@ class RunFolder:
             },
         )
         self._write("assets.json", assets)
-        with atomic_file(self.path / "recipe.yaml") as path, output_errors(path):
-            path.write_text(plan.recipe_text(), encoding="utf-8")
+        write_whole(self.path / "recipe.yaml", plan.recipe_text())
         # Costs and failures are written during the run: they have no checksum until it ends.
         self.seal(_BEGUN)
         self.begun = True
@@ -381,8 +380,7 @@ class RunFolder:
             ) from error
 
     def _write(self, name: str, data: Tree) -> None:
-        with atomic_file(self.path / name) as path, output_errors(path):
-            path.write_text(_text(data), encoding="utf-8")
+        write_whole(self.path / name, _text(data))
 
 
 def _text(data: Mapping[str, object]) -> str:

@@ -31,13 +31,12 @@ from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_folder, output_errors, refuse_existing
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsReader, with_truth
-from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
-from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.records import shown
-from blinkgl.io.stamps import read_label_times
+from blinkgl.io.sequence_tables import EXPOSURES, POSES, ExposureLine, picture_file, read_exposures, read_poses
+from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.machine.heartbeat import heartbeat
-from blinkgl.sequence_files.index import sequence_folders
+from blinkgl.sequence_files.index import data_set, sequence_folders
 from blinkgl.sequence_files.sequence_dir import read_manifest, whole
 from blinkgl.types.events import TOLD, Events
 from blinkgl.types.trees import Tree
@@ -59,10 +58,9 @@ def export_shards(
     Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially.
     note : called with a line for each sequence that is left out. Raises
     AssetError (no labels, a damaged sequence), OutputError (an existing folder, disk full)."""
-    root, out = Path(root), Path(out)
+    out = Path(out)
     refuse_existing(out)
-    if not root.is_dir():
-        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    root = data_set(root)
     labels: dict[str, list[tuple[Path, int]]] = {}
     for number, folder in enumerate(sequence_folders(root), 1):
         heartbeat.at(f"sequence {number:,}")

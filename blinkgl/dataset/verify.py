@@ -32,15 +32,13 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS
-from blinkgl.io.frame_camera import files_of
 from blinkgl.io.imu import FILES as IMU_FILES
-from blinkgl.io.lights import LIGHTS
 from blinkgl.io.records import shown
-from blinkgl.io.tracks import TRACKS
+from blinkgl.io.sequence_tables import LIGHTS, TRACKS, files_of
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.plugins import missing_plugins
-from blinkgl.sequence_files.index import made_folders, sequence_folders
+from blinkgl.sequence_files.index import data_set, made_folders, sequence_folders
 from blinkgl.sequence_files.rig_dir import FILES as LENS_FILES
 from blinkgl.sequence_files.sequence_dir import MANIFEST, RIG, manifest_problems, read_manifest, verify_sequence
 from blinkgl.types.trees import Tree
@@ -241,9 +239,7 @@ def verify_dataset(
     deep : this many sequences, drawn with ``seed``, are generated again and compared bit by bit.
     base : folder that the recipe's relative paths start from; default: as recorded by the run.
     Raises AssetError when ``root`` holds no sequence."""
-    root = Path(root)
-    if not root.is_dir():
-        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    root = data_set(root)
     result = Verification()
     folders = list(made_folders(root))
     if not folders and not (root / RUN_FOLDER).is_dir():

@@ -17,7 +17,7 @@ from blinkgl.types.events import Events
 
 if TYPE_CHECKING:
     from blinkgl.front.sections import Section
-    from blinkgl.io.declared import Declared
+    from blinkgl.io.reading import Declared
     from blinkgl.recordings.calibration import Calibration
     from blinkgl.recordings.comparison import Comparison
     from blinkgl.recordings.simulation import FrameUse, SimulationReport
@@ -349,7 +349,7 @@ def _options(
 
 def _declared(options: Mapping[str, Any], unit: str = "time_unit") -> Declared:
     """Return what is declared of frames; ``unit`` is the key of the unit of their times. Raises ConfigError."""
-    from blinkgl.io.declared import Declared
+    from blinkgl.io.reading import Declared
 
     fps, white, stamps = options.get("fps"), options.get("white_level"), options.get("timestamps")
     return Declared(

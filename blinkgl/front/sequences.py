@@ -83,7 +83,7 @@ class Recording:
     camera : :class:`CameraImage` of the frame camera, with ``images:``.
     imu : measurements of the inertial unit, :class:`~blinkgl.sequence.inertial.Inertial`; None: no unit.
     tracks : tracked points, :class:`~blinkgl.render.tracks.Tracks`; None: not requested.
-    lights : arrays of light that changes over time, as of :func:`blinkgl.io.lights.read_lights`; {}: none does.
+    lights : of light that changes over time, as of :func:`blinkgl.io.sequence_tables.read_lights`; {}: none does.
 
     cameras : recordings by name; that of a frame camera without events contains none.
     units : measurements of every sensor with an inertial unit, by name; ``T_cam_imu`` leads to that sensor's axes.

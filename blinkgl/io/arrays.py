@@ -16,13 +16,11 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_npy
 from blinkgl.io.names import series
 from blinkgl.io.reading import AS_FILE, EventReading
-from blinkgl.io.records import shown_names
-from blinkgl.io.sizes import check_claim
+from blinkgl.io.records import check_claim, shown_names
 from blinkgl.io.tables import (
     Candidate,
     Table,
@@ -35,6 +33,7 @@ from blinkgl.io.tables import (
     table_of_records,
     table_of_rows,
 )
+from blinkgl.io.times import named_unit
 from blinkgl.types.events import Events
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -116,8 +116,7 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
     final = Path(final)
     if final.is_dir():
         raise OutputError("is a folder", where=str(final), accepted="a file name")
-    if final.exists() and not overwrite:
-        raise OutputError("output file exists", where=str(final), accepted="a new name, or --overwrite")
+    refuse_file(final, overwrite)
     with _appearing(final) as temporary:
         yield temporary
         with output_errors(final):
@@ -268,6 +267,12 @@ def make_folders(folder: Path) -> list[Path]:
         with contextlib.suppress(PermissionError):  # a folder of others that may be entered and not read
             fsync(place.parent)
     return missing
+
+
+def refuse_file(final: Path, overwrite: bool) -> None:
+    """Raise OutputError when ``final`` exists, unless it may be overwritten: said before long work, not after it."""
+    if final.exists() and not overwrite:
+        raise OutputError("output file exists", where=str(final), accepted="a new name, or --overwrite")
 
 
 def refuse_existing(final: str | os.PathLike) -> None:

@@ -165,6 +165,24 @@ def joined(pieces: Iterable[Events], least: int) -> Iterator[Events]:
         yield Events.concatenate(pending)
 
 
+def windows(pieces: Iterable[Events], edges: np.ndarray) -> Iterator[Events]:
+    """Yield the events of each [edges[k], edges[k+1]), µs, also of empty ones; no piece is empty."""
+    parts: list[Events] = []
+    k, last = 0, len(edges) - 1
+    for events in pieces:
+        while k < last:
+            parts.append(events.window(int(edges[k]), int(edges[k + 1])))
+            if events.t[-1] < edges[k + 1]:
+                break  # the interval may go on in the next piece
+            yield Events.concatenate(parts)
+            parts, k = [], k + 1
+        if k == last:
+            return
+    while k < last:
+        yield Events.concatenate(parts)
+        parts, k = [], k + 1
+
+
 class CheckedWriter(Finishing):
     """Base of writers of event files: checks what it is given, counts, and closes ``_file``. A subclass has
     :meth:`_write`.

@@ -27,6 +27,9 @@ from blinkgl.types.events import TOLD, TRUTH, Cause, Events
 EVENT_LABELS = "event_labels.h5"
 BLOCK = 1 << 17
 """Rows per HDF5 chunk and per write, as in ``events.h5``."""
+_COLUMNS = {name: TRUTH[name].subdtype or (TRUTH[name], ()) for name in (*TOLD, "light")}
+_COLUMNS["cause"] = np.dtype(np.uint8), ()
+"""Column -> type and shape of a row."""
 
 
 class EventLabelsWriter(Finishing):
@@ -40,10 +43,7 @@ class EventLabelsWriter(Finishing):
         self._rows, self._names = 0, (*TOLD, "light") if lights else TOLD
         with output_errors(self.path):
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
-            self._columns = {
-                name: growing_dataset(self._file, name, (0, *shape), base, (BLOCK, *shape), codec)
-                for name, (base, shape) in {name: _parts(TRUTH[name]) for name in self._names}.items()
-            }
+            self._columns = {name: self._column(name) for name in self._names}
         self._blocks = Blocks(self._columns, BLOCK, self._store)
 
     def append(self, events: Events) -> None:
@@ -55,9 +55,13 @@ class EventLabelsWriter(Finishing):
         rows = {name: events.truth[name] for name in self._names}
         with output_errors(self.path):
             if not self._rows and events.cause is not None:
-                self._columns["cause"] = growing_dataset(self._file, "cause", (0,), np.uint8, (BLOCK,), self._codec)
+                self._columns["cause"] = self._column("cause")
             self._rows += len(events)
             self._blocks.add(rows if events.cause is None else {**rows, "cause": events.cause}, len(events))
+
+    def _column(self, name: str) -> h5py.Dataset:
+        kind, shape = _COLUMNS[name]
+        return growing_dataset(self._file, name, (0, *shape), kind, (BLOCK, *shape), self._codec)
 
     def close(self) -> None:
         with output_errors(self.path):
@@ -74,10 +78,6 @@ class EventLabelsWriter(Finishing):
             write_rows(column, len(column), block[name])
 
 
-def _parts(kind: np.dtype) -> tuple[np.dtype, tuple[int, ...]]:
-    return (kind, ()) if kind.subdtype is None else kind.subdtype
-
-
 class EventLabelsReader(Closing):
     """The truth of a sequence's events, by their number in ``events.h5``: ``reader.read(i, j)``. Use as a context
     manager.
@@ -90,13 +90,8 @@ class EventLabelsReader(Closing):
         self.path = path / EVENT_LABELS if path.is_dir() else path
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            self._columns = {name: self._column(name, *_parts(TRUTH[name])) for name in TOLD}
-            self.causes = "cause" in self._file
-            if self.causes:
-                self._columns["cause"] = self._column("cause", np.dtype(np.uint8), ())
-            self.lights = "light" in self._file
-            if self.lights:
-                self._columns["light"] = self._column("light", np.dtype(np.int32), ())
+            self._columns = {name: self._column(name) for name in _COLUMNS if name in TOLD or name in self._file}
+            self.causes, self.lights = "cause" in self._columns, "light" in self._columns
             lengths = {len(column) for column in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("columns of events differ in length", where=str(self.path), value=sorted(lengths))
@@ -105,7 +100,8 @@ class EventLabelsReader(Closing):
     def close(self) -> None:
         self._file.close()
 
-    def _column(self, name: str, kind: np.dtype, shape: tuple[int, ...]) -> Data:
+    def _column(self, name: str) -> Data:
+        kind, shape = _COLUMNS[name]
         return dataset(self._file, name, self.path, shape=(None, *shape), kinds="f" if kind.kind == "f" else "iu")
 
     def read(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:

@@ -14,16 +14,13 @@ from PIL import Image
 
 from blinkgl.config.images import ImagesConfig
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.alpha import background_of, over
-from blinkgl.io.clock import NANOSECONDS
-from blinkgl.io.declared import NOTHING, Declared
-from blinkgl.io.frame_camera import camera_of
-from blinkgl.io.images import NpzReader, check_npy, numpy_errors
+from blinkgl.io.images import NpzReader, check_npy, numpy_errors, over
 from blinkgl.io.names import Series, series
-from blinkgl.io.reading import Damage, EventReading, chosen
+from blinkgl.io.reading import NOTHING, Damage, Declared, EventReading, background_of, chosen
 from blinkgl.io.records import inside, shown_names
-from blinkgl.io.stamps import Stamps, read_timestamps, stamps_of_array
+from blinkgl.io.sequence_tables import camera_of
 from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills
+from blinkgl.io.times import NANOSECONDS, Stamps, read_timestamps, stamps_of_array
 
 VIDEO = frozenset(
     ".mp4 .avi .mkv .mov .webm .m4v .mpg .mpeg .ts .mts .m2ts .vob .wmv .3gp .flv .mxf .ogv .qt .y4m .h264".split()

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.io.sizes import check_claim
+from blinkgl.io.records import check_claim
 from blinkgl.machine.closing import Closing
 
 _MAX_CHUNK_BYTES = 1 << 28

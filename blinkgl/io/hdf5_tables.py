@@ -18,7 +18,6 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.hdf5 import Data, Group, Hdf5File, hdf5_errors, open_hdf5
-from blinkgl.io.mvsec import EVENTS
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.io.tables import (
     Candidate,
@@ -33,6 +32,8 @@ from blinkgl.io.tables import (
     table_of_rows,
 )
 
+MVSEC_EVENTS = ("davis/left/events", "davis/right/events")
+"""Of both cameras of MVSEC's ``*_data.hdf5``: (N, 4) float64, x, y, t[s], ±1, of 346x260 px."""
 _MILLISECONDS = ("ms_to_idx", "ms_map_idx")
 """Tables of milliseconds beside integer times, as DSEC, BlinkFlow, TUM-VIE and M3ED have them: these are µs."""
 _EVENT_UTILS = {"xs": "iu", "ys": "iu", "ts": "f", "ps": "b"}
@@ -51,13 +52,13 @@ class Hdf5TableReader(TableReader):
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
             tables = _candidates(self._file, self.path, reading)
-            called = [one for one in tables[1] if one[0] in EVENTS or one[0].rpartition("/")[2] == "events"]
+            called = [one for one in tables[1] if one[0] in MVSEC_EVENTS or one[0].rpartition("/")[2] == "events"]
             every = [*tables[0], *tables[1]]
             # A name may mean any of them; a number counts those that the refusal lists.
             candidates = every if reading.stream in dict(every) else tables[0] or called or tables[1]
             table = choose(candidates, reading, str(path), self._file.names())
             super().__init__(self.path, reading, table)
-        self.version = "mvsec" if table.place in EVENTS else "hdf5"
+        self.version = "mvsec" if table.place in MVSEC_EVENTS else "hdf5"
 
     def close(self) -> None:
         self._file.close()
@@ -99,8 +100,7 @@ def _of_records(file: Hdf5File, group: object, data: Data, fields: dict[str, str
 def _of_rows(file: Hdf5File, group: object, data: Data, reading: EventReading, path: Path) -> Table:
     data.check()
     place = data.name
-    if place in EVENTS:
-        # MVSEC's columns, in seconds, of its sensor of 346x260 px.
+    if place in MVSEC_EVENTS:
         return table_of_rows(
             data, str(path), reading.columns or ("x", "y", "t", "p"), place=place, unit="s", size=(260, 346)
         )

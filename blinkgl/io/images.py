@@ -1,4 +1,5 @@
-"""Images, masks, ids, depth and normals of a sequence; NumPy files, whose headers are checked before use."""
+"""Images, masks, ids, depth and normals of a sequence; NumPy files, whose headers are checked before use; transparent
+pixels of given pictures: composited over one colour, and said."""
 
 from __future__ import annotations
 
@@ -21,8 +22,7 @@ from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.reading import Damage
-from blinkgl.io.records import decoding, input_errors
-from blinkgl.io.sizes import check_claim, most_unpacked
+from blinkgl.io.records import check_claim, decoding, input_errors, most_unpacked
 from blinkgl.machine.closing import Closing
 from blinkgl.srgb import to_srgb8
 
@@ -134,7 +134,7 @@ class NpzReader(Closing):
     """The arrays of an .npz by name; each is read when requested. Never unpickles. Use as a context manager.
 
     Raises (inside :func:`numpy_errors`) AssetError: an entry that is not a plain array of numbers; arrays that unpack
-    to more than :func:`~blinkgl.io.sizes.check_claim` allows."""
+    to more than :func:`~blinkgl.io.records.check_claim` allows."""
 
     def __init__(self, path: str | os.PathLike):
         self.path, self._archive, self._unpacked = path, zipfile.ZipFile(path), 0
@@ -174,6 +174,29 @@ class NpzReader(Closing):
         with self._archive.open(f"{name}.npy") as member:
             return np.lib.format.read_array(member, allow_pickle=False)
 
+    def header(self, name: str) -> tuple[tuple[int, ...], np.dtype, int]:
+        """Return shape and type of an array whose rows can be read, and where its data begin. Raises AssetError: it has
+        no rows of numbers."""
+        size = self._archive.getinfo(f"{name}.npy").file_size
+        with self._archive.open(f"{name}.npy") as member:
+            shape, fortran, dtype = npy_header(cast(BinaryIO, member), size, f"{self.path}: '{name}'")
+            if fortran or not shape or dtype.kind not in "fiu":
+                raise AssetError(
+                    f"array '{name}' is not a C-ordered array of numbers",
+                    where=str(self.path),
+                    value=f"{dtype} {shape}",
+                )
+            return shape, dtype, member.tell()
+
+    def row(self, name: str, k: int) -> np.ndarray:
+        """Return row ``k`` of an array, without the others. Raises as :meth:`header`."""
+        shape, dtype, start = self.header(name)
+        size = math.prod(shape[1:]) * dtype.itemsize
+        check_claim(size, str(self.path), os.path.getsize(self.path))
+        with self._archive.open(f"{name}.npy") as member:
+            member.seek(start + k * size)
+            return np.frombuffer(member.read(size), dtype).reshape(shape[1:])
+
 
 def checked_arrays(
     path: str | os.PathLike, shapes: dict[str, tuple[str, str]], optional: dict[str, tuple[str, str]] | None = None
@@ -210,6 +233,29 @@ def numpy_errors(path: str | os.PathLike) -> AbstractContextManager[None]:
     """Convert any failure to load ``path`` with NumPy to an AssetError: on damaged bytes it raises exceptions of its
     header parser, zipfile and zlib (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
     return decoding(path, "cannot read")
+
+
+def over(
+    image: np.ndarray, background: tuple[int, int, int] | None, *, associated: bool | None = None
+) -> tuple[np.ndarray, str | None]:
+    """Return (H, W, 2) or (H, W, 4) without its alpha, (H, W) or (H, W, 3), composited over ``background`` (0 to 255 of
+    full scale; None: black), and the line that says so; None where every pixel is opaque.
+
+    Codes are mixed as viewers and browsers do, alpha being straight, and floats (OpenEXR) are premultiplied light,
+    unless the file states whether alpha is ``associated``, multiplied already."""
+    colour, alpha = image[..., :-1], image[..., -1:]
+    top = 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype).max)
+    grey = colour.shape[-1] == 1
+    if (alpha >= 0.998 * top).all():  # FFmpeg widens 10 bits to 1023 * 64
+        return (colour[..., 0] if grey else colour), None
+    below = np.asarray(background or (0, 0, 0), np.float64) / 255 * top
+    below = below @ [0.2126, 0.7152, 0.0722] if grey else below
+    share = alpha / top
+    multiplied = image.dtype.kind == "f" if associated is None else associated
+    mixed = (colour if multiplied else colour * share) + below * (1 - share)
+    mixed = mixed.astype(np.float32) if image.dtype.kind == "f" else np.rint(np.minimum(mixed, top)).astype(image.dtype)
+    name = "black" if background is None else "#{:02x}{:02x}{:02x}".format(*background)
+    return (mixed[..., 0] if grey else mixed), f"transparent pixels are shown over {name} (--background for another)"
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
-"""What a user declares about an event file. What is not declared is read from the file, and nothing is guessed.
+"""What a user declares about an event file or a clip of frames. What is not declared is read from the file, and nothing
+is guessed.
 
-One value of :class:`EventReading` passes from a command's options, or a Python function's arguments, to every reader.
+One value of :class:`EventReading`, or of :class:`Declared` for frames, passes from a command's options, or a Python
+function's arguments, to every reader.
 """
 
 from __future__ import annotations
@@ -11,8 +13,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from blinkgl.errors import AssetError, ConfigError
-from blinkgl.io.clock import checked_unit
+import numpy as np
+
+from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.times import checked_unit
 from blinkgl.types.numbers import is_number
 
 _MOST_SIDE = 65536
@@ -153,3 +157,66 @@ def chosen(
     problem = f"{len(names)} {what}, and none is chosen" if stream is None else f"no such one of the {what}"
     value: dict[str, object] = {} if stream is None else {"value": stream}
     raise AssetError(problem, where=where, accepted=("one of " if len(names) > 1 else "") + ", ".join(listed), **value)
+
+
+_NAMED = {"black": (0, 0, 0), "grey": (128, 128, 128), "gray": (128, 128, 128), "white": (255, 255, 255)}
+
+
+def background_of(text: str | None) -> tuple[int, int, int] | None:
+    """Return (r, g, b), 0 to 255, of ``black``, ``grey``, ``white`` or ``#rrggbb``. Raises ConfigError."""
+    if text is None or text in _NAMED:
+        return None if text is None else _NAMED[text]
+    if re.fullmatch(r"#[0-9a-fA-F]{6}", text):
+        return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
+    raise ConfigError("unknown colour", where="--background", value=text, accepted="black, grey, white or #rrggbb")
+
+
+RANGES = ("full", "limited")
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a user declares of a clip of frames; None: what the file says.
+
+    fps : Hz, of frames at equal intervals.   timestamps : file with one time per frame (:mod:`blinkgl.io.times`).
+    time_unit : of these, "s", "ms", "us", "ns", or "frames" of ``fps``.   zero_time : count times from the first frame.
+    white_level : code of white.   range : "full" or "limited" (16 to 235 of 8 bits).   background : colour below
+    transparent pixels, "black", "grey", "white" or "#rrggbb".   stream : name or number of one of several arrays or
+    streams of frames.   damaged : "refuse", or "keep" the frames that are whole.
+
+    Raises ConfigError: values that are none of these, fps beside timestamps."""
+
+    fps: float | None = None
+    timestamps: str | os.PathLike | None = None
+    time_unit: str | None = None
+    zero_time: bool = False
+    white_level: float | None = None
+    range: str | None = None
+    background: str | None = None
+    stream: str | None = None
+    damaged: str = "refuse"
+
+    def __post_init__(self) -> None:
+        if self.damaged not in ("refuse", "keep"):
+            raise ConfigError("cannot read --damaged", where="--damaged", value=self.damaged, accepted="refuse or keep")
+        if self.fps is not None and not 1e-6 <= self.fps <= 1e9:
+            raise EventDataError("frame rate", where="--fps", value=self.fps, accepted="a positive number")
+        if self.time_unit != "frames":
+            checked_unit(self.time_unit)
+            if self.fps is not None and self.timestamps is not None:
+                raise ConfigError(
+                    "a frame rate and a list of times contradict each other",
+                    where="--fps, --timestamps",
+                    value=f"{self.fps:g}, {self.timestamps}",
+                    accepted="one of them, or --time-unit frames",
+                )
+        if self.range not in (None, *RANGES):
+            raise ConfigError("unknown range", where="--range", value=self.range, accepted="full or limited")
+        if self.white_level is not None and not (np.isfinite(self.white_level) and self.white_level > 0):
+            raise ConfigError(
+                "not a white level", where="--white-level", value=self.white_level, accepted="a positive number"
+            )
+        background_of(self.background)
+
+
+NOTHING = Declared()

@@ -21,8 +21,7 @@ from blinkgl.errors import AssetError
 from blinkgl.io.columns import events_of, joined
 from blinkgl.io.evt import HIGH, START, UNTIMED, decode, state_lines
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen, listed
-from blinkgl.io.records import decoding
-from blinkgl.io.sizes import bounded, unpacked
+from blinkgl.io.records import bounded, decoding, unpacked
 from blinkgl.machine.extras import install
 from blinkgl.types.events import Events
 

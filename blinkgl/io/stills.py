@@ -27,8 +27,7 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from blinkgl.errors import AssetError
-from blinkgl.io.alpha import over
-from blinkgl.io.images import decode_image, png_chunks, png_problem, read_pfm, size_problem
+from blinkgl.io.images import decode_image, over, png_chunks, png_problem, read_pfm, size_problem
 from blinkgl.io.reading import Damage
 from blinkgl.io.records import decoding, input_errors
 

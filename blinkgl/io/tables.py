@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.clock import NANOSECONDS, named_unit
 from blinkgl.io.columns import events_of, microseconds, proposed_polarity
 from blinkgl.io.reading import EventReading, chosen
 from blinkgl.io.records import shown_names
+from blinkgl.io.times import NANOSECONDS, named_unit
 from blinkgl.types.events import Events
 
 _NAMES = {

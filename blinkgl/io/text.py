@@ -26,10 +26,10 @@ from numba.extending import register_jitable
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.clock import named_unit
 from blinkgl.io.columns import CheckedWriter, proposed_polarity
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen
 from blinkgl.io.tables import not_columns, overruled, slot_of, undeclared
+from blinkgl.io.times import named_unit
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 from blinkgl.types.numbers import is_number

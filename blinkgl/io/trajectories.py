@@ -26,11 +26,18 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.atomic import write_whole
-from blinkgl.io.clock import checked_unit, named_unit, nanoseconds
 from blinkgl.io.names import natural_order
 from blinkgl.io.records import decoding, shown_names
-from blinkgl.io.rows import read_rows, titles_of
-from blinkgl.io.stamps import PLACES, places_of, read_timestamps
+from blinkgl.io.times import (
+    PLACES,
+    checked_unit,
+    named_unit,
+    nanoseconds,
+    places_of,
+    read_rows,
+    read_timestamps,
+    titles_of,
+)
 from blinkgl.types.numbers import exact, is_number
 
 FORMS = ("tum", "euroc", "orbslam", "kitti", "tartanair", "colmap", "nerf")

@@ -23,10 +23,10 @@ import cv2
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
-from blinkgl.io.alpha import over
+from blinkgl.io.images import over
 from blinkgl.io.reading import Damage, chosen
-from blinkgl.io.sizes import most_unpacked
-from blinkgl.io.ticks import frame_times
+from blinkgl.io.records import most_unpacked
+from blinkgl.io.times import frame_times
 from blinkgl.io.yuv import cut_riff, floats_of, known, orientation_of, rgb_from_yuv, samples_of
 from blinkgl.machine.closing import Finishing
 from blinkgl.machine.extras import install

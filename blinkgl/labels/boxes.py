@@ -9,7 +9,7 @@ import numpy as np
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.io.boxes import encode_boxes, kitti_text, read_boxes
-from blinkgl.io.overlays import with_boxes
+from blinkgl.io.pictures import with_boxes
 from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Label
 from blinkgl.labels.semantics import Categories, categories_of

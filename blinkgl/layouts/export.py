@@ -12,22 +12,27 @@ from blinkgl.io.atomic import atomic_folder
 from blinkgl.io.records import inside
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
-from blinkgl.layouts.event_kubric import EventKubric
 from blinkgl.layouts.intervals import Intervals
 from blinkgl.layouts.layout import Layout
 from blinkgl.layouts.multiflow import MultiFlow
 from blinkgl.layouts.mvsec import Mvsec
 from blinkgl.layouts.nerf import Nerf
-from blinkgl.layouts.planned import Planned
+from blinkgl.layouts.point_tracks import EventKubric, TapVid
 from blinkgl.layouts.rosbag import RosBag
-from blinkgl.layouts.source import Source, sources_of
-from blinkgl.layouts.tapvid import TapVid
+from blinkgl.layouts.source import Planned, Source, sources_of
 from blinkgl.machine.heartbeat import heartbeat
+from blinkgl.sequence_files.index import data_set
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The available layouts.
 
-LAYOUTS: dict[str, Layout] = {}
+LAYOUTS: dict[str, Layout] = {
+    layout.name: layout
+    for layout in (
+        *(Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()),
+        *(Nerf(), Intervals()),
+    )
+}
 
 
 def register(layout: Layout) -> Layout:
@@ -36,13 +41,6 @@ def register(layout: Layout) -> Layout:
         raise TypeError(f"layout '{layout.name}': there is one already")
     LAYOUTS[layout.name] = layout
     return layout
-
-
-for _layout in (
-    *(Dsec(), ERaft(), BlinkFlow(), Mvsec(), TapVid(), MultiFlow(), EventKubric(), RosBag()),
-    *(Nerf(), Intervals()),
-):
-    register(_layout)
 
 
 def layout_of(name: str) -> Layout:
@@ -75,9 +73,7 @@ def export_layout(root: str | Path, out: str | Path, layout: str) -> Exported:
             where=str(root),
             accepted="a data set: 'blinkgl generate' with frames: {folders: […]} makes one of recorded frames",
         )
-    if not root.is_dir():
-        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
-    sources = sources_of(root)
+    sources = sources_of(data_set(root))
     if not sources:
         raise AssetError("no sequences found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
     # Nothing is written before every sequence is known to have what the layout needs.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
+from blinkgl.io.sequence_tables import EXPOSURES, picture_file, read_exposures
 from blinkgl.labels import LABELS
 from blinkgl.layouts.layout import need, write_bytes
 from blinkgl.layouts.source import Source

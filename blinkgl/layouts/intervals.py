@@ -12,14 +12,14 @@ The events of file k are those from frame k to k + 1: of [t_k, t_k+1).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from blinkgl.events.grids import voxel_grid
+from blinkgl.io.columns import windows
 from blinkgl.io.images import encoded
-from blinkgl.layouts.frames import Frames, frames_of, picture, two_frames, write_frames
+from blinkgl.layouts.frames import frames_of, picture, two_frames, write_frames
 from blinkgl.layouts.layout import GZIP, Layout, keep, new_hdf5, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 from blinkgl.types.events import Events
@@ -47,7 +47,7 @@ class Intervals(Layout):
         with new_hdf5(path) as grids:
             for k, file in enumerate(frames.files):
                 keep(grids, f"images/{k:06d}", _bgr(source, file), **GZIP)
-            for k, events in enumerate(between(source, frames)):
+            for k, events in enumerate(windows(source.events(), frames.t_us)):
                 columns = {"x": events.x, "y": events.y, "t": events.t, "p": events.p}
                 write_bytes(own / f"events_aligned/{k:06d}.npz", encoded(np.savez_compressed, **columns))
                 fine = {name: columns[name].astype(np.uint32) * _BS_ERGB_UNIT for name in "xy"}
@@ -64,19 +64,6 @@ class Intervals(Layout):
 
     def folder(self, source: Source) -> str:
         return source.split
-
-
-def between(source: Source, frames: Frames) -> Iterator[Events]:
-    """Yield the events of [t_k, t_k+1) of all frames k but the last, in constant memory."""
-    held, k = Events.empty(), 0
-    for chunk in source.events():
-        held = Events.concatenate([held, chunk])
-        while k + 1 < len(frames.t_us) and len(held) and held.t[-1] >= frames.t_us[k + 1]:
-            interval, held = held.split(int(frames.t_us[k + 1]))
-            yield interval.window(int(frames.t_us[k]), int(frames.t_us[k + 1]))
-            k += 1
-    for start, end in zip(frames.t_us[k:-1].tolist(), frames.t_us[k + 1 :].tolist()):
-        yield held.window(start, end)
 
 
 def _voxels(events: Events, source: Source) -> np.ndarray:

@@ -26,13 +26,11 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import CameraModel
 from blinkgl.camera.pinhole import rectified
 from blinkgl.io.formats import write_events
-from blinkgl.io.frame_camera import EXPOSURE_POSES, EXPOSURES, read_exposure_poses, read_exposures
 from blinkgl.io.images import encode_npy, encoded
-from blinkgl.io.poses import POSES
+from blinkgl.io.sequence_tables import EXPOSURE_POSES, EXPOSURES, POSES, read_exposure_poses, read_exposures
 from blinkgl.layouts.frames import Frames, frames_of, two_frames, write_frames
 from blinkgl.layouts.layout import Layout, need, write_bytes, write_lines
-from blinkgl.layouts.planned import Planned
-from blinkgl.layouts.source import Source
+from blinkgl.layouts.source import Planned, Source
 from blinkgl.types.events import Events
 
 _poses = need("poses of its camera", "scene: {kind: random}", lambda source: source.has(POSES))

@@ -1,10 +1,10 @@
-"""A sequence directory as input of layouts."""
+"""A sequence directory as input of layouts, and one that a configuration makes, as far as their checks look at it."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +14,18 @@ import numpy as np
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.config.camchain import read_camchain
 from blinkgl.config.reader import read_table
+from blinkgl.config.sequence import SequenceConfig
+from blinkgl.dataset.verify import files_of_sequence, times_of
 from blinkgl.errors import AssetError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.hdf5 import CODECS
 from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU
 from blinkgl.io.intervals import intervals_in
-from blinkgl.io.poses import POSES, read_poses
 from blinkgl.io.reading import listed
 from blinkgl.io.records import inside
-from blinkgl.io.stamps import read_label_times
-from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.io.sequence_tables import POSES, TRACKS, read_poses, read_tracks
+from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS, Form
 from blinkgl.labels.intervals import Flows
 from blinkgl.sequence_files.index import made_folders
@@ -221,3 +222,51 @@ def _of_sensors(folder: Path) -> Source:
         return Source.open(inside(folder, one), folder.name, unit=unit)
     left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
     return Source.open(inside(folder, left), folder.name, inside(folder, right), unit)
+
+
+@dataclass(frozen=True)
+class Planned(Source):
+    """A sequence of which nothing is generated.   config : of the camera that an export takes: of a rig its first with
+    events."""
+
+    config: SequenceConfig = field(default_factory=SequenceConfig)
+
+    @classmethod
+    def of(cls, config: SequenceConfig, where: Path) -> Planned:
+        """Return the plan of a configuration; ``where`` is named in errors. Raises StopIteration: no events."""
+        own = next(one.config for one in config.cameras() if one.gives_events)
+        manifest = {
+            "files": dict.fromkeys(files_of_sequence(own)),
+            "height": own.camera.height,
+            "width": own.camera.width,
+            "split": own.output.split,
+            **dict(times_of(own)),
+        }
+        return cls(where, manifest, own.output.name, config=own)
+
+    @property
+    def camera(self) -> CameraModel:
+        return self.config.camera.model
+
+    @property
+    def track_times(self) -> list[int]:
+        tracks, times = self.config.tracks, self._label_us
+        if tracks is None or tracks.rate is None:
+            return times
+        return [round(t) for t in np.arange(times[0], times[-1] + 1, 1e6 / tracks.rate)]
+
+    def interval_ns(self, k: int) -> np.ndarray:
+        return np.array(LABELS["flow_intervals"].intervals(self.config.labels), np.int64)
+
+    @property
+    def _label_us(self) -> list[int]:
+        return [t // 1000 for t in self.config.time.label_times_ns]
+
+    def _times(self, label: str, columns: int = 1) -> list[tuple[int, ...]]:
+        if not self.has(LABELS[label].stamps or ""):
+            return []
+        rows: list[tuple[int, ...]] = list(zip(*(self._label_us[k:] for k in range(columns))))
+        return rows[: self.count(label)]
+
+    def _configured(self, section: str, key: str) -> Any:
+        return getattr(getattr(self.config, section), key)

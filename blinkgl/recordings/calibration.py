@@ -17,8 +17,7 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.declared import NOTHING, Declared
-from blinkgl.io.reading import AS_FILE, Damage, EventReading
+from blinkgl.io.reading import AS_FILE, NOTHING, Damage, Declared, EventReading
 from blinkgl.recordings.clip import (
     PLAIN,
     Clip,

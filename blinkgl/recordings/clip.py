@@ -19,10 +19,9 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import FrameSource, open_frames
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.reading import AS_FILE, NOTHING, Declared, EventReading
 from blinkgl.recordings.bursts import frame_bursts, inside_any
 from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET, spanned
 from blinkgl.recordings.decoding import UNKNOWN, Codes, OwnFrames, meaning

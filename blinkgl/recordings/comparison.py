@@ -16,13 +16,12 @@ import cv2
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.declared import NOTHING, Declared
+from blinkgl.io.columns import windows
 from blinkgl.io.formats import ENDINGS, EventFile, ending_of, kind_of_files, open_events
-from blinkgl.io.frames import CALLED
+from blinkgl.io.frames import CALLED, open_frames
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
-from blinkgl.io.reading import AS_FILE, EventReading
+from blinkgl.io.reading import AS_FILE, NOTHING, Declared, EventReading
 from blinkgl.machine.kernels import kernel
-from blinkgl.types.events import Events
 
 IEI_EDGES_US = np.logspace(0, 7, 71)
 """Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
@@ -241,19 +240,18 @@ def _accumulate(
     ]
     # -1: the pixel has had no event yet.
     last = [np.full(shape, -1, np.int64) for shape in shapes]
-    bins = IEI_EDGES_US
     polarity = np.full(intervals, np.nan)
     frame_correlation = np.full((len(files), intervals), np.nan)
     threshold = np.full((len(files), intervals), np.nan)
     with_frames = False
-    streams = [_windows(f, edges + d, d) for f, d in zip(files, shifts)]
+    streams = [windows(f.chunks(), edges + d) for f, d in zip(files, shifts)]
     for k, (change, *events) in enumerate(zip(changes, *streams)):
         sums = [np.zeros(shape, np.int32) for shape in shapes]
-        for i, e in enumerate(events):
-            sides[i].count += len(e)
-            sides[i].on += int(np.count_nonzero(e.p))
-            sides[i].rate_hz[k] = len(e) / ((edges[k + 1] - edges[k]) * 1e-6)
-            _collect(e.x, e.y, e.t, e.p, edges[0], sides[i].counts, sums[i], last[i], sides[i].iei, len(bins) - 1)
+        for i, (side, e) in enumerate(zip(sides, events)):
+            side.count += len(e)
+            side.on += int(np.count_nonzero(e.p))
+            side.rate_hz[k] = len(e) / ((edges[k + 1] - edges[k]) * 1e-6)
+            _collect(e.x, e.y, e.t, e.p, edges[0] + shifts[i], side.counts, sums[i], last[i], side.iei)
         smooth = [_blurred(s) for s in sums] if same or change is not None else []
         if change is not None:
             with_frames = True
@@ -278,7 +276,7 @@ def _accumulate(
 
 
 @kernel
-def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
+def _collect(x, y, t, p, origin, counts, sums, last, iei):
     """Add events to the count and polarity maps and to the histogram of inter-event intervals (ten bins per decade of
     µs)."""
     for i in range(len(t)):
@@ -290,31 +288,8 @@ def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
         if last[r, c] >= 0:
             # 1e-9, so that the rounded logarithm of a bin's first value is not in the bin below.
             k = int(10 * np.log10(max(now - last[r, c], 1)) + 1e-9)
-            iei[min(k, bins - 1)] += 1
+            iei[min(k, len(iei) - 1)] += 1
         last[r, c] = now
-
-
-def _windows(file: EventFile, edges: np.ndarray, shift: int) -> Iterator[Events]:
-    """Yield the events of each [edges[k], edges[k+1]), times minus ``shift``, also for empty intervals."""
-    parts: list[Events] = []
-    k = 0
-    for chunk in file.chunks():
-        while k < len(edges) - 1:
-            parts.append(chunk.window(int(edges[k]), int(edges[k + 1])))
-            if chunk.t[-1] < edges[k + 1]:
-                break  # the interval may go on in the next chunk
-            yield _joined(parts, shift)
-            parts, k = [], k + 1
-        if k == len(edges) - 1:
-            return
-    while k < len(edges) - 1:
-        yield _joined(parts, shift)
-        parts, k = [], k + 1
-
-
-def _joined(parts: list[Events], shift: int) -> Events:
-    events = Events.concatenate(parts)
-    return replace(events, t=events.t - shift) if shift else events
 
 
 def _span(file: EventFile) -> tuple[int, int]:
@@ -339,7 +314,6 @@ def _frame_intervals(
 ) -> tuple[np.ndarray, Iterator[np.ndarray], list[str]]:
     """Return the edges (µs) of the frame intervals inside [start, stop), lazily the change of ln(I + 10) over each, and
     notes on the frames."""
-    from blinkgl.io.frames import open_frames
     from blinkgl.recordings.decoding import Codes, OwnFrames, meaning
 
     for file in files:

@@ -31,7 +31,7 @@ class OwnFrames(NamedTuple):
 class Codes:
     """What is known of the codes of frames; None: nothing.
 
-    gamma, white_level, range : declared by the user, as of :class:`~blinkgl.io.declared.Declared`.   own : properties
+    gamma, white_level, range : declared by the user, as of :class:`~blinkgl.io.reading.Declared`.   own : properties
     of the sensor's own frames.   transfer, levels, origin : what the file says, as of
     :class:`~blinkgl.io.frames.FrameSource`."""
 

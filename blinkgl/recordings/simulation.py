@@ -13,29 +13,28 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.problems import validate
 from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.sensor import SensorConfig, load_sensor
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.io.clock import NANOSECONDS, checked_unit
-from blinkgl.io.declared import NOTHING, Declared
+from blinkgl.io.formats import FORMATS, event_writer, output_format
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import NOTHING, Declared
+from blinkgl.io.times import NANOSECONDS, checked_unit
 from blinkgl.recordings.decoding import UNKNOWN, Codes, Decoder, OwnFrames, checked_gamma, meaning
 from blinkgl.recordings.fitting import Fitting
 from blinkgl.recordings.frame_checks import FrameChecks
 from blinkgl.recordings.frame_noise import DenoisedLight, FrameNoise, is_mosaic
+from blinkgl.sequence_files.preview import Panels, PreviewWriter
 from blinkgl.tensors.choice import make_on_device
 from blinkgl.timeline import interpolate as between
 from blinkgl.types.events import Events, count_causes, named_causes
-
-if TYPE_CHECKING:
-    from blinkgl.config.sensor import SensorConfig
-    from blinkgl.sequence_files.preview import PreviewWriter
 
 INTERPOLATIONS = ("linear", "motion")
 
@@ -370,8 +369,6 @@ def file_to_events(
     cropped and scaled; None: that of the frames. preview : video of frames and events. progress : called with (report
     so far, fraction done or None) per given frame.
     """
-    from blinkgl.io.formats import event_writer
-
     _check_target(target, emulator)
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
@@ -419,8 +416,6 @@ def _show(video: PreviewWriter, step: Step) -> None:
 def _check_target(target: str | os.PathLike, emulator: str | EmulatorConfig | dict) -> None:
     """Raise OutputError for an ending that is not an event file's, or a format that cannot store the emulator's
     causes."""
-    from blinkgl.io.formats import FORMATS, output_format
-
     kind = output_format(target)
     if getattr(emulator_config(emulator), "causes", False) and not FORMATS[kind].causes:
         raise OutputError(
@@ -436,7 +431,6 @@ def _preview(
 ) -> Iterator[PreviewWriter]:
     """Return a video of frames and events, at the frames' rate up to 100 Hz, which appears completely or not at all."""
     from blinkgl.io.atomic import atomic_file
-    from blinkgl.sequence_files.preview import Panels, PreviewWriter
 
     rate = min(1e9 / gap_ns, 100.0)
     fps = min(rate, 25.0)
@@ -459,8 +453,6 @@ def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
 def with_sensor(emulator: dict[str, object], sensor: str | None) -> tuple[EmulatorConfig, SensorConfig | None]:
     """Return the emulator of a plain table, with the values of a sensor where the table gives none, and that sensor, a
     shipped one's name or a sensor file; None: the emulator's defaults. Raises ConfigError."""
-    from blinkgl.config.sensor import load_sensor
-
     if sensor is None:
         return emulator_config(emulator), None
     camera = load_sensor(sensor)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
+from blinkgl.recordings.calibration import Calibration
 from blinkgl.recordings.clip import TILE_PX, polarity_sums
 from blinkgl.recordings.comparison import BLUR_PX
 from blinkgl.recordings.statistics import COUNTS, ISI_BINS, ISI_PER_DECADE, sums
 from blinkgl.report.charts import data_uri, render
-
-if TYPE_CHECKING:
-    from blinkgl.recordings.calibration import Calibration
 
 _COLOURS = {"recorded": "#222222", "before": "#e9a13b", "fitted": "#1764ab"}
 

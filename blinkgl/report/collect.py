@@ -16,16 +16,14 @@ from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.flow import read_flow_png
-from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
 from blinkgl.io.images import read_image
-from blinkgl.io.overlays import TrackLines, with_tracks
-from blinkgl.io.pictures import picture
+from blinkgl.io.pictures import TrackLines, picture, with_tracks
 from blinkgl.io.records import shown
-from blinkgl.io.stamps import read_label_times
-from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.io.sequence_tables import EXPOSURES, TRACKS, picture_file, read_exposures, read_tracks
+from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.machine.heartbeat import heartbeat
-from blinkgl.sequence_files.index import entry, sequence_folders, task_of
+from blinkgl.sequence_files.index import data_set, entry, sequence_folders, task_of
 from blinkgl.sequence_files.sequence_dir import read_manifest, verify_sequence
 from blinkgl.types.trees import Tree
 
@@ -85,9 +83,7 @@ class Collected:
 
 def collect(root: str | Path, *, examples: int = 6) -> Collected:
     """Collect the data of the page. Raises AssetError when there is no data set; unreadable sequences are listed."""
-    root = Path(root)
-    if not root.is_dir():
-        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    root = data_set(root)
     sequences, unreadable, damaged = [], [], set()
     for number, folder in enumerate(sequence_folders(root), 1):
         heartbeat.at(f"sequence {number:,}")

@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from blinkgl.errors import OutputError
-from blinkgl.io.atomic import write_whole
+from blinkgl.io.atomic import refuse_file, write_whole
 from blinkgl.report.charts import histogram, number, png, render, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
 from blinkgl.sequence_files.index import write_index
@@ -27,8 +26,7 @@ def write_report(
     overwrite : replace an existing ``out``. Raises BlinkGLError."""
     own = out is None
     out = Path(root) / "report.html" if out is None else Path(out)
-    if not own and not overwrite and out.exists():  # before the work, not after it
-        raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
+    refuse_file(out, overwrite or own)
     collected = collect(root, examples=examples)
     if own:
         write_index(root)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from blinkgl.recordings.pixel_noise import PixelFit
 from blinkgl.report.charts import render
-
-if TYPE_CHECKING:
-    from blinkgl.recordings.pixel_noise import PixelFit
 
 
 def page(result: PixelFit, sensor_text: str) -> str:

@@ -17,13 +17,12 @@ from blinkgl.config.base import placed
 from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.io.clock import NANOSECONDS
 from blinkgl.io.flow import READ_ENDINGS, flow_form, read_flow
 from blinkgl.io.frames import IMAGE, read_any_image, stated_levels
 from blinkgl.io.images import read_npy
 from blinkgl.io.names import series
-from blinkgl.io.stamps import Undeclared, read_timestamps
 from blinkgl.io.stills import open_stills
+from blinkgl.io.times import NANOSECONDS, Undeclared, read_timestamps
 from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.decoding import Codes
 from blinkgl.recordings.simulation import FrameUse, SimulationReport, Step, stepped, timed

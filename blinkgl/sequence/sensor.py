@@ -186,7 +186,7 @@ class SensorSimulation(ABC):
         """Return the content of poses.npz; empty where poses are unknown."""
 
     def exposure_poses(self) -> dict[str, np.ndarray]:
-        """Return the arrays of :func:`blinkgl.io.frame_camera.read_exposure_poses`; {}: there is no frame camera."""
+        """Return the arrays of :func:`blinkgl.io.sequence_tables.read_exposure_poses`; {}: there is no frame camera."""
         return {}
 
     @property
@@ -204,7 +204,7 @@ class SensorSimulation(ABC):
         return None
 
     def lights(self) -> dict[str, np.ndarray]:
-        """Return the arrays of :func:`blinkgl.io.lights.read_lights`; {}: no light changes over time."""
+        """Return the arrays of :func:`blinkgl.io.sequence_tables.read_lights`; {}: no light changes over time."""
         return {}
 
     @abstractmethod

@@ -41,6 +41,14 @@ _KEYS = (
 )
 
 
+def data_set(root: str | Path) -> Path:
+    """Return the folder of a data set. Raises AssetError: there is none."""
+    root = Path(root)
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    return root
+
+
 def sequence_folders(root: str | Path) -> Iterator[Path]:
     """Yield folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a sequence; of a rig those
     of its cameras, <root>/<split>/<sequence>/<sensor>. Hidden folders are skipped."""

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, model_validator
 
-from blinkgl.io.frame_camera import EXPOSURES
 from blinkgl.io.records import InsidePath, PlainName
+from blinkgl.io.sequence_tables import EXPOSURES
 
 _LARGEST = 2**62
 _PIXELS = 2**28

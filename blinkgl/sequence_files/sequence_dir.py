@@ -11,9 +11,9 @@
       flow/intervals/%06d.h5         flow over intervals of one's own; occlusion/intervals/   (on request)
       occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
-      frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)
+      frame_camera/                  images with exposure and noise (blinkgl.io.sequence_tables)   (on request)
       imu/  tracks.npz               an inertial unit; point tracks (blinkgl.io.imu, .tracks; on request)
-      lights.npz                     light that changes over time (blinkgl.io.lights)
+      lights.npz                     light that changes over time (blinkgl.io.sequence_tables)
       poses.npz  config.yaml  manifest.json  preview.mp4
 
 Each label's row says its place (``blinkgl.labels``). DSEC's loaders take every file of ``flow/forward`` for a PNG.
@@ -40,14 +40,6 @@ from blinkgl.io import imu as imu_files
 from blinkgl.io.atomic import fsync, make_folders, output_errors, refuse_existing, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsWriter
-from blinkgl.io.frame_camera import (
-    EXPOSURES,
-    STAMPS,
-    ExposureLine,
-    exposures_csv,
-    picture_file,
-    stamps_txt,
-)
 from blinkgl.io.images import encode_image
 from blinkgl.io.records import (
     SEAL,
@@ -59,6 +51,7 @@ from blinkgl.io.records import (
     sealed,
     shown,
 )
+from blinkgl.io.sequence_tables import CAMERA_STAMPS, EXPOSURES, ExposureLine, exposures_csv, picture_file, stamps_txt
 from blinkgl.labels import Form, Label, label_of
 from blinkgl.sequence_files.manifest import MODEL, RIG_MODEL
 from blinkgl.types.events import Events
@@ -237,7 +230,7 @@ class SequenceWriter:
 
     def image(self, pictures: Mapping[str, np.ndarray], exposure: ExposureLine) -> None:
         """Write the next image of the frame camera: codes of "images" and what is written beside it
-        (:mod:`blinkgl.io.frame_camera`); the arrays must not be changed afterwards."""
+        (:mod:`blinkgl.io.sequence_tables`); the arrays must not be changed afterwards."""
         for picture, codes in pictures.items():
             self._write(picture_file(picture, len(self._exposures)), partial(encode_image, codes))
         self._exposures.append(exposure)
@@ -313,7 +306,7 @@ class SequenceWriter:
         for name, lines in self._timestamps.items():
             self.text(name, "\n".join(lines) + "\n")
         if self._exposures:
-            self.text(STAMPS, stamps_txt(self._exposures))
+            self.text(CAMERA_STAMPS, stamps_txt(self._exposures))
             self.text(EXPOSURES, exposures_csv(self._exposures))
         self.text("config.yaml", self.config_yaml)
         if self._events is not None:

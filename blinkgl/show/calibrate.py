@@ -11,8 +11,8 @@ from rich.table import Table
 
 from blinkgl.config.reader import to_short_yaml
 from blinkgl.errors import ConfigError, OutputError
-from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.declared import Declared
+from blinkgl.io.atomic import atomic_file, output_errors, refuse_file
+from blinkgl.io.reading import Declared
 from blinkgl.machine.terminal import plain_column, plain_console, say
 from blinkgl.recordings.calibration import Calibration, calibrate
 from blinkgl.recordings.clip import FrameReading
@@ -45,8 +45,7 @@ def run(
         raise OutputError("not the name of a sensor file", where=out, accepted="a name that ends in .yaml")
     beside = target.with_suffix(".html")
     for path in (target, beside):
-        if path.exists() and not overwrite:  # before the fit, not after it
-            raise OutputError("output file exists", where=str(path), accepted="a new name, or --overwrite")
+        refuse_file(path, overwrite)
     console = plain_console(quiet=quiet)
     columns = plain_column("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:

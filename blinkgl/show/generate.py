@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
@@ -23,7 +24,12 @@ from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
 from blinkgl.layouts.export import refuse_plan
 from blinkgl.machine.terminal import causes_line, clock, plain_column, plain_console, say, size
+from blinkgl.sequence_files.index import made_folders
 from blinkgl.show import export
+from blinkgl.show.view import check_extra
+
+if TYPE_CHECKING:
+    from blinkgl.viewer.page import Page
 
 MAX_NOTES = 20
 """Number of files whose undrawn features are listed."""
@@ -56,7 +62,7 @@ def run(
     if layout not in (None, export.SHARDS):
         refuse_plan(template, num, layout)
     console = plain_console(quiet=quiet)
-    display = None if quiet else Display(console, Path(out))
+    display = Listener() if quiet else Display(console, Path(out))
     with _shown(view, Path(out), display) as listener:
         outcome = run_dataset(template, out, executor, num=num, listener=listener, **options)
         show_outcome(console, outcome, Path(out))
@@ -68,16 +74,57 @@ def run(
     return SET_ASIDE if outcome.set_aside else 0
 
 
-def _shown(view: bool, out: Path, display: Listener | None) -> AbstractContextManager[Listener | None]:
-    """Return the context that shows the run's progress, with a page in the browser if requested."""
+@contextmanager
+def _shown(view: bool, out: Path, display: Listener) -> Iterator[Listener]:
+    """Show the run's progress, if requested also on a page in the browser, which stays until Ctrl-C. Raises ConfigError
+    without viser."""
     if not view:
-        return nullcontext(display)
-    from blinkgl.show.view import watching
+        yield display
+        return
+    check_extra("--view")
+    from blinkgl.viewer.page import Page
+    from blinkgl.viewer.server import LocalServer
 
-    return watching(plain_console(), out, display)
+    server, console = LocalServer(), plain_console()
+    page = Page(server)
+    drawing = threading.Thread(target=page.run, daemon=True)
+    try:
+        say(console, f"{server.url}  (each sequence appears there when it is complete)")
+        drawing.start()
+        yield Watched(page, out, display)
+        if page.folders:
+            say(console, f"{server.url}  (Ctrl-C ends it)")
+            try:
+                drawing.join()
+            except KeyboardInterrupt:
+                say(console, "")
+    finally:
+        page.end()
+        server.stop()
 
 
-class Display:
+class Watched(Listener):
+    """A run's listener that forwards everything and adds each finished sequence to a page."""
+
+    def __init__(self, page: Page, out: Path, display: Listener):
+        self._page, self._out, self._display = page, out, display
+
+    def begin(self, plan: Plan, outcome: Outcome) -> None:
+        self._display.begin(plan, outcome)
+        if self._out.is_dir():
+            for folder in made_folders(self._out):  # sequences of the resumed run
+                self._page.add(folder)
+
+    def message(self, name: str, message: Message) -> None:
+        self._display.message(name, message)
+        if message["kind"] == "done":
+            self._page.add(self._out / name)
+
+    def end(self, outcome: Outcome) -> None:
+        self._display.end(outcome)
+
+
+class Display(Listener):
     """Shows sequences, events, frames/s, remaining time, disk space used and expected: on a terminal a bar per sequence
     in progress, elsewhere a line per finished sequence."""
 

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from blinkgl.config.draw import middle
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.expansion import expanded
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.sensor import SensorConfig
 from blinkgl.errors import ConfigError
-from blinkgl.io.reading import parsed_size
+from blinkgl.io.reading import Declared, parsed_size
+from blinkgl.machine.compiling import announced_compiling
 from blinkgl.machine.terminal import causes_line, plain_column, plain_console, say
-
-if TYPE_CHECKING:
-    from blinkgl.config.events import EmulatorConfig
-    from blinkgl.config.sensor import SensorConfig
-    from blinkgl.recordings.simulation import SimulationReport
+from blinkgl.recordings.decoding import Codes
+from blinkgl.recordings.simulation import FrameUse, SimulationReport, file_to_events, own_frames, with_sensor
 
 FAR_PX = 2.0
 """px between frames above which linear interpolation gives a warning: at 2 px it loses up to 20 % of the events."""
@@ -30,8 +30,6 @@ def emulator_options(
 ) -> tuple[EmulatorConfig, SensorConfig | None]:
     """Return the emulator of a name, an optional YAML file (which may name the emulator itself) and ``key=value``
     overrides, with the values of an optional sensor as defaults, and that sensor."""
-    from blinkgl.recordings.simulation import with_sensor
-
     table = {"emulator": name, **(read_table(config, "emulator parameters, key: value") if config is not None else {})}
     for item in overrides:
         key, equals, value = item.partition("=")
@@ -59,12 +57,7 @@ def run(
 ) -> int:
     """Convert a file. ``size``: "WIDTHxHEIGHT" instead of the sensor's.   ``frames``: gamma, interpolate, max_px and
     keep_noise, see :class:`~blinkgl.recordings.simulation.FrameUse`.   ``declared``: of the frames, as of
-    :class:`~blinkgl.io.declared.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
-    from blinkgl.io.declared import Declared
-    from blinkgl.machine.compiling import announced_compiling
-    from blinkgl.recordings.decoding import Codes
-    from blinkgl.recordings.simulation import FrameUse, file_to_events, own_frames
-
+    :class:`~blinkgl.io.reading.Declared`.   ``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
     options["emulator"], camera = emulator_options(emulator, config, overrides, sensor)
     use = dict(frames or {})
     options["use"] = FrameUse(Codes(use.pop("gamma", None), own=own_frames(camera)), **use)

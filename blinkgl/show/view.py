@@ -1,26 +1,17 @@
-"""``blinkgl view`` and ``generate --view``: print the page's address, or the file that was written."""
+"""``blinkgl view``: print the page's address, or the file that was written."""
 
 from __future__ import annotations
 
 import importlib.util
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from rich.console import Console
 
 from blinkgl.errors import ConfigError, OutputError
+from blinkgl.io.atomic import refuse_file
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.terminal import plain_console, say
-from blinkgl.sequence_files.index import made_folders
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from blinkgl.dataset.messages import Message
-    from blinkgl.dataset.plan import Plan
-    from blinkgl.dataset.run import Listener, Outcome
-    from blinkgl.viewer.page import Page
 
 
 def run(sequences: Sequence[str], *, port: int | None = None, save: str | None = None, overwrite: bool = False) -> int:
@@ -63,8 +54,7 @@ def _save(console: Console, folders: list[Path], out: Path, port: int | None, ov
         raise ConfigError(
             "a file shows one sequence", where="--save", value=len(folders), accepted=f"one, such as {folders[0]}"
         )
-    if out.exists() and not overwrite:  # before the work, not after it
-        raise OutputError("output file exists", where=str(out), accepted="a new name, or --overwrite")
+    refuse_file(out, overwrite)
     from blinkgl.viewer.page import save
 
     with console.status("drawing"):
@@ -81,52 +71,3 @@ def check_extra(option: str) -> None:
             where=option,
             accepted=f"run {install(*EXTRAS['view'][0])}",
         )
-
-
-class Watched:
-    """A run's listener that forwards everything and adds each finished sequence to a page."""
-
-    def __init__(self, page: Page, out: Path, display: Listener | None):
-        self._page, self._out, self._display = page, out, display
-
-    def begin(self, plan: Plan, outcome: Outcome) -> None:
-        if self._display is not None:
-            self._display.begin(plan, outcome)
-        if self._out.is_dir():
-            for folder in made_folders(self._out):  # sequences of the resumed run
-                self._page.add(folder)
-
-    def message(self, name: str, message: Message) -> None:
-        if self._display is not None:
-            self._display.message(name, message)
-        if message["kind"] == "done":
-            self._page.add(self._out / name)
-
-    def end(self, outcome: Outcome) -> None:
-        if self._display is not None:
-            self._display.end(outcome)
-
-
-@contextmanager
-def watching(console: Console, out: Path, display: Listener | None) -> Iterator[Watched]:
-    """Show a page during a run and afterwards until Ctrl-C. Raises ConfigError without viser."""
-    check_extra("--view")
-    from blinkgl.viewer.page import Page
-    from blinkgl.viewer.server import LocalServer
-
-    server = LocalServer()
-    page = Page(server)
-    drawing = threading.Thread(target=page.run, daemon=True)
-    try:
-        say(console, f"{server.url}  (each sequence appears there when it is complete)")
-        drawing.start()
-        yield Watched(page, out, display)
-        if page.folders:
-            say(console, f"{server.url}  (Ctrl-C ends it)")
-            try:
-                drawing.join()
-            except KeyboardInterrupt:
-                say(console, "")
-    finally:
-        page.end()
-        server.stop()

@@ -10,7 +10,7 @@ _Value = TypeVar("_Value")
 
 
 class Recent(dict[_Key, _Value]):
-    """The last ``most`` values that were made; the oldest is dropped first."""
+    """The last ``most`` values that were made; the oldest is dropped first, and none is sent to another process."""
 
     def __init__(self, most: int):
         super().__init__()
@@ -23,3 +23,6 @@ class Recent(dict[_Key, _Value]):
             if len(self) > self.most:
                 del self[next(iter(self))]
         return self[key]
+
+    def __reduce__(self) -> tuple[type[Recent], tuple[int]]:
+        return Recent, (self.most,)

@@ -17,13 +17,11 @@ from blinkgl.camera.pinhole import rectified
 from blinkgl.errors import AssetError
 from blinkgl.io.colour import count_events, event_colour
 from blinkgl.io.dsec import DsecEventReader
-from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_exposures
 from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU, read_imu
-from blinkgl.io.overlays import TrackLines, with_boxes, with_tracks
-from blinkgl.io.pictures import id_colours, picture
+from blinkgl.io.pictures import TrackLines, id_colours, picture, with_boxes, with_tracks
 from blinkgl.io.records import inside
-from blinkgl.io.tracks import TRACKS, read_tracks
+from blinkgl.io.sequence_tables import EXPOSURES, TRACKS, picture_file, read_exposures, read_tracks
 from blinkgl.labels import LABELS, Label
 from blinkgl.layouts.source import Source
 from blinkgl.sequence_files.index import made_folders

@@ -245,7 +245,8 @@ class Endless(Source, Protocol):
 
     stats: StreamStats
 
-    def first(self) -> RawSample: ...
+    def first(self) -> RawSample:
+        """Return the next sample."""
 
 
 def is_endless(source: Source) -> TypeGuard[Endless]:

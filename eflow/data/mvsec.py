@@ -3,22 +3,18 @@ al., RSS 2018), or with the pairs, rows and ground truth of published tables (:d
 
 from __future__ import annotations
 
-import math
 import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import numpy as np
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.columns import check_events, microseconds
-from blinkgl.io.hdf5 import Data, Hdf5File, dataset, open_hdf5
-from blinkgl.io.images import npy_header, numpy_errors
-from blinkgl.io.mvsec import event_table, events_of_rows
-from blinkgl.io.sizes import check_claim
+from blinkgl.io.columns import check_events, events_of, microseconds
+from blinkgl.io.hdf5 import Data, Group, Hdf5File, dataset, open_hdf5
+from blinkgl.io.hdf5_tables import MVSEC_EVENTS
+from blinkgl.io.images import NpzReader, numpy_errors
 from blinkgl.types.recent import Recent
 from eflow.data.folders import below
 from eflow.data.window import RawSample, Window
@@ -58,62 +54,28 @@ PROTOCOLS = {
 STE-FlowNet, whose centre crop ends above row 192. ``e-raft``: 20 Hz, as in E-RAFT's table."""
 
 
-class NpzRows:
-    """Reads rows of arrays in an .npz without loading the arrays: MVSEC's flow has gigabytes. Never unpickles.
-
-    Raises AssetError: not an .npz, or an array is missing or holds objects."""
-
-    def __init__(self, path: Path, names: tuple[str, ...]):
-        self.path, self._layout = path, {}
-        with numpy_errors(path), zipfile.ZipFile(path) as archive:
-            if missing := [n for n in names if f"{n}.npy" not in archive.namelist()]:
-                raise AssetError(f"no array '{missing[0]}'", where=str(path), accepted=", ".join(names))
-            for name in names:
-                with archive.open(f"{name}.npy") as member:
-                    shape, fortran, dtype = npy_header(
-                        cast(BinaryIO, member), archive.getinfo(f"{name}.npy").file_size, f"{path}: '{name}'"
-                    )
-                    if fortran or not shape or dtype.kind not in "fiu":
-                        raise AssetError(
-                            f"array '{name}' is not a C-ordered array of numbers",
-                            where=str(path),
-                            value=f"{dtype} {shape}",
-                        )
-                    self._layout[name] = (shape, dtype, member.tell())
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        return self._layout[name][0]
-
-    def read(self, name: str, row: int | None = None) -> Numbers:
-        """Return one row, or the whole array, of the dtype in the file."""
-        shape, dtype, start = self._layout[name]
-        shape = shape if row is None else shape[1:]
-        count = math.prod(shape)
-        check_claim(count * dtype.itemsize, str(self.path), self.path.stat().st_size)
-        with numpy_errors(self.path), zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
-            member.seek(start + (row or 0) * count * dtype.itemsize)
-            return np.frombuffer(member.read(count * dtype.itemsize), dtype).reshape(shape)
-
-
 class NpzTruth:
     """The 20 Hz flow of ``<seq>_gt_flow_dist.npz``. times : (N,) s. Raises AssetError."""
 
+    _PARTS = ("x_flow_dist", "y_flow_dist")
+
     def __init__(self, path: Path):
-        self._rows = NpzRows(path, ("timestamps", "x_flow_dist", "y_flow_dist"))
-        self.path, self.times = path, self._rows.read("timestamps")
-        for name in ("x_flow_dist", "y_flow_dist"):
-            if self._rows.shape(name) != (expected := (len(self.times), HEIGHT, WIDTH)):
+        self.path, names = path, ("timestamps", *self._PARTS)
+        with numpy_errors(path), NpzReader(path) as file:
+            if missing := [name for name in names if name not in file]:
+                raise AssetError(f"no array '{missing[0]}'", where=str(path), accepted=", ".join(names))
+            shapes = {name: file.header(name)[0] for name in names}
+            self.times = file["timestamps"]
+        for name in self._PARTS:
+            if shapes[name] != (expected := (len(self.times), HEIGHT, WIDTH)):
                 raise AssetError(
-                    f"array '{name}' has the wrong shape",
-                    where=str(path),
-                    value=self._rows.shape(name),
-                    accepted=str(expected),
+                    f"array '{name}' has the wrong shape", where=str(path), value=shapes[name], accepted=str(expected)
                 )
 
     def field(self, k: int) -> Flow:
         """Return field k, (H, W, 2) float32 px."""
-        parts = ("x_flow_dist", "y_flow_dist")
-        return np.stack([self._rows.read(name, k).astype(np.float32) for name in parts], axis=-1)
+        with numpy_errors(self.path), NpzReader(self.path) as file:
+            return np.stack([file.row(name, k).astype(np.float32) for name in self._PARTS], axis=-1)
 
 
 class Hdf5Truth:
@@ -218,7 +180,7 @@ class _MvsecSequence:
     def __init__(self, path: Path):
         self.path, self.name = path, path.name.removesuffix("_data.hdf5")
         with open_hdf5(path) as file:
-            self._count = len(event_table(file, path))
+            self._count = len(_table(file, path))
             stamps = dataset(file, "davis/left/image_raw_ts", path, shape=(None,), kinds="f")[()]
             self._inds = dataset(file, "davis/left/image_raw_event_inds", path, shape=(len(stamps),), kinds="iuf")[
                 ()
@@ -234,33 +196,32 @@ class _MvsecSequence:
         self.t0_s = float(stamps[0])
         self.image_us = _stamps(stamps - self.t0_s, f"{path}: 'davis/left/image_raw_ts'")
         self.flow_us = _stamps(self._truth.times - self.t0_s, f"{self._truth.path}: its time stamps")
-        self._file: Hdf5File | None = None
-        self._pid: int | None = None
-        self._table: Data | None = None
+        self._opened: Recent[int, tuple[Hdf5File, Data]] = Recent(1)
+        """By process: HDF5 handles do not survive a fork."""
         self._rows: Recent[int, Flow] = Recent(9)
 
-    def __getstate__(self) -> dict:
-        return {**self.__dict__, "_file": None, "_pid": None, "_table": None}
+    def _open(self) -> tuple[Hdf5File, Data]:
+        file = open_hdf5(self.path)
+        return file, _table(file, self.path)
 
     def window(self, t0: int, t1: int) -> Window:
         """Return the events of [t0, t1) µs. The event indices of the images are hints; times decide."""
-        if self._pid != os.getpid():  # HDF5 handles do not survive a fork
-            self._file, self._pid = open_hdf5(self.path), os.getpid()
-            self._table = event_table(self._file, self.path)
+        _, table = self._opened.of(os.getpid(), self._open)
         images = np.searchsorted(self.image_us, t0, side="right") - 1, np.searchsorted(self.image_us, t1)
         low, high = (int(np.clip(self._inds[min(max(k, 0), len(self._inds) - 1)], 0, self._count)) for k in images)
-        margin = 4096
+        margin, where = 4096, str(self.path)
         while True:
             i, j = max(low - margin, 0), min(high + margin, self._count)
-            assert self._table is not None
-            rows = self._table[i : max(i, j)]
-            t = microseconds(rows[:, 2] - self.t0_s, str(self.path), i)
+            rows = table[i : max(i, j)]
+            t = microseconds(rows[:, 2] - self.t0_s, where, i)
             enough = len(t) and (i == 0 or t[0] < t0) and (j == self._count or t[-1] >= t1)
             if enough or (i == 0 and j == self._count):
                 break
             margin *= 4
-        events = events_of_rows(rows, str(self.path), i, self.t0_s)
-        check_events(events, str(self.path), i, height=HEIGHT, width=WIDTH)
+        # Contiguous columns, because each is read several times.
+        x, y, seconds, p = np.ascontiguousarray(rows.T)
+        events = events_of(x, y, microseconds(seconds - self.t0_s, where, i), p, where, i, signed=True)
+        check_events(events, where, i, height=HEIGHT, width=WIDTH)
         return Window.of(events, t0, t1)
 
     def flow_between(self, t0: int, t1: int, truth: str = "propagated") -> tuple[Flow, Mask]:
@@ -279,6 +240,11 @@ class _MvsecSequence:
 
     def _field(self, k: int) -> Flow:
         return self._rows.of(k, lambda: self._truth.field(k))
+
+
+def _table(file: Group, path: Path) -> Data:
+    """Return the (N, 4) float64 data set of events: x, y, t[s], ±1. Raises AssetError."""
+    return dataset(file, MVSEC_EVENTS[0], path, shape=(None, 4), kinds="f")
 
 
 def _stamps(seconds: Numbers, where: str) -> Times:

@@ -6,25 +6,17 @@ with open_online(SourceConfig(recipe="configs/eflow/real_data.yaml", online=True
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from blinkgl.config.base import placed
 from blinkgl.config.run import load_run
 from blinkgl.machine.closing import Closing
 from blinkgl.online.job import MIX, StreamJob, stream_seed
-from blinkgl.online.samples import StreamSample, WindowSample
 from blinkgl.online.stream import SampleStream
 from eflow.config import SourceConfig
+from eflow.data.sources import Part
 from eflow.data.window import RawSample, raw_sample
 
 LEAST_APART = 512
 """Rendered samples between two uses of one, at least."""
-
-
-def _windows(sample: WindowSample | StreamSample) -> RawSample:
-    """Return a sample of a stream of windows as sources give it."""
-    assert isinstance(sample, WindowSample)
-    return raw_sample(sample)
 
 
 class OnlineSource(Closing):
@@ -47,20 +39,16 @@ class OnlineSource(Closing):
 
     def __getitem__(self, index: int) -> RawSample:
         if self._uses == 1:
-            return _windows(self.stream.take(index))
+            return raw_sample(self.stream.take(index))
         newest, age = divmod(index, self._uses)
         if age == 0 and (gone := newest - self._uses * self._apart) >= self.stream.first:
             self.stream.drop(gone)
         wanted = newest - age * self._apart
-        return _windows(self.stream.peek(wanted if wanted >= 0 else wanted % (newest + 1)))
+        return raw_sample(self.stream.peek(wanted if wanted >= 0 else wanted % (newest + 1)))
 
     def first(self) -> RawSample:
         """Return the first sample of a training without consuming it."""
-        return _windows(self.stream.peek(self.stream.first))
-
-    def move(self, n: int, to: Path) -> None:
-        """Move sample n to a file (read it by :func:`blinkgl.online.samples.read_sample`)."""
-        self.stream.move(n, to)
+        return raw_sample(self.stream.peek(self.stream.first))
 
     def close(self) -> None:
         self.stream.close()
@@ -97,21 +85,8 @@ def open_online(
         return OnlineSource(stream, s.uses, apart)
 
 
-class Held:
-    """Samples in memory, as a :class:`~eflow.data.sources.Source`."""
-
-    def __init__(self, samples: list[RawSample]):
-        self._samples = samples
-        self.has_backward = all(sample.backward is not None for sample in samples)
-
-    def __len__(self) -> int:
-        return len(self._samples)
-
-    def __getitem__(self, index: int) -> RawSample:
-        return self._samples[index]
-
-
-def held(s: SourceConfig, count: int) -> Held:
+def held(s: SourceConfig, count: int) -> Part:
     """Render ``count`` samples of a recipe's test groups into memory. Raises as :func:`open_online`."""
     with open_online(s, 0, split="test") as source:
-        return Held([source[n] for n in range(count)])
+        samples = [source[n] for n in range(count)]
+    return Part(samples, range(count), all(sample.backward is not None for sample in samples))

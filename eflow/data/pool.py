@@ -26,7 +26,7 @@ from blinkgl.online.samples import WindowSample, read_sample
 from eflow.data.window import RawSample, raw_sample
 
 if TYPE_CHECKING:
-    from eflow.data.online import OnlineSource
+    from blinkgl.online.stream import SampleStream
 
 ABOUT = "windows.json"
 _VERSION = 1
@@ -100,14 +100,14 @@ def _about(root: Path) -> _About:
 
 
 def render_pool(
-    source: OnlineSource,
+    stream: SampleStream,
     count: int,
     out: str | os.PathLike,
     *,
     about: Mapping[str, object] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> int:
-    """Write the first ``count`` samples of an online source to the new folder ``out``; return their number.
+    """Write the first ``count`` samples of a stream of windows to the new folder ``out``; return their number.
 
     The folder appears when it is complete. After an interruption it holds the samples finished by then.
     about : further entries of windows.json. Raises OutputError: the folder exists, no space. ConfigError: the recipe
@@ -117,14 +117,14 @@ def render_pool(
         try:
             for n in range(count):
                 with output_errors(folder):
-                    source.move(n, folder / f"{n:07d}.npz")
+                    stream.move(n, folder / f"{n:07d}.npz")
                 done = n + 1
                 progress(done)
         except KeyboardInterrupt:
             if done == 0:
                 raise
             (folder / f"{done:07d}.npz").unlink(missing_ok=True)
-        tree = {**(about or {}), "version": _VERSION, "samples": done, "backward": source.has_backward}
+        tree = {**(about or {}), "version": _VERSION, "samples": done, "backward": stream.has_backward}
         with output_errors(folder):
             (folder / ABOUT).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
     return done

@@ -19,11 +19,11 @@ class Representation(Protocol):
     """Converts the events of a window to a tensor."""
 
     @property
-    def channels(self) -> int: ...
+    def channels(self) -> int:
+        """Return the number of channels of the tensor."""
 
     def __call__(self, window: Window, height: int, width: int) -> Grid:
         """Return (channels, height, width) float32. Raises EventDataError: events outside the window or the sensor."""
-        ...
 
 
 def grids_of(

@@ -16,8 +16,7 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections import OrderedDict
-from collections.abc import Sized
+from collections.abc import Sequence as SequenceOf, Sized
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -32,7 +31,7 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.records import inside
-from blinkgl.io.stamps import read_label_times
+from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
 from blinkgl.types.recent import Recent
@@ -54,8 +53,11 @@ class Source(Protocol):
 
     has_backward: bool
 
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int) -> RawSample: ...
+    def __len__(self) -> int:
+        """Return the number of samples."""
+
+    def __getitem__(self, index: int) -> RawSample:
+        """Return a sample. Raises AssetError."""
 
 
 @dataclass(frozen=True)
@@ -83,18 +85,14 @@ class Sequence:
 
 class FolderSource:
     """The samples of :class:`Sequence` objects, in order. Files are opened on first use in each process, since HDF5
-    handles survive neither a fork nor pickling; at most 16 stay open."""
+    handles survive neither a fork nor pickling; the last 16 stay open."""
 
     def __init__(self, sequences: list[Sequence]):
         self.sequences = sequences
         self._index = [(s, e) for s in sequences for e in s.entries]
         self.has_backward = bool(self._index) and all(e.backward is not None for _, e in self._index)
-        self._readers: OrderedDict[Path, DsecEventReader] = OrderedDict()
+        self._readers: Recent[tuple[int, Path], DsecEventReader] = Recent(_OPEN_FILES)
         self._maps: Recent[Path, Numbers] = Recent(len(sequences))
-        self._pid = os.getpid()
-
-    def __getstate__(self) -> dict:
-        return {**self.__dict__, "_readers": OrderedDict()}  # handles cannot be sent to another process
 
     def __len__(self) -> int:
         return len(self._index)
@@ -106,7 +104,7 @@ class FolderSource:
             flow, valid = read_flow(entry.forward)
         if entry.backward is not None:
             backward, backward_valid = read_flow(entry.backward)
-        reader = self._reader(sequence.events)
+        reader = self._readers.of((os.getpid(), sequence.events), lambda: DsecEventReader(sequence.events))
         rectify = (
             None if (path := sequence.rectify_map) is None else self._maps.of(path, lambda: read_rectify_map(path))
         )
@@ -132,16 +130,6 @@ class FolderSource:
     def entry(self, index: int) -> tuple[Sequence, Entry]:
         """Return the sequence and the label of sample ``index``."""
         return self._index[index]
-
-    def _reader(self, path: Path) -> DsecEventReader:
-        if self._pid != os.getpid():
-            self._readers, self._pid = OrderedDict(), os.getpid()
-        if path not in self._readers:
-            self._readers[path] = DsecEventReader(path)
-            if len(self._readers) > _OPEN_FILES:
-                self._readers.popitem(last=False)[1].close()
-        self._readers.move_to_end(path)
-        return self._readers[path]
 
     @staticmethod
     def _window(reader: DsecEventReader, t0: int, t1: int, rectify: Numbers | None) -> Window:
@@ -203,10 +191,10 @@ def read_flow(path: Path) -> tuple[Flow, Mask]:
 
 
 class Part:
-    """The samples ``indices`` of a source, in order."""
+    """The samples ``indices`` of a source, or of a list in memory, in order."""
 
-    def __init__(self, source: Source, indices: list[int]):
-        self.source, self.indices, self.has_backward = source, indices, source.has_backward
+    def __init__(self, source: Source | list[RawSample], indices: SequenceOf[int], has_backward: bool):
+        self.source, self.indices, self.has_backward = source, indices, has_backward
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -233,10 +221,9 @@ def parts_of(source: Source, share: float, where: str) -> tuple[Part, Part]:
             value=f"{share}, {len(draws)} sequences",
             accepted=f"a share from {least + 0.001:.3f} to {most:.3f}" if len(draws) > 1 else "a set to validate on",
         )
-    train, held = (
-        Part(source, [k for k, name in enumerate(names) if (draws[name] < share) is kept]) for kept in (False, True)
-    )
-    return train, held
+    kept = [k for k, name in enumerate(names) if draws[name] < share]
+    rest = [k for k, name in enumerate(names) if draws[name] >= share]
+    return Part(source, rest, source.has_backward), Part(source, kept, source.has_backward)
 
 
 # ---- where files lie -------------------------------------------------------------------------------------------------
@@ -414,6 +401,10 @@ def _same_count(folder: Path, files: Sized, times: Sized) -> None:
         )
 
 
+_KNOWN_BY = {"blinkgl": "manifest.json", "blinkflow": "forward_flow", "mvsec": "*_data.hdf5", "dsec": "events.h5"}
+"""Layout -> a file or folder that only it and those after it have."""
+
+
 def detect_format(root: Path) -> str:
     """Return the name of the layout at ``root``. Raises AssetError: no known layout."""
     if root.is_file() and root.name.endswith("_data.hdf5"):
@@ -422,14 +413,11 @@ def detect_format(root: Path) -> str:
         raise AssetError("no such data set", where=str(root), accepted="a folder")
     if (root / ABOUT).is_file():
         return "windows"
-    if (root / INDEX).is_file() or next(below(root, "manifest.json"), None):
+    if (root / INDEX).is_file():
         return "blinkgl"
-    if next(below(root, "forward_flow"), None):
-        return "blinkflow"
-    if next(below(root, "*_data.hdf5"), None):
-        return "mvsec"
-    if next(below(root, "events.h5"), None):
-        return "dsec"
+    for layout, pattern in _KNOWN_BY.items():
+        if next(below(root, pattern), None):
+            return layout
     raise AssetError(
         "no data set found",
         where=str(root),

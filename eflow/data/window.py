@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from blinkgl.errors import EventDataError
-from blinkgl.online.samples import WindowSample
+from blinkgl.online.samples import StreamSample, WindowSample
 from blinkgl.types.events import Events
 from eflow.types import Flow, Mask
 
@@ -251,8 +251,9 @@ class RawSample:
         return replace(self, old=add(self.old), new=add(self.new))
 
 
-def raw_sample(s: WindowSample) -> RawSample:
-    """Return a rendered sample as a RawSample."""
+def raw_sample(s: WindowSample | StreamSample) -> RawSample:
+    """Return a rendered sample, of a stream of windows, as a RawSample."""
+    assert isinstance(s, WindowSample)
     t, span = s.t_us, s.span_us
     return RawSample(
         Window(s.old.x, s.old.y, s.old.t, s.old.p, t - span, t),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 from blinkgl.errors import ConfigError
@@ -20,24 +19,14 @@ class Method(Protocol):
 
     def __call__(self, old: Window, new: Window, height: int, width: int) -> Flow:
         """Return flow (H, W, 2) float32 px, +x right, +y down. Raises EventDataError: too few events."""
-        ...
-
-
-def _contrast(field: str) -> Callable[[float | None], Method]:
-    def make(focal: float | None) -> Method:
-        from eflow.methods.contrast import ContrastMaximisation
-
-        return ContrastMaximisation(field, focal)
-
-    return make
 
 
 METHODS = {
-    "contrast-translation": _contrast("translation"),
-    "contrast-affine": _contrast("affine"),
-    "contrast-rotation": _contrast("rotation"),
+    "contrast-translation": "translation",
+    "contrast-affine": "affine",
+    "contrast-rotation": "rotation",
 }
-"""Name -> function that makes the method, given the focal length in px (only rotation needs it)."""
+"""Name -> the motion field whose contrast the method maximises."""
 
 
 def make_method(name: str, focal: float | None = None) -> Method:
@@ -47,4 +36,6 @@ def make_method(name: str, focal: float | None = None) -> Method:
     Raises ConfigError: rotation without a focal length."""
     if name == "contrast-rotation" and not focal:
         raise ConfigError("a rotation's flow depends on the lens", where="--focal", accepted="its focal length in px")
-    return METHODS[name](focal)
+    from eflow.methods.contrast import ContrastMaximisation
+
+    return ContrastMaximisation(METHODS[name], focal)

@@ -7,17 +7,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 from torch import Tensor, nn
 
+from blinkgl.config.base import Config as BaseConfig
 from blinkgl.errors import EventDataError
 from eflow.config import NetworkConfig
-
-if TYPE_CHECKING:
-    from blinkgl.config.base import Config as BaseConfig
-    from eflow.data.representation import Representation
-    from eflow.types import Batch
+from eflow.data.representation import Representation
+from eflow.types import Batch
 
 C = TypeVar("C", bound=NetworkConfig)
 

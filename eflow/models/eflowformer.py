@@ -11,13 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from eflow.config import EFlowFormerConfig
+from eflow.machine import runs_once
 from eflow.models.contract import initialise
 from eflow.models.eraft import Correlation, Eraft
 from eflow.models.unets import Consensus, Residual, double, seen_cells
 from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
 from eflow.ops.correlation import channels_of, pixel_grid
-from eflow.ops.upsample import bilinear_upsample
-from eflow.precision import runs_once
+from eflow.ops.resample import bilinear_upsample
 from eflow.types import Batch
 
 LAYERS = {"base": 4, "small": 2, "tiny": 1}

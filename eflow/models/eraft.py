@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -13,13 +13,11 @@ from torch.utils.checkpoint import checkpoint
 
 from eflow.config import EFlowFormerConfig, EraftConfig
 from eflow.data.representation import VoxelGrid
+from eflow.machine import fp32
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
 from eflow.ops.correlation import DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, channels_of, pixel_grid
-from eflow.ops.upsample import convex_upsample
-from eflow.precision import fp32
-
-if TYPE_CHECKING:
-    from eflow.types import Batch
+from eflow.ops.resample import convex_upsample
+from eflow.types import Batch
 
 R = TypeVar("R", EraftConfig, EFlowFormerConfig)
 Correlation: TypeAlias = DenseCorrelation | OnDemandCorrelation

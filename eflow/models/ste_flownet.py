@@ -13,7 +13,7 @@ from eflow.data.representation import CountSlices
 from eflow.models.contract import FlowModel, FlowPrediction
 from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initialise_wide, leaky, to_size
 from eflow.ops.correlation import local_correlation
-from eflow.ops.warp import backward_warp
+from eflow.ops.resample import backward_warp
 from eflow.types import Batch
 
 RADII = {"base": 4, "small": 3, "tiny": 2}

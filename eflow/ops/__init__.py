@@ -2,5 +2,5 @@
 
 In:    tensors.
 Out:   tensors.
-Start: warp.py; correlation.py, voxel.py.
+Start: resample.py; correlation.py, voxel.py.
 """

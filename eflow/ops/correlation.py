@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from blinkgl.machine.kernels import kernel
-from eflow.precision import fp32, runs_once
+from eflow.machine import fp32, runs_once
 
 # Largest number of tokens with a dense volume, whose memory grows with their square.
 DENSE_TOKENS = 8192

@@ -20,7 +20,7 @@ from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flo, read_flow_png
-from blinkgl.io.frame_camera import read_exposures
+from blinkgl.io.sequence_tables import read_exposures
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.report.collect import collect
 from blinkgl.report.page import write_report

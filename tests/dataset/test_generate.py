@@ -22,8 +22,8 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.flow import read_flow
-from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.images import read_image
+from blinkgl.io.sequence_tables import read_exposures
 from blinkgl.render.passes import Luminance
 from runs import generated
 

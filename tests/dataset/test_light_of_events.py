@@ -17,7 +17,7 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import EventDataError
 from blinkgl.gl import create_context
 from blinkgl.io.event_labels import EventLabelsReader
-from blinkgl.io.lights import read_lights
+from blinkgl.io.sequence_tables import read_lights
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import simulate_sequence

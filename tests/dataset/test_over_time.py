@@ -13,7 +13,7 @@ from blinkgl.dataset.explain import explain
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.imu import read_imu
-from blinkgl.io.tracks import read_tracks
+from blinkgl.io.sequence_tables import read_tracks
 from runs import generated
 
 CONFIG = """

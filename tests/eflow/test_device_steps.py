@@ -10,8 +10,8 @@ torch = pytest.importorskip("torch")
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from eflow.config import TrainConfig  # noqa: E402
+from eflow.machine import fp32, use_tf32  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
-from eflow.precision import fp32, use_tf32  # noqa: E402
 from eflow.progress import Readings  # noqa: E402
 from eflow.train import _forward  # noqa: E402
 from eflow.training_data import _alike, validate  # noqa: E402

@@ -25,8 +25,7 @@ from eflow.cli import run  # noqa: E402
 from eflow.data.window import StreamWindow  # noqa: E402
 from eflow.metrics import frame_metrics  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
-from eflow.pictures import BAR  # noqa: E402
-from eflow.writers import Answer, flow_video  # noqa: E402
+from eflow.writers import BAR, Answer, flow_video  # noqa: E402
 from flow_data import SPAN, blinkflow_set, blinkgl_set, dsec_set, moving_events, mvsec_set  # noqa: E402
 
 

@@ -13,8 +13,7 @@ from eflow.ops.correlation import (  # noqa: E402
     local_correlation,
     pixel_grid,
 )
-from eflow.ops.upsample import bilinear_upsample, convex_upsample  # noqa: E402
-from eflow.ops.warp import backward_warp, forward_warp  # noqa: E402
+from eflow.ops.resample import backward_warp, bilinear_upsample, convex_upsample, forward_warp  # noqa: E402
 
 H, W = 17, 21
 

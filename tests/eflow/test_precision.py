@@ -5,16 +5,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from eflow import precision  # noqa: E402
-from eflow.precision import precision_on  # noqa: E402
+from eflow import machine  # noqa: E402
+from eflow.machine import precision_on  # noqa: E402
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
 
 
 def test_bf16_where_it_is_and_fp32_elsewhere(monkeypatch, capsys):
-    monkeypatch.setattr(precision, "bf16_instructions", lambda: "AMX")
+    monkeypatch.setattr(machine, "bf16_instructions", lambda: "AMX")
     assert precision_on(CPU, "bf16") == "bf16" and precision_on(CPU, "fp32") == "fp32"
-    monkeypatch.setattr(precision, "bf16_instructions", lambda: "")
+    monkeypatch.setattr(machine, "bf16_instructions", lambda: "")
     assert precision_on(CPU, "fp32") == "fp32" and capsys.readouterr().err == ""
     assert precision_on(CPU, "bf16") == "fp32"
     err = capsys.readouterr().err

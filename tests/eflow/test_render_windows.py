@@ -54,11 +54,11 @@ def test_an_interruption_keeps_what_is_there(recipe, tmp_path):
             raise KeyboardInterrupt
 
     with open_online(asked(recipe), 0) as source:
-        assert render_pool(source, 10, tmp_path / "some", progress=stop) == 3
+        assert render_pool(source.stream, 10, tmp_path / "some", progress=stop) == 3
     assert len(open_source(tmp_path / "some")) == 3
     assert [p.name for p in tmp_path.iterdir()] == ["some"]
     with open_online(asked(recipe), 0) as source, pytest.raises(OutputError, match="exists"):
-        render_pool(source, 10, tmp_path / "some")
+        render_pool(source.stream, 10, tmp_path / "some")
 
 
 def renamed(path, **changes):

@@ -17,9 +17,9 @@ from aedat2_files import (
 from blinkgl.cli import run
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.aedat2 import Aedat2Reader
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import convert, open_events
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import Declared
 from blinkgl.types.events import Events
 from tests.io.some_events import same, some_events
 from tests.shared_data import shared

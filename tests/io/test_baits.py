@@ -22,9 +22,9 @@ import tifffile
 import trimesh
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import Declared
 from blinkgl.io.stills import open_stills
 from blinkgl.scene.importing.mesh_files import load_asset
 

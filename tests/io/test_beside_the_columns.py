@@ -10,8 +10,8 @@ import scipy.io
 from PIL import Image
 
 from blinkgl import AssetError, ConfigError, EventDataError, Events, open_events, simulate, write_events
-from blinkgl.io.declared import Declared
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import Declared
 
 T, X, Y, P = np.arange(20) * 1000, np.arange(20) % 7, np.arange(20) % 5, np.arange(20) % 2
 COLUMNS = {"t_us": T, "x": X, "y": Y, "p": P}

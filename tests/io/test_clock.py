@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import ConfigError
-from blinkgl.io.clock import checked_unit, named_unit, nanoseconds
+from blinkgl.io.times import checked_unit, named_unit, nanoseconds
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from blinkgl.errors import BlinkGLError
 from blinkgl.io import aedat2, evt, fixed_records, hdf5, hdf5_tables, ros, tables
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.reading import EventReading
-from blinkgl.show.look import looked_at
+from blinkgl.show.convert import looked_at
 from tests.io.aedat2_files import event_addresses, header, records
 from tests.io.some_events import same, some_events
 

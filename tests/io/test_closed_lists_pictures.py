@@ -20,8 +20,8 @@ from PIL import Image
 from blinkgl.cli import run
 from blinkgl.errors import BlinkGLError
 from blinkgl.io import stills, video, yuv
-from blinkgl.io.declared import Declared
 from blinkgl.io.frames import open_frames
+from blinkgl.io.reading import Declared
 from blinkgl.io.stills import open_stills
 from tests.videos import put_video
 

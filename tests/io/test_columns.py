@@ -194,7 +194,7 @@ def test_csv_in_microseconds_is_faerys(tmp_path):
 
 
 def test_times_with_and_without_names(tmp_path):
-    from blinkgl.io.stamps import read_timestamps
+    from blinkgl.io.times import read_timestamps
 
     (tmp_path / "t.txt").write_text("0 a.png\n10000\n")
     with pytest.raises(EventDataError, match="t.txt: times with a name and times without one"):

@@ -216,8 +216,8 @@ def test_damaged_files(tmp_path, name, data, message):
 @pytest.mark.parametrize("name", ["e.h5", "e.raw", "e.txt", "e.npy", "e.npz", "f.npy", "f.npz"])
 def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
     """Flipped and missing bytes either go unnoticed (a flipped coordinate is one) or give one line."""
-    from blinkgl.io.declared import Declared
     from blinkgl.io.frames import open_frames
+    from blinkgl.io.reading import Declared
 
     path, rng, errors = tmp_path / name, np.random.default_rng(0), 0
     if name.startswith("e"):

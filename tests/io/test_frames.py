@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.declared import Declared
 from blinkgl.io.frames import open_frames, read_any_image
-from blinkgl.io.stamps import read_timestamps
+from blinkgl.io.reading import Declared
+from blinkgl.io.times import read_timestamps
 from blinkgl.io.video import VideoWriter
 from tests.videos import put_exr
 

@@ -9,10 +9,9 @@ import pytest
 
 from blinkgl import cli
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import NOTHING, Declared
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
-from blinkgl.io.reading import EventReading
+from blinkgl.io.reading import NOTHING, Declared, EventReading
 from blinkgl.types.events import Events
 from tests.shared_data import shared
 

@@ -16,14 +16,13 @@ import eflow
 from blinkgl.config.camchain import read_camchain, read_place_on_body
 from blinkgl.config.reader import read_table
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import open_events
-from blinkgl.io.frame_camera import EXPOSURES, read_exposures
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import encode_png, read_pfm
-from blinkgl.io.reading import EventReading
-from blinkgl.io.stamps import read_label_times, read_timestamps
+from blinkgl.io.reading import Declared, EventReading
+from blinkgl.io.sequence_tables import EXPOSURES, read_exposures
 from blinkgl.io.stills import open_stills
+from blinkgl.io.times import read_label_times, read_timestamps
 from blinkgl.io.trajectories import read_trajectory
 from blinkgl.types.numbers import exact, is_number
 from eflow.data.sources import read_submission_times
@@ -204,8 +203,8 @@ def test_what_a_number_is():
 
 def test_exact_arithmetic_begins_in_one_place():
     """``Fraction`` and ``Decimal`` of a text whose length and exponent nobody limits compute for minutes."""
-    allowed = {"Fraction": {"types/numbers.py", "io/clock.py", "io/stamps.py", "io/ticks.py", "io/video.py",
-                            "timeline/sampling.py"}, "Decimal": {"io/names.py"}}  # fmt: skip
+    allowed = {"Fraction": {"types/numbers.py", "io/times.py", "io/video.py", "timeline/sampling.py"},
+               "Decimal": {"io/names.py"}}  # fmt: skip
     for root in (Path(package.__path__[0]) for package in (blinkgl, eflow)):
         for path in sorted(root.rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):

@@ -12,10 +12,9 @@ import pytest
 import tifffile
 
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
-from blinkgl.io.reading import EventReading
+from blinkgl.io.reading import Declared, EventReading
 from blinkgl.io.stills import open_stills
 from blinkgl.io.video import VideoReader
 from tests.io.some_events import same, some_events

@@ -22,13 +22,12 @@ from blinkgl.errors import AssetError
 from blinkgl.io.formats import open_events
 from blinkgl.io.frames import open_frames
 from blinkgl.io.images import NpzReader, read_png
-from blinkgl.io.poses import read_poses
+from blinkgl.io.records import check_claim, most_unpacked, unpacked
 from blinkgl.io.ros import event_array, typestore
-from blinkgl.io.sizes import check_claim, most_unpacked, unpacked
+from blinkgl.io.sequence_tables import read_poses, read_tracks
 from blinkgl.io.stills import open_stills
-from blinkgl.io.tracks import read_tracks
 from blinkgl.types.events import Events
-from eflow.data.mvsec import NpzRows
+from eflow.data.mvsec import NpzTruth
 
 SIDE = 9000
 
@@ -160,8 +159,8 @@ CLAIMS = {
                   "'T_world_cam' has the wrong shape or type"),
     "tracks.npz": (lambda p: npz(p, t_us=((4_000_000,), "i8"), target_points=((9, 4_000_000, 2), "f4")),
                    lambda p: read_tracks(p.parent), f"has the wrong shape|no such array|{PACKED}"),
-    "flow.npz": (lambda p: npz(p, timestamps=((1 << 26,), "f8")),
-                 lambda p: NpzRows(p, ("timestamps",)).read("timestamps"), PACKED),
+    "flow.npz": (lambda p: npz(p, timestamps=((1 << 26,), "f8"), x_flow_dist=((9,), "f4"), y_flow_dist=((9,), "f4")),
+                 NpzTruth, PACKED),
     "bz2.bag": (lambda p: bag(p, "BZ2"), events, f"bz2.bag: damaged bag: {PACKED}"),
     "lz4.bag": (lambda p: bag(p, "LZ4"), events, f"lz4.bag: damaged bag: {PACKED}"),
     "sqlite": (lambda p: bag(p, "sqlite"), events, f"sqlite: damaged bag: {PACKED}"),

@@ -19,10 +19,9 @@ from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
 from blinkgl.io.reading import EventReading
-from blinkgl.io.tracks import read_tracks
-from blinkgl.layouts import LAYOUTS, dsec, event_kubric, export as exporting, export_layout
-from blinkgl.layouts.planned import Planned
-from blinkgl.layouts.source import sources_of
+from blinkgl.io.sequence_tables import read_tracks
+from blinkgl.layouts import LAYOUTS, dsec, export as exporting, export_layout, point_tracks
+from blinkgl.layouts.source import Planned, sources_of
 from loaders import (
     blinkflow_sequence,
     dsec_disparity,
@@ -217,8 +216,8 @@ def test_tapvid(data, sequence, tmp_path):
 
 
 def test_eventkubric(data, sequence, tmp_path, monkeypatch):
-    monkeypatch.setattr(event_kubric, "TIMES", 5)
-    monkeypatch.setattr(event_kubric, "SECONDS", 0.4)
+    monkeypatch.setattr(point_tracks, "TIMES", 5)
+    monkeypatch.setattr(point_tracks, "SECONDS", 0.4)
     folder = exported(data, tmp_path, "eventkubric")
     (x, y, t, p), rgb, points, occluded = eventkubric_sample(folder / "train/sequence_000000", 5, 0.4)
     tracks, events = read_tracks(sequence), read_events(sequence / "events.h5")

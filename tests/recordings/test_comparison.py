@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from blinkgl.cli import run
 from blinkgl.errors import EventDataError
+from blinkgl.io.columns import windows
 from blinkgl.io.formats import write_events
-from blinkgl.recordings import comparison
 from blinkgl.recordings.comparison import compare
 from blinkgl.types.events import Events
 from tests.shared_data import shared
@@ -149,5 +148,5 @@ def test_windows_of_any_chunks(cuts):
     chunks = [
         Events(*(c[i:j] for c in (events.x, events.y, events.t, events.p))) for i, j in itertools.pairwise(bounds)
     ]
-    windows = list(comparison._windows(SimpleNamespace(chunks=lambda: iter(chunks)), np.arange(20, 101, 20), 5))
-    assert [w.t.tolist() for w in windows] == [[15, 34], [35], [66], [75]]
+    found = [w.t.tolist() for w in windows(chunks, np.arange(20, 101, 20))]
+    assert found == [[20, 39], [40], [71], [80]]

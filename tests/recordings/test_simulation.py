@@ -13,8 +13,8 @@ from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events import Events, make_emulator
-from blinkgl.io.declared import Declared
 from blinkgl.io.formats import open_events
+from blinkgl.io.reading import Declared
 from blinkgl.io.video import VideoReader, VideoWriter
 from blinkgl.recordings.decoding import Codes, Decoder
 from blinkgl.recordings.fitting import Fitting

@@ -13,7 +13,7 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
 from blinkgl.io.boxes import kitti_text, read_boxes
-from blinkgl.io.overlays import with_boxes
+from blinkgl.io.pictures import with_boxes
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.labels.semantics import BY_NAME, category_of, class_of
 from blinkgl.render.boxes import before

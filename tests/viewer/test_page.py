@@ -20,7 +20,7 @@ from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import OutputError
-from blinkgl.show import view as command
+from blinkgl.show import generate
 from recipes import RIG, SINGLE
 
 viser = pytest.importorskip("viser", reason="the extra [view] is not installed")
@@ -145,7 +145,7 @@ def test_a_run_hands_on_what_it_has_finished(made):
     seen = []
     page = SimpleNamespace(add=seen.append)
     display = SimpleNamespace(**dict.fromkeys(("begin", "message", "end"), lambda *a: seen.append(a)))
-    watched = command.Watched(page, made.root / "single", display)
+    watched = generate.Watched(page, made.root / "single", display)
     watched.begin("plan", "outcome")
     watched.message("train/x", {"kind": "progress"})
     watched.message("train/x", {"kind": "done"})

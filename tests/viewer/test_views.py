@@ -11,7 +11,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import AssetError
 from blinkgl.io.boxes import read_boxes
-from blinkgl.io.tracks import read_tracks
+from blinkgl.io.sequence_tables import read_tracks
 from blinkgl.sequence_files.sequence_dir import SequenceWriter
 from blinkgl.types.events import Events
 from blinkgl.viewer.views import MAX_EVENTS, SequenceView, sequences_in

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import configparser
 import json
+import multiprocessing.forkserver
 import os
 import re
 import shutil
@@ -50,7 +51,17 @@ def test_the_list_of_wheels_is_whole():
 # --- on this machine --------------------------------------------------------------------------------------------------
 
 
-def test_stage_a_runs_here(tmp_path, capfd):
+@pytest.fixture
+def started_once(monkeypatch):
+    """The processes of pieces are forked from one that has imported what they need, which takes longer than most."""
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(["blinkgl.tools.gpu_pieces"])
+    monkeypatch.setattr(gpu_suite, "multiprocessing", SimpleNamespace(get_context=lambda _: server))
+    yield
+    multiprocessing.forkserver._forkserver._stop()
+
+
+def test_stage_a_runs_here(started_once, tmp_path, capfd):
     """All but what compiles kernels, in processes; without what travels, the comparison with it says so."""
     pieces = [name for name in gpu_suite.STAGES["A"][1] if name != "compiling"]
     words = ["--small", "--device", "cpu", "--stage", "A", "--events", "1000", "--packed", str(tmp_path / "none")]
@@ -136,8 +147,9 @@ def broken(options):
 
 @pytest.fixture
 def faults(tmp_path, monkeypatch):
-    """Stages A to C of pieces that go wrong."""
+    """Stages A to C of pieces that go wrong, in processes that do without torch, whose import is most of their time."""
     (tmp_path / "faults.py").write_text(FAULTS)
+    (tmp_path / "torch.py").write_text("raise ImportError('not here')")
     monkeypatch.syspath_prepend(tmp_path)
     pieces = {name: ("faults", f"of {name}", 1.0, 20.0) for name in ("rows", "slow", "broken", "gone")}
     monkeypatch.setattr(gpu_suite, "PIECES", pieces)

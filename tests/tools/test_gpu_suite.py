@@ -20,6 +20,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError
 from blinkgl.tools import gpu_learning, gpu_pieces, gpu_suite
 
@@ -95,10 +96,17 @@ def small(tmp_path: Path) -> Namespace:
     return Namespace(device="cpu", small=True, **folders, seconds=60.0, seed=0, backend="auto", egl_device=0)
 
 
+def dancers_of(row):
+    """The run that the row generates, which loads a recipe of a hundred figures in each of its processes."""
+    name, *words = row.args[1]
+    return load_run(name, words[1::2])
+
+
 def test_a_sequence_has_its_stages(tmp_path):
     rows = dict(gpu_pieces.sequences(small(tmp_path)))
     assert list(rows)[:2] == ["flying_objects, 64x48, 1 process", "dancers, 64x48, 1 process"]
-    row = rows["dancers, 64x48, 2 processes"]()
+    assert [group.count for group in dancers_of(rows["dancers, 64x48, 2 processes"]).groups if group.enabled] == [12]
+    row = rows["flying_objects, 64x48, 2 processes"]()
     assert 0 < row["render, s/s"] < row["wall, s/s"] and row["processor, s/s"] > 0
     with pytest.raises(RuntimeError, match="status 2: error: .*camera.width"):
         gpu_pieces._generated(small(tmp_path), ["stereo"], (0, 48), 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import gc
 import os
 import resource
@@ -11,8 +12,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer.main
 
-from blinkgl.machine import command_line
+from blinkgl.machine import command_line, plugins
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -38,7 +40,7 @@ def pytest_collection_finish() -> None:
 
 
 _STATM = Path("/proc/self/statm")
-_GROWTH = 100 * 2**20 // resource.getpagesize()
+_GROWTH = 200 * 2**20 // resource.getpagesize()
 _tidied = 0  # pages that the process had when its memory was last given back
 
 
@@ -96,6 +98,16 @@ class _Lender:
 def _no_line_about_compiling():
     """Which command of the tests is the first to need a kernel depends on their order; its errors do not."""
     command_line.announced_compiling = lambda say: contextlib.nullcontext()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _command_lines_are_made_once():
+    """A process has one command, but here thousands: typer would read the signatures of all commands anew for each, and
+    BlinkGL look through the installed packages for plug-ins."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", functools.cache(typer.main.get_command))
+        patch.setattr(plugins, "entry_points", functools.cache(plugins.entry_points))
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

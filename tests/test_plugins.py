@@ -1,77 +1,74 @@
 """A file of the user's own, from the command line: what it registers reaches commands, workers and verify."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from apart import run_apart
 
 from blinkgl import open_events
+from blinkgl.cli import run
 
 MINE = Path(__file__).parents[1] / "examples/plugins"
 
 
-def command(folder: Path, *words: str) -> tuple[int, str]:
-    environment = {k: v for k, v in os.environ.items() if k != "BLINKGL_PLUGINS"}
-    done = subprocess.run(
-        [sys.executable, "-m", "blinkgl", *words], cwd=folder, env=environment, capture_output=True, text=True
-    )
-    return done.returncode, done.stdout + done.stderr
+@pytest.fixture(autouse=True)
+def none_so_far(monkeypatch):
+    monkeypatch.delenv("BLINKGL_PLUGINS", raising=False)
 
 
-def test_four_parts_of_ones_own_reach_everything(tmp_path):
+def with_mine(folder: Path, *lines: str) -> list[tuple[int, str]]:
+    return run_apart([["blinkgl", "--plugin", "mine.py", *line.split()] for line in lines], folder)
+
+
+GENERATE = f"generate {MINE / 'mine.yaml'} --out set --set camera.width=48 --set camera.height=36"
+
+
+def test_four_parts_of_ones_own_reach_everything(tmp_path, monkeypatch, capsys):
     """The file of docs/extending.md: emulator, label, primitive and event format, in commands, workers and verify; its
     folder has a character that separates paths elsewhere."""
     tmp_path = tmp_path / "of a:b"
     tmp_path.mkdir()
+    monkeypatch.chdir(tmp_path)
     shutil.copy(MINE / "mine.py", tmp_path)
-    small = ["--set", "camera.width=48", "--set", "camera.height=36", "--set", "output.sequences=2"]
-    run = ["generate", str(MINE / "mine.yaml"), "--out", "set", *small]
-    status, said = command(tmp_path, *run)
-    assert status == 2 and "unknown" in said and not (tmp_path / "set").exists()
-    status, said = command(tmp_path, "--plugin", "mine.py", *run, "--workers", "2")
-    assert status == 0, said
+    assert run(GENERATE.split()) == 2
+    assert "unknown" in capsys.readouterr().err and not (tmp_path / "set").exists()
+    np.save(tmp_path / "frames.npy", (np.random.default_rng(0).random((6, 24, 32)) * 255).astype(np.uint8))
+    answers = with_mine(
+        tmp_path,
+        f"{GENERATE} --set output.sequences=2 --workers 2",
+        "verify set --deep",
+        "convert set/train/sequence_000000/events.h5 e.nine",
+        "convert e.nine back.h5",
+        "simulate frames.npy --fps 30 --emulator toy -o s.nine",
+        f"shader diff {MINE / 'mine.yaml'} --time 0.1 --pass height --out diff",
+    )
+    assert [status for status, _ in answers] == [0] * 6, answers
+    assert "serializ" not in answers[1][1] and "agrees with the reference" in answers[5][1]
     (folder, _) = sorted(path.parent for path in (tmp_path / "set").glob("*/*/manifest.json"))
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["emulator"] == "toy" and len(manifest["versions"]["plug-in mine"]) == 16
     height = np.load(min((folder / "height").glob("*.npy")))
     assert 0.5 < height.max() < 0.6001 and height.min() == 0, "of the ramp, world units"
-    status, said = command(tmp_path, "--plugin", "mine.py", "verify", "set", "--deep")
-    assert status == 0 and "serializ" not in said, said
-    status, said = command(tmp_path, "verify", "set")
-    assert status == 2 and "made with the plug-in mine (sha256" in said and "--plugin FILE" in said
-    converts = ["--plugin", "mine.py", "convert"]
-    assert command(tmp_path, *converts, str(folder / "events.h5"), "e.nine")[0] == 0
-    assert command(tmp_path, *converts, "e.nine", "back.h5")[0] == 0
     there, here = (open_events(path).read() for path in (folder / "events.h5", tmp_path / "back.h5"))
     assert len(there) > 300 and all(np.array_equal(getattr(there, k), getattr(here, k)) for k in "xytp")
+    assert run(["verify", "set"]) == 2
+    said = capsys.readouterr().out
+    assert "made with the plug-in mine (sha256" in said and "--plugin FILE" in said
     (tmp_path / "e.nine").write_bytes((tmp_path / "e.nine").read_bytes() + b"x")
-    status, said = command(tmp_path, *converts, "e.nine", "back.h5")
-    assert status == 2 and "truncated" in said
     (tmp_path / "mine.py").write_text((tmp_path / "mine.py").read_text() + "\n# another\n")
-    status, said = command(tmp_path, "--plugin", "mine.py", "verify", "set")
-    assert status == 2 and "which differs here" in said
-    np.save(tmp_path / "frames.npy", (np.random.default_rng(0).random((6, 24, 32)) * 255).astype(np.uint8))
-    simulate = ["--plugin", "mine.py", "simulate", "frames.npy", "--fps", "30", "--emulator", "toy", "-o", "s.nine"]
-    assert command(tmp_path, *simulate)[0] == 0
-
-
-def test_a_label_of_ones_own_agrees_with_its_reference(tmp_path):
-    here = ["--plugin", str(MINE / "mine.py"), "shader", "diff", str(MINE / "mine.yaml"), "--time", "0.1"]
-    status, said = command(tmp_path, *here, "--pass", "height", "--out", "diff")
-    assert status == 0 and "agrees with the reference" in said
+    answers = with_mine(tmp_path, "verify set", "convert e.nine back.h5")
+    for (status, said), line in zip(answers, ("which differs here", "truncated"), strict=True):
+        assert status == 2 and line in said
 
 
 def test_nodes_of_ray_load_the_file(tmp_path):
     pytest.importorskip("ray")
-    small = ["--set", "camera.width=48", "--set", "camera.height=36", "--num", "2", "--workers", "2"]
-    words = ["generate", str(MINE / "mine.yaml"), "--out", "set", *small, "--executor", "ray"]
-    status, said = command(tmp_path, "--plugin", str(MINE / "mine.py"), *words)
-    assert status == 0, said
+    shutil.copy(MINE / "mine.py", tmp_path)
+    (answer,) = with_mine(tmp_path, f"{GENERATE} --num 2 --workers 2 --executor ray")
+    assert answer[0] == 0, answer
 
 
 EMULATOR = (
@@ -95,8 +92,9 @@ LAYOUT = "from blinkgl.layouts.export import LAYOUTS, register\nregister(LAYOUTS
         (LAYOUT, "TypeError: layout 'dsec': there is one already"),
     ],
 )
-def test_one_that_cannot_be_loaded_is_a_line(tmp_path, text, said):
+def test_one_that_cannot_be_loaded_is_a_line(tmp_path, capsys, text, said):
     if text is not None:
         (tmp_path / "mine.py").write_text(text)
-    status, line = command(tmp_path, "--plugin", "mine.py", "configs")
-    assert status == 2 and said in line and line.startswith("error: ") and line.count("\n") == 1
+    assert run(["--plugin", str(tmp_path / "mine.py"), "configs"]) == 2
+    line = capsys.readouterr().err
+    assert said in line and line.startswith("error: ") and line.count("\n") == 1

@@ -146,6 +146,7 @@ COMMANDS = [
     "generate words.txt --out out",
     "generate good.yaml --out out --num 0",
     "generate good.yaml --out out --num many",
+    "generate good.yaml --out out --workers 0",
     "generate good.yaml --out out --wokers 2",
     "generate good.yaml --out out --set camera.widht=3",
     "generate good.yaml --out out --set =3",

@@ -113,12 +113,13 @@ class RunTemplate:
                     value=self.tree[key],
                     accepted="plain values",
                 )
-        return self.corners()[0]
+        return self.corners[0]
 
-    def corners(self) -> list[SequenceConfig]:
+    @cached_property
+    def corners(self) -> tuple[SequenceConfig, ...]:
         """Return configurations that represent all that can be drawn (:mod:`blinkgl.config.draw`). Raises
         ConfigError."""
-        return [_validated(tree) for tree in corners(with_default(self.tree))]
+        return tuple(_validated(tree) for tree in corners(with_default(self.tree)))
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ class Group:
 
 def _split(template: RunTemplate) -> tuple[Group, ...]:
     if "groups" not in template.tree:
-        return (_group("", template.tree, template, True),)
+        return (_group("", template, True),)
     groups = template.tree["groups"]
     if not isinstance(groups, dict) or not groups:
         raise ConfigError("not a table of groups", where="groups", value=groups, accepted="name: {keys of the group}")
@@ -171,7 +172,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
         if isinstance(tree.setdefault("output", {}), dict):
             tree["output"].setdefault("name", name)
         with placed(str, before=f"in group '{name}': "):
-            made.append(_group(name, tree, template, enabled))
+            made.append(_group(name, RunTemplate(tree, template.base), enabled))
     # Two groups may have the same name in different splits.
     folders: dict[tuple[str, str], str] = {}
     for group in made:
@@ -188,10 +189,9 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
     return tuple(made)
 
 
-def _group(name: str, tree: dict[str, object], template: RunTemplate, enabled: bool) -> Group:
-    made = RunTemplate(tree, template.base)
-    config: SequenceConfig = made.check()
-    return Group(name, made, config.output.first_index, config.output.sequences, enabled)
+def _group(name: str, template: RunTemplate, enabled: bool) -> Group:
+    output = template.check().output
+    return Group(name, template, output.first_index, output.sequences, enabled)
 
 
 def derived_seed(seed: int, name: str) -> int:

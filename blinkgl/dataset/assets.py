@@ -86,7 +86,7 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
 def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
     """Yield configurations that represent the scenes and frame folders that can be drawn; each once."""
     seen = set()
-    for config in template.corners()[:_ASSET_CORNERS]:
+    for config in template.corners[:_ASSET_CORNERS]:
         recipe = repr((config.scene, config.frames))
         if recipe not in seen:
             seen.add(recipe)
@@ -98,7 +98,7 @@ def _hash_thresholds(template: RunTemplate, base: Path, hashes: dict[str, str]) 
     frames, whose size is not known yet, only AssetError."""
     used = {
         (name, camera.config.camera.height, camera.config.camera.width, config.frames is None)
-        for config in template.corners()[:_ASSET_CORNERS]
+        for config in template.corners[:_ASSET_CORNERS]
         for camera in config.cameras()
         if camera.gives_events and (name := getattr(camera.config.events, "threshold_map", None)) is not None
     }

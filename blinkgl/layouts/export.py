@@ -98,7 +98,7 @@ def refuse_plan(template: RunTemplate, num: int | None, layout: str) -> None:
     """Raise AssetError when no sequence of a run can have what a layout of the table takes, before it is generated."""
     row = layout_of(layout)
     for group in Plan.of(template, num).used:
-        configs = [one for one in group.template.corners() if any(camera.gives_events for camera in one.cameras())]
+        configs = [one for one in group.template.corners if any(camera.gives_events for camera in one.cameras())]
         planned = [Planned.of(one, Path(group.name or "the recipe")) for one in configs if one.frames is None]
         if len(planned) == len(configs) and all(row.missing(one) for one in planned):
             for one in planned[:1]:

@@ -8,6 +8,7 @@ of any two features meet. Whoever adds a feature adds its kinds to ``FEATURES``;
 
 from __future__ import annotations
 
+import collections
 import copy
 import importlib.util
 import itertools
@@ -433,27 +434,28 @@ def covering_rows(seed: int = 1, tries: int = 12) -> list[dict[str, str]]:
     takes of every further feature the kind that brings most of those; the best of ``tries``
     orders. The same seed gives the same rows."""
     rng, missing, rows = random.Random(seed), sorted(all_pairs()), []
+    contested = {kind for pair in (*REFUSED, *TOO_SLOW, *OTHER_WAY) for kind in pair}
     while missing:
-        wanted = set(missing)
+        wanted = collections.defaultdict(set)
+        for a, b in missing:
+            wanted[a].add(b)
+            wanted[b].add(a)
         best: tuple[int, dict[str, str]] = (-1, {})
         for _ in range(tries):
             row = dict(missing[rng.randrange(len(missing))])
             rest = [f for f in FEATURES if f not in row]
             rng.shuffle(rest)
             for feature in rest:
-
-                def gain(kind: str) -> int:
-                    return sum(
-                        ((f, k), (feature, kind)) in wanted or ((feature, kind), (f, k)) in wanted
-                        for f, k in row.items()
-                    )
-
-                fit = [kind for kind in FEATURES[feature] if fits({**row, feature: kind})]
-                most = max(map(gain, fit))
-                row[feature] = rng.choice([kind for kind in fit if gain(kind) == most])
-            best = max(best, (len(pairs(row) & wanted), row), key=lambda pair: pair[0])
+                taken = row.items()
+                gain = {
+                    kind: len(taken & wanted[feature, kind])
+                    for kind in FEATURES[feature]
+                    if (feature, kind) not in contested or fits({**row, feature: kind})
+                }
+                row[feature] = rng.choice([kind for kind, more in gain.items() if more == max(gain.values())])
+            best = max(best, (len(pairs(row).intersection(missing)), row), key=lambda pair: pair[0])
         rows.append({f: best[1][f] for f in FEATURES})
-        missing = [pair for pair in missing if pair not in pairs(rows[-1])]
+        missing = sorted(set(missing) - pairs(rows[-1]))
     return rows
 
 

@@ -68,12 +68,12 @@ def test_expected_frames_and_passes_are_those_of_the_run(tmp_path):
 )
 def test_the_size_of_a_run_is_foretold(tmp_path, changes):
     """Ten recipes, within a quarter. (Times are those of a busy machine: no test compares them.)"""
-    run = template(tmp_path, output={"sequences": 4}, **changes)
+    run = template(tmp_path, output={"sequences": 2}, **changes)
     told = explain(run)
     list(generate_run(run, tmp_path / "out"))
     size = sum(p.stat().st_size for p in (tmp_path / "out").rglob("*") if p.is_file())
-    assert told.sequences == 4 and 4 * told.bytes == pytest.approx(size, rel=0.25)
-    assert told.seconds > 0 and told.run_seconds >= told.seconds * 3
+    assert told.sequences == 2 and 2 * told.bytes == pytest.approx(size, rel=0.25)
+    assert told.seconds > 0 and told.run_seconds >= told.seconds
 
 
 def test_of_a_recipe_the_first_group_that_is_used_is_explained(tmp_path):

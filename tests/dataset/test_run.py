@@ -250,21 +250,6 @@ def test_damaged_sequence_is_put_away_and_made_again(reference, tmp_path):
     assert verify_dataset(tmp_path / "out").clean
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (["--executor", "slurm"], "--executor: unknown executor (got 'slurm'); expected local or ray"),
-        (["--address", "head:6379"], "--address: belongs to --executor ray"),
-        (["--devices", "a"], "--devices: not a list of device numbers"),
-        (["--workers", "0"], "--workers"),
-    ],
-)
-def test_bad_options(tmp_path, capsys, arguments, message):
-    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
-
-
 def test_workers_that_differ_are_refused(tmp_path):
     class Odd(Inline):
         def open(self, job):

@@ -53,7 +53,7 @@ def test_windows_of_short_flow_propose_longer_ones_that_are_not_short(tmp_path, 
 
     def lines(window_ms: str) -> list[str]:
         command = ["predict", "real_small", str(tmp_path / "dots.txt"), "--size", "128x96", "--window-ms", window_ms]
-        assert run(command) == 0
+        assert run([*command, "--end-ms", str(50 * float(window_ms))]) == 0
         return [line for line in capsys.readouterr().out.splitlines() if "below 2 px" in line]
 
     (line,) = lines("8")

@@ -1,7 +1,6 @@
 """A job script has one line, ``eflow train … --resume``: whenever it was stopped, wherever its data are now."""
 
 import errno
-import json
 import os
 import shutil
 import signal
@@ -15,7 +14,6 @@ import yaml
 
 torch = pytest.importorskip("torch")
 
-from safetensors.torch import load_file  # noqa: E402
 
 from blinkgl.errors import ConfigError  # noqa: E402
 from blinkgl.io.images import read_png  # noqa: E402
@@ -24,38 +22,12 @@ from eflow.cli import run  # noqa: E402
 from eflow.load_config import load_train_config  # noqa: E402
 from eflow.train import train  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402
-
-FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5, "width": 8}
+from trainings import config_file, log, tensors  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     return blinkgl_set(tmp_path_factory.mktemp("train"), sequences=2, labels=2)
-
-
-def config_file(folder: Path, data: Path, model=FAST, steps=6, crop=(64, 64), **changes) -> Path:
-    tree = {
-        "seed": 5,
-        "model": model,
-        "data": {"train": [{"path": str(data)}], "batch": 2, "crop": list(crop), "augment": {"time_reversal": 0.3}},
-        "optim": {"steps": steps, "lr": 1e-3},
-        "run": {"device": "cpu", "log_every": 1},
-    }
-    for dotted, value in changes.items():
-        part, key = dotted.split("__")
-        tree[part][key] = value
-    path = folder / "train.yaml"
-    path.write_text(yaml.safe_dump(tree))
-    return path
-
-
-def tensors(run_folder: Path) -> dict:
-    folder = ckpt.newest(run_folder)
-    return {f"{p.stem}/{k}": v for p in sorted(folder.glob("*.safetensors")) for k, v in load_file(p).items()}
-
-
-def log(run_folder: Path) -> list[dict]:
-    return [json.loads(line) for line in (run_folder / "log.jsonl").read_text().splitlines()]
 
 
 def test_one_line_for_a_job_script(tmp_path, data, capsys):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 torch = pytest.importorskip("torch")
 
@@ -22,38 +21,12 @@ from eflow.load_config import load_train_config  # noqa: E402
 from eflow.progress import Log, TrainingError  # noqa: E402
 from eflow.train import learning_rate, train  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402
-
-FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5, "width": 8}
+from trainings import FAST, config_file, log, tensors  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     return blinkgl_set(tmp_path_factory.mktemp("train"), sequences=2, labels=2)
-
-
-def config_file(folder: Path, data: Path, model=FAST, steps=6, crop=(64, 64), **changes) -> Path:
-    tree = {
-        "seed": 5,
-        "model": model,
-        "data": {"train": [{"path": str(data)}], "batch": 2, "crop": list(crop), "augment": {"time_reversal": 0.3}},
-        "optim": {"steps": steps, "lr": 1e-3},
-        "run": {"device": "cpu", "log_every": 1},
-    }
-    for dotted, value in changes.items():
-        part, key = dotted.split("__")
-        tree[part][key] = value
-    path = folder / "train.yaml"
-    path.write_text(yaml.safe_dump(tree))
-    return path
-
-
-def tensors(run_folder: Path) -> dict:
-    folder = ckpt.newest(run_folder)
-    return {f"{p.stem}/{k}": v for p in sorted(folder.glob("*.safetensors")) for k, v in load_file(p).items()}
-
-
-def log(run_folder: Path) -> list[dict]:
-    return [json.loads(line) for line in (run_folder / "log.jsonl").read_text().splitlines()]
 
 
 TINY = {"name": "eflowformer", "size": "tiny", "levels": 4, "train_iterations": 1, "input": {"bins": 3}}

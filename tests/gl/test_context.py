@@ -100,16 +100,6 @@ def test_two_contexts_side_by_side(pair):
         assert a.tobytes() == b.tobytes() == c.tobytes()
 
 
-WORKER = """
-import hashlib, sys
-sys.path.insert(0, sys.argv[1])
-from test_context import create_context, draw
-with create_context() as gl:
-    colour, depth = draw(gl)
-print(hashlib.sha256(colour.tobytes() + depth.tobytes()).hexdigest())
-"""
-
-
 # --- failures ---------------------------------------------------------------------------------------------------------
 
 

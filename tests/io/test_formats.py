@@ -159,12 +159,6 @@ def test_matlab(tmp_path):
             open_events(tmp_path / "cut.mat")
 
 
-def test_times_named_by_their_unit_are_microseconds(tmp_path):
-    e = some_events(50, 0, 60_000, 180, 240)
-    np.savez(tmp_path / "e.npz", x=e.x, y=e.y, t_us=e.t * 1.0, p=e.p)
-    assert same(open_events(tmp_path / "e.npz").read(), e)
-
-
 def test_blinkflow_and_mvsec(tmp_path):
     events = random_events(5000, duration_us=3_000_000)
     with h5py.File(tmp_path / "blinkflow.h5", "w") as file:  # u8 times, no t_offset, table without the final ms

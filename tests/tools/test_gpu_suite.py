@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import configparser
 import json
+import multiprocessing.forkserver
 import os
 import re
 import shutil
@@ -19,6 +20,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError
 from blinkgl.tools import gpu_learning, gpu_pieces, gpu_suite
 
@@ -50,7 +52,17 @@ def test_the_list_of_wheels_is_whole():
 # --- on this machine --------------------------------------------------------------------------------------------------
 
 
-def test_stage_a_runs_here(tmp_path, capfd):
+@pytest.fixture
+def started_once(monkeypatch):
+    """The processes of pieces are forked from one that has imported what they need, which takes longer than most."""
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(["blinkgl.tools.gpu_pieces"])
+    monkeypatch.setattr(gpu_suite, "multiprocessing", SimpleNamespace(get_context=lambda _: server))
+    yield
+    multiprocessing.forkserver._forkserver._stop()
+
+
+def test_stage_a_runs_here(started_once, tmp_path, capfd):
     """All but what compiles kernels, in processes; without what travels, the comparison with it says so."""
     pieces = [name for name in gpu_suite.STAGES["A"][1] if name != "compiling"]
     words = ["--small", "--device", "cpu", "--stage", "A", "--events", "1000", "--packed", str(tmp_path / "none")]
@@ -84,10 +96,17 @@ def small(tmp_path: Path) -> Namespace:
     return Namespace(device="cpu", small=True, **folders, seconds=60.0, seed=0, backend="auto", egl_device=0)
 
 
+def dancers_of(row):
+    """The run that the row generates, which loads a recipe of a hundred figures in each of its processes."""
+    name, *words = row.args[1]
+    return load_run(name, words[1::2])
+
+
 def test_a_sequence_has_its_stages(tmp_path):
     rows = dict(gpu_pieces.sequences(small(tmp_path)))
     assert list(rows)[:2] == ["flying_objects, 64x48, 1 process", "dancers, 64x48, 1 process"]
-    row = rows["dancers, 64x48, 2 processes"]()
+    assert [group.count for group in dancers_of(rows["dancers, 64x48, 2 processes"]).groups if group.enabled] == [12]
+    row = rows["flying_objects, 64x48, 2 processes"]()
     assert 0 < row["render, s/s"] < row["wall, s/s"] and row["processor, s/s"] > 0
     with pytest.raises(RuntimeError, match="status 2: error: .*camera.width"):
         gpu_pieces._generated(small(tmp_path), ["stereo"], (0, 48), 1)
@@ -136,8 +155,9 @@ def broken(options):
 
 @pytest.fixture
 def faults(tmp_path, monkeypatch):
-    """Stages A to C of pieces that go wrong."""
+    """Stages A to C of pieces that go wrong, in processes that do without torch, whose import is most of their time."""
     (tmp_path / "faults.py").write_text(FAULTS)
+    (tmp_path / "torch.py").write_text("raise ImportError('not here')")
     monkeypatch.syspath_prepend(tmp_path)
     pieces = {name: ("faults", f"of {name}", 1.0, 20.0) for name in ("rows", "slow", "broken", "gone")}
     monkeypatch.setattr(gpu_suite, "PIECES", pieces)

@@ -15,11 +15,12 @@ import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import AfterValidator, TypeAdapter, ValidationError
+from typing import TYPE_CHECKING, Any
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError
+
+if TYPE_CHECKING:  # reading events alone does not wait for it
+    from pydantic import TypeAdapter, ValidationError
 
 MAX_RECORD_BYTES = 512 << 20
 MAX_NAME_BYTES = 1024
@@ -85,14 +86,21 @@ def parse(text: str, model: TypeAdapter | None = None) -> Any:
     try:
         data = json.loads(text, object_pairs_hook=_unique)
         if model is not None:
-            model.validate_python(data)
+            _validate(model, data)
         return data
-    except ValidationError as error:
-        raise ValueError(first_problem(error)) from None
     except RecursionError:
         raise ValueError("nested too deeply") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"not JSON: {error.msg.lower()} at line {error.lineno}") from None
+
+
+def _validate(model: TypeAdapter, data: object) -> None:
+    from pydantic import ValidationError
+
+    try:
+        model.validate_python(data)
+    except ValidationError as error:
+        raise ValueError(first_problem(error)) from None
 
 
 def first_problem(error: ValidationError) -> str:
@@ -144,7 +152,7 @@ def shown_names(names: Iterable[object], most: int = 12) -> str:
     return ", ".join(shown(name, 60) for name in listed[:most]) + more
 
 
-def _inside(name: str) -> str:
+def path_inside(name: str) -> str:
     """Return ``name``. Raises ValueError unless it is a plain relative POSIX path inside its folder."""
     parts = name.split("/")
     try:
@@ -159,19 +167,11 @@ def _inside(name: str) -> str:
     return name
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
     """Return ``name``. Raises ValueError unless it is the plain name of one folder, which can be printed."""
-    if "/" in _inside(name) or "\\" in name or name.startswith(".") or not name.isprintable():
+    if "/" in path_inside(name) or "\\" in name or name.startswith(".") or not name.isprintable():
         raise ValueError("not the plain name of a folder")
     return name
-
-
-InsidePath = Annotated[str, AfterValidator(_inside)]
-"""A relative path that neither leaves its folder nor names the folder itself."""
-PlainName = Annotated[str, AfterValidator(_plain)]
-"""The name of one folder: no separators, not hidden, printable."""
-HereOrInside = Annotated[str, AfterValidator(lambda name: name if name == "." else _inside(name))]
-"""As InsidePath, or "." for the folder itself."""
 
 
 def inside(folder: str | os.PathLike, name: str) -> Path:
@@ -180,7 +180,7 @@ def inside(folder: str | os.PathLike, name: str) -> Path:
     lead out of the folder."""
     path = Path(folder)
     try:
-        parts = _inside(name).split("/")
+        parts = path_inside(name).split("/")
     except ValueError as error:
         raise AssetError(f"names {error}", where=str(path), value=name, accepted="a plain relative path") from None
     for part in parts:

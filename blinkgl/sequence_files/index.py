@@ -20,7 +20,8 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.records import HereOrInside, inside, parse, read_text, shown
+from blinkgl.io.records import inside, parse, read_text, shown
+from blinkgl.sequence_files.manifest import HereOrInside
 from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
 from blinkgl.types.trees import Tree
 

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, model_validator
 
-from blinkgl.io.records import InsidePath, PlainName
+from blinkgl.io.records import path_inside, plain_name
 from blinkgl.io.sequence_tables import EXPOSURES
+
+InsidePath = Annotated[str, AfterValidator(path_inside)]
+"""A relative path that neither leaves its folder nor names the folder itself."""
+PlainName = Annotated[str, AfterValidator(plain_name)]
+"""The name of one folder: no separators, not hidden, printable."""
+HereOrInside = Annotated[str, AfterValidator(lambda name: name if name == "." else path_inside(name))]
+"""As InsidePath, or "." for the folder itself."""
 
 _LARGEST = 2**62
 _PIXELS = 2**28

@@ -27,7 +27,8 @@ from blinkgl.config.reader import read_table, to_yaml
 from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.errors import AssetError
 from blinkgl.io.dsec import write_rectify_map
-from blinkgl.io.records import PlainName, first_problem
+from blinkgl.io.records import first_problem
+from blinkgl.sequence_files.manifest import PlainName
 from blinkgl.sequence_files.sequence_dir import RIG, SequenceWriter
 from blinkgl.types.trees import Tree
 

@@ -8,6 +8,7 @@ import functools
 import gc
 import os
 import resource
+import signal
 import sys
 from pathlib import Path
 
@@ -24,6 +25,9 @@ def pytest_configure(config: pytest.Config) -> None:
     # Runs of the tests count as one build, although somebody may be editing the code while they are on. (From the
     # start: a process looks once.)
     os.environ["BLINKGL_BUILD"] = "tests"
+    # A shell starts what runs in the background with Ctrl-C ignored, and tests send it.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     # Of a few hundred processes that tests start each would compile BlinkGL's three hundred modules anew: a second.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     sys.dont_write_bytecode = False

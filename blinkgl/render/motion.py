@@ -98,7 +98,7 @@ class Motion:
         nanosecond later."""
         paths = [self._path, *(lamp.path for lamp in self._lamps), *(self._objects[k].path for k in set(self._body))]
         moving = [*paths, *(item.deformer for item in self._items if item.deformer is not None)]
-        # Paths and deformers of somebody's own may not say it.
+        # Paths need not say it.
         return sorted({t for one in moving if hasattr(one, "jumps") for t in one.jumps(t0_ns, t1_ns)})
 
     @cached_property

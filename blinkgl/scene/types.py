@@ -105,6 +105,10 @@ class Deformer(ABC):
     mirrors: bool = False
     examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
 
+    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
+        """Return the times in (t0, t1), ns, increasing, after which it stands elsewhere a nanosecond later."""
+        return []
+
     @classmethod
     def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Deformer:
         """Return the deformer of a ``deform:`` configuration, for an object whose box at rest is (3,) low to high. Only
@@ -421,8 +425,7 @@ class Scene:
     rig        : the moving rig with its sensors.
     background : linear radiance where nothing is hit.
     log        : one line per important decision (collisions cut, objects dropped), for the manifest.
-    omissions  : one line per file with features that are not drawn, for the user and
-    the manifest.
+    omissions  : one line per file with features that are not drawn, for the user and the manifest.
     dynamics   : of the objects that an engine moves; None: there are none.
     fog        : between the camera and everything; None: clear air.
     """

@@ -109,6 +109,17 @@ def test_a_scene_in_python_is_the_scene_of_its_yaml():
     assert np.array_equal(ours.camera.K, theirs.camera.K) and ours.light == theirs.light and ours.background == 0.4
 
 
+def test_what_limits_a_recording_is_a_warning_where_it_was_asked_for():
+    way = {0.0: blinkgl.Pose((2, -3, 0)), 0.1: blinkgl.Pose((2, 3, 0))}
+    flies = blinkgl.Primitive("sphere", radius=0.2, pose=blinkgl.Keyframes(way))
+    scene = blinkgl.Scene(blinkgl.Camera(64, 48, fov=60), [flies], duration=0.1)
+    with pytest.warns(
+        UserWarning, match="steps between event frames are 9000 µs long .* timeline.min_step_us"
+    ) as given:
+        blinkgl.record(scene, labels=[], timeline=blinkgl.Timeline("displacement", max_px=1, min_step_us=9000))
+    assert given[0].filename == __file__
+
+
 def test_record_is_what_generate_writes(tmp_path):
     scene = box_scene()
     labels = ("images", "forward", "backward", "occlusion", "depth")

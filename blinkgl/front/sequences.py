@@ -157,6 +157,7 @@ def record(source: Source, rig: Rig | str | None = None, *, index: int = 0, **se
     imu : an inertial unit: the name of a preset, "adis16448", or a table of ``imu:``, ``{"rate": 400}``.
     tracks : points on surfaces: "grid", "surface", or a table of ``tracks:``, ``{"points": 100}``.
     optics, readout : tables of ``optics:`` and ``readout:``, ``{"psf": {"kind": "gaussian", "sigma": 0.8}}``.
+    What limits the result, such as motion too fast for the shortest step, is a warning.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     with simulate_sequence(source, rig, index=index, **settings) as sequence:
         gathered = {member.name: Gathered() for member in sequence.members}
@@ -165,6 +166,8 @@ def record(source: Source, rig: Rig | str | None = None, *, index: int = 0, **se
         cameras = {member.name: gathered[member.name].recording(member) for member in sequence.members}
         units = {name: one.imu for name, one in cameras.items() if one.imu is not None}
         units |= {name: measured for name, _, measured in sequence.inertial_units()}
+        for line in sequence.notes:
+            warnings.warn(line, stacklevel=3)
     made = replace(
         next(iter(cameras.values()), Recording(sequence.config)),
         config=sequence.config,

@@ -1,4 +1,4 @@
-"""What adaptive times see of fast motion: the events of a dense fixed rate, in seventeen scenes in which both ends of a
+"""What adaptive times see of fast motion: the events of a dense fixed rate, in eighteen scenes in which both ends of a
 step do not show what happens inside it."""
 
 from __future__ import annotations
@@ -190,20 +190,30 @@ def lamp_that_jumps() -> Scene:
     return seen([wall(Material(base_color=(0.8,) * 3))], light=replace(Light(), sun=0.0, sky=0.05, lamps=(lamp,)))
 
 
-def stepped_body() -> Scene:
-    """A clip whose keys hold (STEP), as files of stop motion have it, which begins anew every 30 ms elsewhere."""
-    places = np.array([[-0.4, 0, 0], [0.4, 0, 0], [0.1, 0, 0.2], [0, 0, -0.2]])
-    track = Track(0, "translation", np.array([0, 0.011, 0.0117, 0.03]), places, "STEP")
-    skeleton = Skeleton([-1], Clip(Locals.rest(1), [track], Playing(0, 0.03)))
+def card_of_a_clip(times, places, kind: str, loop: bool = True) -> Scene:
+    track = Track(0, "translation", np.array(times), np.array(places), kind)
+    skeleton = Skeleton([-1], Clip(Locals.rest(1), [track], Playing(0, times[-1], loop=loop)))
     mesh = quad(0.3, 0.3)
     mesh = replace(mesh, deformer=Skin.rigid(skeleton, 0, len(mesh.vertices)))
     return seen([wall(GREY), thing("card", 2, mesh, still((0, 2, 0), FACING), SHARP)])
 
 
+def stepped_body() -> Scene:
+    """A clip whose keys hold (STEP), as files of stop motion have it, which begins anew every 30 ms elsewhere."""
+    places = [[-0.4, 0, 0], [0.4, 0, 0], [0.1, 0, 0.2], [0, 0, -0.2]]
+    return card_of_a_clip([0, 0.011, 0.0117, 0.03], places, "STEP")
+
+
+def leaping_body() -> Scene:
+    """The same as programs without STEP write it: two keys close to each other."""
+    places = [[-0.4, 0, 0], [-0.4, 0, 0], [0.4, 0, 0], [0.4, 0, 0], [-0.4, 0, 0], [-0.4, 0, 0]]
+    return card_of_a_clip([0, 0.011, 0.01101, 0.0117, 0.01171, 0.06], places, "LINEAR", loop=False)
+
+
 WORLDS = (
     fan, hand_shake, pendulum, bouncing_ball, flash, waving_arm, passing_car, from_behind, to_and_fro_along_the_axis,
     vibration, ball_through_the_picture, stopped_body, camera_that_jumps, body_that_jumps,
-    body_that_vanishes, lamp_that_jumps, stepped_body,
+    body_that_vanishes, lamp_that_jumps, stepped_body, leaping_body,
 )  # fmt: skip
 
 
@@ -223,6 +233,16 @@ def test_no_motion_between_two_frames_goes_unseen(gl, world):
     assert len(made) == pytest.approx(len(dense), rel=0.03)
     matching = match_events(dense, made, HEIGHT, WIDTH, 4000)
     assert matching.matched.mean() > 0.95
+
+
+@pytest.mark.parametrize("world", [stepped_body, leaping_body])
+def test_jumps_of_clips_cost_two_frames_each_and_are_no_motion_too_fast(gl, world):
+    with Renderer(gl, world(), RenderConfig()) as renderer:
+        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        jumps = renderer.motion.jumps(0, END)
+        times = list(made)
+    assert jumps and {t + after for t in jumps for after in (0, 1)} <= set(times)
+    assert len(times) <= 2 * len(jumps) + 12 and made.notes == ()
 
 
 # --- what cannot be held is said

@@ -18,6 +18,11 @@ from blinkgl.scene.shapes.skeleton import NEVER, Locals
 
 PATHS = ("translation", "rotation", "scale")
 KINDS = ("LINEAR", "STEP", "CUBICSPLINE")
+LEAP_S = 1e-3
+"""Longest time between two key frames, at most an eighth of the mean, in which a motion counts as a jump: how programs
+without STEP write one."""
+MOST_JUMPS = 100_000
+"""Most jumps of a clip in a sequence that have frames of their own, two each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,23 +90,37 @@ class Playing:
         return self.speed == 0 or self.last <= self.first
 
     def timescale_ns(self, tracks: Iterable[Track]) -> int:
-        """Return half of the time between the closest two key frames of these tracks; without key frames,
-        :data:`~blinkgl.scene.shapes.skeleton.NEVER`."""
-        closest = min((float(np.diff(track.times).min()) for track in tracks if len(track.times) > 1), default=0.0)
-        return max(round(closest / abs(self.speed) * 0.5e9), 1) if closest and self.speed else NEVER
+        """Return half of the time between the closest two key frames of these tracks between which nothing jumps;
+        without any, :data:`~blinkgl.scene.shapes.skeleton.NEVER`."""
+        gaps = [np.diff(t.times)[~self._leaps(t)] for t in tracks if t.interpolation != "STEP"]
+        closest = float(np.concatenate([*gaps, [np.inf]]).min())
+        return max(round(closest / abs(self.speed) * 0.5e9), 1) if closest < np.inf and self.speed else NEVER
+
+    def _leaps(self, track: Track) -> np.ndarray:
+        """Return (K - 1,) bool, whether the track jumps between two key frames (:data:`LEAP_S`)."""
+        gaps = np.diff(track.times)
+        return gaps <= min(LEAP_S * abs(self.speed), 0.125 * (self.last - self.first) / max(len(gaps), 1))
 
     def jumps(self, tracks: Iterable[Track], t0_ns: int, t1_ns: int) -> list[int]:
         """Return the times in (t0, t1), ns, increasing, at which the value of a track jumps a nanosecond later: at the
-        keys of a STEP, and where a loop begins anew with other values than it ends with."""
+        keys of a STEP, before and after a leap between others (:data:`LEAP_S`), and where a loop begins anew with other
+        values than it ends with. [] where there are more than
+        :data:`MOST_JUMPS`: such a clip jumps at all times."""
         if self.is_static:
             return []
         tracks, places = list(tracks), set()
         for track in tracks:
-            if track.interpolation == "STEP" and len(track.times) > 1:
-                places |= set(track.times[1:][(np.diff(track.values, axis=0) != 0).any(axis=1)].tolist())
+            values = track.values.reshape(len(track.times), -1)
+            changed, leaps = (np.diff(values, axis=0) != 0).any(axis=1), self._leaps(track)
+            if track.interpolation == "STEP":
+                places |= set(track.times[1:][changed].tolist())
+            else:
+                places |= {*track.times[1:][changed & leaps].tolist(), *track.times[:-1][changed & leaps].tolist()}
         if self.loop and any(_differs(track, track.at(self.first)[0], track.at(self.last)[0]) for track in tracks):
             places.add(self.first)
         period, times = self.period_ns, set()
+        if len(places) * (1 if period is None else (t1_ns - t0_ns) // period + 1) > MOST_JUMPS:
+            return []
         for place in places:
             at = round(((place - self.first - self.phase) / self.speed) * 1e9)
             rounds = [0] if period is None else range((t0_ns - at) // period, (t1_ns - at) // period + 1)

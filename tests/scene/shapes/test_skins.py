@@ -96,6 +96,12 @@ def test_all_jumps_of_a_clip_are_known_to_the_nanosecond(kind, seam, playing):
     assert (fast == inside).all() and (len(jumps) > 0) == (kind == "STEP" or (seam and playing.loop))
 
 
+def test_a_clip_that_jumps_at_all_times_has_no_times_of_its_own():
+    track = Track(0, "translation", np.array([0, 1e-6]), np.eye(3)[:2], "STEP")
+    clip = Clip(Locals.rest(1), [track], Playing(0, 2e-6))
+    assert clip.jumps(0, MS) == list(range(999, MS, 1000)) and clip.jumps(0, 500 * MS) == []
+
+
 def test_clips_loop_hold_and_run_backwards():
     assert Playing(2, 5).at(0) == (2, 1) and Playing(2, 5).at(4 * 10**9)[0] == 3
     assert Playing(2, 5, -1).at(10**9) == (4, -1)

@@ -17,7 +17,7 @@ from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.importing.parts import Z_UP, transformed
 from blinkgl.scene.worlds.from_file import from_document, split_rigid
-from tests.scene.gltf_files import GltfBuilder, triangle
+from tests.scene.gltf_files import GltfBuilder, arm_file, triangle
 from tests.shared_data import shared
 
 SETTINGS = CameraConfig(width=64, height=48, fov=70)
@@ -272,10 +272,14 @@ def test_animation_choices_and_limits(tmp_path):
         load(tmp_path, animated(), animation="spin")
 
 
-def test_a_camera_that_jumps_says_when(tmp_path):
+def test_a_camera_and_a_shape_that_jump_say_when(tmp_path):
     builder = animated("STEP")
     for channel in builder.tree["animations"][0]["channels"]:
         channel["target"]["node"] = 0
+    shape = load(tmp_path, with_camera(arm_file("STEP", morphs=True))).objects[0].parts[0].mesh
+    moved = shape.deformer.jumps(0, T1)
+    at = lambda t: shape.deformer.positions(shape, t)
+    assert moved and all(np.abs(at(t) - at(t + 1)).max() > 0.1 for t in moved)
     path = load(tmp_path, builder).camera_path
     jumps = path.jumps(0, T1)
     assert jumps and all(not np.array_equal(path.pose(t), path.pose(t + 1)) for t in jumps)

@@ -65,6 +65,11 @@ def temporary_beside(final: Path) -> Path:
     return final.with_name(f".{final.name}.blinkgl-tmp-{machine_token()}-{os.getpid()}-{next(_serial)}{final.suffix}")
 
 
+def is_temporary(name: str) -> bool:
+    """Return whether a file or folder of this name is being written, or was when its writer died."""
+    return _PATTERN.match(name) is not None
+
+
 def remove_stale(folder: Path) -> list[Path]:
     """Delete temporaries in ``folder`` whose writer ran on this boot of this machine and is dead. Everything else, even
     if it looks similar, is kept."""

@@ -1,16 +1,22 @@
 """Every layout read from files of that layout; damaged ones refused by name."""
 
 import dataclasses
+import shutil
 
 import h5py
 import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
+from blinkgl.io.atomic import temporary_beside
 from eflow.data import mvsec
+from eflow.data.content import content_of
+from eflow.data.folders import below
 from eflow.data.mvsec import MvsecSource, propagate
 from eflow.data.sources import open_source, read_flow
+from eflow.load_config import load_train_config
 from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set, moving_events, mvsec_set
+from trainings import config_file
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +246,20 @@ def test_damaged_sequences(tmp_path, spoil, said):
     root = blinkgl_set(tmp_path, sequences=1)
     spoil(root / "train" / "seq_000000")
     refused(said, lambda: open_source(root)[0])
+
+
+@pytest.mark.parametrize("make", [blinkgl_set, dsec_set, blinkflow_set, mvsec_set])
+def test_a_sequence_that_is_being_written_is_no_data_yet(tmp_path, make):
+    """Training on a set that grows: a run writes its next sequence in a hidden folder, whose files come and go."""
+    root = make(tmp_path / "set")
+    names = [open_source(root)[k].name for k in range(len(open_source(root)))]
+    config = load_train_config(config_file(tmp_path, root))
+    content = content_of(config)
+    whole = next(below(root, "*"))
+    shutil.copytree(whole, temporary_beside(whole)) if whole.is_dir() else shutil.copy(whole, temporary_beside(whole))
+    (temporary_beside(root / "next.h5")).symlink_to(root / "gone")
+    source = open_source(root)
+    assert [source[k].name for k in range(len(source))] == names and content_of(config) == content
 
 
 def test_folders_without_data(tmp_path):

@@ -27,6 +27,7 @@ from eflow.cli_arguments import (
     Refine,
     Refined,
     Sampling,
+    Views,
     WarmStart,
     WindowMs,
     WindowsAsked,
@@ -162,6 +163,7 @@ def evaluate(
             limit=limit,
             refine=refine,
             warm_start=options.warm_start,
+            views=options.views or 1,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
     show(result)
@@ -208,7 +210,8 @@ def predict(
         name, why = chosen(file, asked, infer.Predictor(model, height, width))
         typer.echo(f"network: {why}")
         model = answerer(name, options)
-    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, refine=refine)
+    views = options.views or infer.default_views(name)
+    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, refine=refine, views=views)
     show_flows(file, predictor, asked, outputs, typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)
@@ -220,6 +223,7 @@ def submit(
     dataset: Annotated[str, typer.Argument(help="The test set of DSEC or BlinkFlow; its layout says which.")],
     out: Annotated[str, typer.Option("--out", "-o", help="New zip file.")],
     warm_start: WarmStart = False,
+    views: Views = None,
 ) -> None:
     """Write the submission file of a benchmark and check it."""
     from blinkgl.machine.terminal import plain_console
@@ -228,7 +232,7 @@ def submit(
     model = network_of(checkpoint, warm_start=warm_start)
     with plain_console(stderr=True).status("predicting") as status:
         progress = lambda i, n: status.update(f"{i}/{n} flows")
-        count, still = write_submission(model, dataset, out, warm_start=warm_start, progress=progress)
+        count, still = write_submission(model, dataset, out, warm_start=warm_start, views=views or 1, progress=progress)
     typer.echo(f"written and checked: {out}, {count} files")
     if still:
         typer.echo(f"{still} of {count} flows are zero: a window without events, or nothing moves")

@@ -61,6 +61,15 @@ WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
 Refine = Annotated[bool, typer.Option(help=_REFINE)]
+Views = Annotated[
+    int | None,
+    typer.Option(
+        metavar="1|4|8",
+        help="Mean flow of this many views of the events (4: mirrored, too; 8: with swapped polarities, too). "
+        "Default: 4 where predict takes a shipped network, else 1.",
+        show_default=False,
+    ),
+]
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -86,10 +95,11 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 @dataclass(frozen=True)
 class Answering:
-    """Options of a network or of a method. iterations, warm_start : of networks.   focal : px, of a method."""
+    """Options of a network or of a method. iterations, warm_start, views : of networks.   focal : px, of a method."""
 
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, for networks that have them.")] = None
     warm_start: WarmStart = False
+    views: Views = None
     focal: Annotated[
         float | None,
         typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False),
@@ -216,7 +226,8 @@ def answerer(name: str, options: Answering) -> FlowModel | Method:
                 "only a method uses it", where="--focal", value=options.focal, accepted=", ".join(METHODS)
             )
         return network_of(name, iterations=options.iterations, warm_start=options.warm_start)
-    for option, value in (("--iterations", options.iterations), ("--warm-start", options.warm_start)):
+    of_networks = {"--iterations": options.iterations, "--warm-start": options.warm_start, "--views": options.views}
+    for option, value in of_networks.items():
         if value:
             raise ConfigError(f"{name} is not a network", where=option, value=value)
     return make_method(name, options.focal)

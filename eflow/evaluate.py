@@ -82,6 +82,7 @@ def evaluate(
     limit: int | None = None,
     refine: bool = False,
     warm_start: bool = False,
+    views: int = 1,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Result:
     """Score ``model``, or a method that needs no training, on every labelled sample of ``source``. Samples with an
@@ -89,7 +90,8 @@ def evaluate(
 
     out : new folder for ``results.json`` and ``pictures/`` (at most 12 evenly spaced samples: events, truth,
     prediction, error map); None: write nothing.
-    limit : score only this many samples, evenly spaced.   refine, warm_start : as of :class:`~eflow.infer.Predictor`.
+    limit : score only this many samples, evenly spaced.   refine, warm_start, views : as of
+    :class:`~eflow.infer.Predictor`.
     progress : called with (samples done, samples in all, AEE so far).
 
     Raises AssetError: no ground truth, unreadable files. EventDataError: events outside the sensor."""
@@ -98,7 +100,7 @@ def evaluate(
     indices = evenly(len(source), limit or len(source))
     shown = {indices[k] for k in evenly(len(indices), PICTURES)}
     scores = _Scores(_set_median(source, indices))
-    predictor = Predictor(model, 0, 0, warm_start=warm_start, refine=refine)
+    predictor = Predictor(model, 0, 0, warm_start=warm_start, refine=refine, views=views)
     for done, (i, sample, answer) in enumerate(answers(predictor, source, indices), 1):
         if not sample.has_events:
             scores.left_out += 1

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from blinkgl.errors import EventDataError
+from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.reading import AS_FILE, EventReading
 from blinkgl.types.events import Events
@@ -21,6 +22,7 @@ from eflow.methods.contrast import sharpest_length
 from eflow.methods.dominant import toward_dominant
 from eflow.models import FlowModel, FlowPrediction
 from eflow.ops.resample import forward_warp
+from eflow.shipped import is_shipped
 from eflow.types import Batch, Flow, Grid
 
 PICTURED = VoxelGrid(bins=2, normalise="none")
@@ -227,6 +229,17 @@ def whole_file(file: EventFile, reads: tuple[str, ...] = SIDES) -> tuple[StreamW
     return StreamWindow.of(events, t0, t, t1), (t1 - t0) / (t1 - t)
 
 
+VIEWS = (1, 4, 8)
+"""Views of the events whose flows a network's answer may be the mean of: as they are; mirrored along x, y and both,
+too; all of these with swapped polarities, too. What is chance in a network's error is another in each of them."""
+
+
+def default_views(name: str) -> int:
+    """Return the views of `eflow predict`: 4 of a shipped network, which was trained on mirrored samples; 1 of others,
+    which may know only one way up."""
+    return 4 if is_shipped(name) else 1
+
+
 class Predictor:
     """A network, or a method that needs no training, that is called with the windows of a stream, one after the other.
 
@@ -235,6 +248,7 @@ class Predictor:
     refine : draw each flow of a network towards its dominant motion (:func:`eflow.methods.dominant.toward_dominant`),
     then multiply it by the factor that makes the events of its windows sharpest
     (:func:`eflow.methods.contrast.sharpest_length`).   unsharpened : windows whose flow kept its length, by reason.
+    views : a network's flow is the mean of that of :data:`VIEWS` of the events.
     reads : the windows of a pair that are read. A window without events, or with too few for a method, has zero
     flow."""
 
@@ -246,14 +260,18 @@ class Predictor:
         *,
         warm_start: bool = False,
         refine: bool = False,
+        views: int = 1,
     ):
+        if views not in VIEWS:
+            raise ConfigError("not a number of views", where="views", value=views, accepted="1, 4 or 8")
         self.model, self.height, self.width = model, height, width
-        self.warm_start, self.refine = warm_start, refine
+        self.warm_start, self.refine, self.views = warm_start, refine, views
         self.reads = model.reads if isinstance(model, FlowModel) else SIDES
         self.unsharpened: Counter[str] = Counter()
         self.warm = 0
-        self._before: tuple[tuple[str, int], torch.Tensor] | None = None
-        """Scene and end of the previous window, and its low-resolution flow, if a window may start from it."""
+        self._before: tuple[tuple[str, int], list[torch.Tensor]] | None = None
+        """Scene and end of the previous window, and the low-resolution flow of each of its views, if a window may
+        start from it."""
 
     def __call__(self, window: StreamWindow | RawSample) -> tuple[Flow, Grid]:
         """Return the flow (H, W, 2) float32 px, t -> t + Δ, and the new window's event tensor (C, H, W) float32.
@@ -268,7 +286,7 @@ class Predictor:
         grids = grids_of(self.model.representation, window, self.reads, (self.height, self.width))
         if not all(len(getattr(window, name)) for name in self.reads):
             return self._still(), grids["new"]
-        flow = self._predicted(window, {name: torch.from_numpy(grid)[None] for name, grid in grids.items()})
+        flow = self._predicted(window, grids)
         return self._refined(window, flow) if self.refine else flow, grids["new"]
 
     def _still(self) -> Flow:
@@ -276,15 +294,37 @@ class Predictor:
         self._before = None
         return np.zeros((self.height, self.width, 2), np.float32)
 
-    def _predicted(self, window: StreamWindow | RawSample, batch: Batch) -> Flow:
+    def _predicted(self, window: StreamWindow | RawSample, grids: dict[str, Grid]) -> Flow:
         assert isinstance(self.model, FlowModel)
+        before, lows, total = None, [], torch.zeros(())
         if self._before is not None and self._before[0] == (window.scene, window.new.t0):
             self.warm += 1
-            batch = {**batch, "flow_init": forward_warp(self._before[1])}
-        prediction = predict(self.model, batch)
-        if self.warm_start and prediction.low is not None:
-            self._before = (window.scene, window.new.t1), prediction.low
-        return prediction.flow[0].permute(1, 2, 0).cpu().numpy()
+            before = self._before[1]
+        # One after the other: correlations of eight views of a large sensor would not fit into memory.
+        for k, (view, axes) in enumerate(self._seen(window, grids)):
+            batch = {name: torch.from_numpy(grid)[None].flip(axes) for name, grid in view.items()}
+            if before is not None:
+                batch["flow_init"] = forward_warp(before[k])
+            prediction = predict(self.model, batch)
+            if self.warm_start and prediction.low is not None:
+                lows.append(prediction.low)
+            sign = torch.tensor([-1.0 if axis in axes else 1.0 for axis in (3, 2)])
+            total = total + prediction.flow.flip(axes)[0].permute(1, 2, 0).cpu() * sign
+        if lows:
+            self._before = (window.scene, window.new.t1), lows
+        return (total / self.views).numpy()
+
+    def _seen(
+        self, window: StreamWindow | RawSample, grids: dict[str, Grid]
+    ) -> Iterator[tuple[dict[str, Grid], tuple[int, ...]]]:
+        """Yield the tensors of every view, and the axes of (N, C, H, W) along which they are still to be mirrored."""
+        assert isinstance(self.model, FlowModel)
+        polarities = [grids]
+        if self.views == 8:
+            swapped = replace(window, old=window.old.inverted(), new=window.new.inverted())
+            polarities.append(grids_of(self.model.representation, swapped, self.reads, (self.height, self.width)))
+        for view in polarities:
+            yield from ((view, axes) for axes in ((), (3,), (2,), (2, 3))[: self.views])
 
     def _refined(self, window: StreamWindow | RawSample, flow: Flow) -> Flow:
         read = [getattr(window, name) for name in self.reads]

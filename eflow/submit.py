@@ -56,6 +56,7 @@ def submit(
     out: str | os.PathLike,
     *,
     warm_start: bool = False,
+    views: int = 1,
     progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> tuple[int, int]:
     """Write the zip of the benchmark whose layout the test set at ``root`` has, a file ``<sequence>/<name>`` for every
@@ -76,7 +77,7 @@ def submit(
     sizes: dict[str, tuple[int, int]] = {}
     still = 0
     # Sizes differ between sequences, so the predictor learns them from each sample.
-    predictor = Predictor(model, 0, 0, warm_start=warm_start)
+    predictor = Predictor(model, 0, 0, warm_start=warm_start, views=views)
     with atomic_file(out, overwrite=False) as temporary:
         with zipfile.ZipFile(temporary, "w", benchmark.compression) as archive:
             for i, sample, answer in answers(predictor, source, range(len(source))):

@@ -3,11 +3,11 @@
     eflow render configs/eflow/real_data.yaml --out out/lengths -n 500 --split test --seed 99 --per-sequence 4 \\
         --window-ms 1.5-100 --max-flow 24 --min-density 0.008
     python -m blinkgl.tools.flow_lengths real_small out/lengths
-    python -m blinkgl.tools.flow_lengths real_small out/lengths --views     # the error of mirrored, thinned … windows
+    python -m blinkgl.tools.flow_lengths real_small out/lengths --changed   # the error of mirrored, thinned … windows
 
-Two tables of medians, each of the network's flow as it is and as long as makes the events sharpest (`eflow predict`):
+Two tables of medians, each of the network's flow as it is and as `eflow predict` refines it:
 over the windows of a rendered pool, by their true length; and over pans across photographs (one velocity everywhere,
-three speeds, three emulators), by the length of a window. At pixels with events. ``--views`` prints three tables of
+three speeds, three emulators), by the length of a window. At pixels with events. ``--changed`` prints three tables of
 errors over all pixels, as shares of zero flow's: of each view; of thinned windows beside others with so few events; of
 tripled ones by the length of their flow.
 """
@@ -26,7 +26,7 @@ from blinkgl.tools.real_recordings import PANS, of_pans, table
 from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
 from eflow.data.window import RawSample, StreamWindow, hit_pixels
-from eflow.infer import Predictor
+from eflow.infer import Predictor, default_views
 from eflow.models import FlowModel
 
 BINS = (0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 24.0)
@@ -63,7 +63,7 @@ def enlarged(sample: RawSample, factor: int) -> RawSample:
 THINNED, TRIPLED = "5 % of the events", "coordinates tripled"
 DENSITIES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
 """Edges of the bins of events per pixel."""
-VIEWS: dict[str, Callable[[RawSample], RawSample]] = {
+CHANGED: dict[str, Callable[[RawSample], RawSample]] = {
     "as it is": lambda s: s,
     "mirrored": lambda s: s.flip("x"),
     "upside down": lambda s: s.flip("y"),
@@ -77,7 +77,7 @@ VIEWS: dict[str, Callable[[RawSample], RawSample]] = {
 }
 
 
-def of_views(model: FlowModel, path: str, limit: int) -> list[list[list[object]]]:
+def of_changed(model: FlowModel, path: str, limit: int) -> list[list[list[object]]]:
     """Rows of three tables of the windows of a pool. Errors are over all pixels with truth, as shares of zero flow's.
 
     Each view: error and zero flow's, px, their ratio, and that beside the ratio of the windows as they are. Windows as
@@ -86,7 +86,7 @@ def of_views(model: FlowModel, path: str, limit: int) -> list[list[list[object]]
     source = open_source(path)
     samples = [source[int(i)] for i in np.linspace(0, len(source) - 1, min(limit, len(source))).round().astype(int)]
     samples = [s for s in samples if s.valid is not None and s.valid.any()]
-    errors = {name: np.array([_error(model, view(s)) for s in samples]) for name, view in VIEWS.items()}
+    errors = {name: np.array([_error(model, view(s)) for s in samples]) for name, view in CHANGED.items()}
     plain, thin, tripled = (errors[name] for name in ("as it is", THINNED, TRIPLED))
     share = lambda of: float(of[:, 0].mean() / of[:, 1].mean()) if len(of) else float("nan")
     views = [[n, *e.mean(0)[:2].tolist(), share(e), share(e) / share(plain)] for n, e in errors.items()]
@@ -108,8 +108,10 @@ def _error(model: FlowModel, s: RawSample) -> tuple[float, float, float]:
     return np.hypot(*(flow - true).T).mean(), np.hypot(*true.T).mean(), len(s.new) / (s.height * s.width)
 
 
-def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow | RawSample, np.ndarray]]) -> Iterator[Judged]:
-    """Of every pair whose new window has events enough."""
+def judged(
+    model: FlowModel, pairs: Iterable[tuple[StreamWindow | RawSample, np.ndarray]], views: int
+) -> Iterator[Judged]:
+    """Of every pair whose new window has events enough. views : of the refined flow."""
     for pair, truth in pairs:
         height, width = truth.shape[:2]
         hit = hit_pixels([pair.new], height, width) & np.isfinite(truth).all(-1)
@@ -120,7 +122,8 @@ def judged(model: FlowModel, pairs: Iterable[tuple[StreamWindow | RawSample, np.
         if not size.any():  # nothing moves: no length to compare
             continue
         for refine in (False, True):
-            flow = Predictor(model, height, width, refine=refine)(pair)[0][hit]
+            predictor = Predictor(model, height, width, refine=refine, views=views if refine else 1)
+            flow = predictor(pair)[0][hit]
             row += [np.hypot(*flow.T).sum() / size.sum(), np.hypot(*(flow - true).T).sum() / size.sum()]
         share, error, sharp_share, sharp_error = map(float, row)
         yield float(np.median(size)), share, error, sharp_share, sharp_error
@@ -142,23 +145,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("network", help="checkpoint, or a packaged network")
     parser.add_argument("pool", help="folder of `eflow render`")
-    parser.add_argument("--views", action="store_true", help="errors of changed windows in place of lengths")
-    parser.add_argument("--limit", type=int, default=200, help="windows of the pool that --views takes")
+    parser.add_argument("--changed", action="store_true", help="errors of changed windows in place of lengths")
+    parser.add_argument("--limit", type=int, default=200, help="windows of the pool that --changed takes")
     options = parser.parse_args()
     model = load_model(options.network)
-    if options.views:
+    if options.changed:
         heads = (
             ("view", ["error, px", "zero flow", "ratio", "to as it is"]),
             ("events per pixel", ["windows", "ratio", "windows, thinned", "ratio, thinned"]),
             ("mean flow", ["windows", "ratio", "ratio, tripled"]),
         )
-        for (title, columns), rows in zip(heads, of_views(model, options.pool, options.limit), strict=True):
+        for (title, columns), rows in zip(heads, of_changed(model, options.pool, options.limit), strict=True):
             say(plain_console(), table(title, columns, rows) + "\n")
         return
     heads = ["windows", "length", "length, sharp", "error", "error, sharp"]
-    pool = list(judged(model, of_pool(options.pool)))
+    views = default_views(options.network)
+    pool = list(judged(model, of_pool(options.pool), views))
     say(plain_console(), table("true length", heads, rows_of(pool, itertools.pairwise(BINS))))
-    pans = list(judged(model, of_pans()))
+    pans = list(judged(model, of_pans(), views))
     near = [(0.9 * length, 1.1 * length) for length in PANS[2]]
     say(plain_console(), "\n" + table("pans", heads, rows_of(pans, near)))
 

@@ -19,9 +19,10 @@ image's x axis: ``x`` is the share of its flow along it.
 
 The second line is for judging, and to be used seldom: the bursts' flow is known. AEE and cosine of the whole burst as
 one window and (``halves``) of its second half, behind its first, beside zero flow's and the best constant and affine
-flow (which know the truth); at pixels with events, and over all. ``NAME+refined`` is a network whose flow is as long as
-makes the events sharpest, which is what `eflow predict` gives. ``--changed`` adds their share of zero flow's error when
-only a part of the events is left (means of ten draws), and when the burst lies in the middle of a larger sensor.
+flow (which know the truth); at pixels with events, and over all. ``NAME+refined`` is what `eflow predict` gives: the
+mean over four views of the events, as long as makes the events sharpest. ``--changed`` adds their share of zero flow's
+error when only a part of the events is left (means of ten draws), and when the burst lies in the middle of a larger
+sensor.
 ``--sets`` adds the same table for data sets with labels (configs/eflow/independent_data.yaml is one): means over up to
 ``--windows`` samples of each, evenly spaced; ``--pans`` that of four photographs that pass by, of 0.5 to 6 px a window.
 """
@@ -51,14 +52,14 @@ from eflow.checkpoint import load_model
 from eflow.data.sources import open_source
 from eflow.data.window import RawSample, StreamWindow, hit_pixels
 from eflow.evaluate import best_motions
-from eflow.infer import LIKELY_PX, Predictor
+from eflow.infer import LIKELY_PX, Predictor, default_views
 from eflow.methods.iwe import flow_warp_loss
 from eflow.methods.table import METHODS, make_method
 
 TEST = "ecd_rotation"
 """Folder of the bursts whose flow is known: the networks are judged by them and not tuned on them."""
 REFINED = "+refined"
-"""Behind a network's name: its flow as long as makes the events sharpest, as `eflow predict` has it."""
+"""Behind a network's name: the mean over views, as long as makes the events sharpest, as `eflow predict` has it."""
 MOVES = 1.1
 """FWL of the affine field from which on a window is said to move."""
 LONGEST_MS = 120.0
@@ -112,7 +113,8 @@ def answer_of(name: str, height: int, width: int, focal: float | None = None) ->
         return lambda window: np.zeros((height, width, 2), np.float32)
     plain = name.removesuffix(REFINED)
     model = make_method(name, focal) if name in METHODS else load_model(plain)
-    predictor = Predictor(model, height, width, refine=plain != name)
+    refine = plain != name
+    predictor = Predictor(model, height, width, refine=refine, views=default_views(plain) if refine else 1)
     return lambda window: predictor(window)[0]
 
 

@@ -255,6 +255,8 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
             "error: --iterations: contrast-affine is not a network (got 3)",
         ),
         (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is not a network (got True)"),
+        (["contrast-affine", "E", "--views", "4"], "error: --views: contrast-affine is not a network (got 4)"),
+        (["NETWORK", "E", "--views", "3"], "error: views: not a number of views (got 3); expected 1, 4 or 8"),
         (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method uses it (got 200.0); expected contrast-"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The views of `flow_lengths --views` are right about their own flow."""
+"""The views of `flow_lengths --changed` are right about their own flow."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("torch")
 
 from blinkgl.tools import flow_lengths
-from blinkgl.tools.flow_lengths import VIEWS, enlarged
+from blinkgl.tools.flow_lengths import CHANGED, enlarged
 from eflow.data.window import RawSample, Window
 
 
@@ -25,7 +25,7 @@ def test_enlarged_windows_have_the_events_and_the_flow_of_a_larger_sensor():
     assert (three.height, three.width) == three.valid.shape == (27, 36)
     np.testing.assert_array_equal(three.new.x, 3 * sample.new.x)
     np.testing.assert_array_equal(three.flow[three.new.y, three.new.x], 3 * sample.flow[sample.new.y, sample.new.x])
-    for name, view in VIEWS.items():
+    for name, view in CHANGED.items():
         seen = view(sample)
         assert seen.flow.shape == (seen.height, seen.width, 2) == (*seen.valid.shape, 2), name
 
@@ -36,8 +36,8 @@ def test_no_flow_is_as_wrong_as_zero_flow_in_every_table(monkeypatch):
     monkeypatch.setattr(flow_lengths, "open_source", lambda _: windows)
     still = lambda model, height, width, **_: lambda window: (np.zeros((height, width, 2), np.float32), None)
     monkeypatch.setattr(flow_lengths, "Predictor", still)
-    views, density, length = flow_lengths.of_views(None, "pool", 3)
-    assert [row[0] for row in views] == list(VIEWS)
+    views, density, length = flow_lengths.of_changed(None, "pool", 3)
+    assert [row[0] for row in views] == list(CHANGED)
     for _, error, zero, ratio, beside in views:
         assert error == zero and ratio == beside == 1.0
     assert views[-1][2] == pytest.approx(3 * views[0][2])  # tripled

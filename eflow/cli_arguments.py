@@ -64,9 +64,9 @@ Refine = Annotated[bool, typer.Option(help=_REFINE)]
 Views = Annotated[
     int | None,
     typer.Option(
-        metavar="1|4|8",
-        help="Mean flow of this many views of the events (4: mirrored, too; 8: with swapped polarities, too). "
-        "Default: 4 where predict takes a shipped network, else 1.",
+        metavar="N",
+        help="Mean flow of N views of the events: 1, 4 (mirrored, too) or 8 (with swapped polarities, too). Default: 4 "
+        "where predict takes a shipped network, else 1.",
         show_default=False,
     ),
 ]

@@ -267,9 +267,7 @@ class View:
 
     @classmethod
     def of(cls, camera: CameraModel) -> View:
-        if camera not in _views:
-            _views.of(camera, lambda: cls._made(camera))
-        return _views[camera]
+        return _views.of(camera, lambda: cls._made(camera))
 
     @classmethod
     def _made(cls, camera: CameraModel) -> View:

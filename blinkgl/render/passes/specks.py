@@ -12,7 +12,7 @@ import numpy as np
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.frames import DEPTH_BUFFER
-from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
+from blinkgl.render.passes.base import Input, Output, OverPass, Pass, ScenePass, Shot
 from blinkgl.render.passes.edged import Edged
 from blinkgl.render.passes.luminance import Colour, Luminance, LuminancePass, Mean, Picture
 from blinkgl.render.passes.shadow import ShadowMap
@@ -89,7 +89,7 @@ class ColourPortraits(Portraits, Colour):
 
 
 @dataclass(frozen=True)
-class Specks(Pass):
+class Specks(OverPass):
     """A picture of light, with filtered edges or without, and the specks that it leaves out, far ones first. Outputs
     and grid are those of the pass."""
 
@@ -110,10 +110,6 @@ class Specks(Pass):
         base = self.of.of if isinstance(self.of, Edged) else self.of
         assert isinstance(base, Picture)
         return base
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
-        return self.of.outputs
 
     @property
     def samples(self) -> Samples:  # type: ignore[bad-override]
@@ -139,8 +135,7 @@ class Specks(Pass):
         # The nearest comes first among the portraits, and last into the picture.
         buffer = ctx.buffer(np.ascontiguousarray(table[::-1]))
         array = ctx.vertex_array(program, [(buffer, "4f 2i /i", "in_body", "in_cell")])
-        shot.target.fbo.use()
-        ctx.viewport = (0, 0, shot.target.fbo.width, shot.target.fbo.height)
+        shot.target.use()
         ctx.enable_only(moderngl.BLEND)
         ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         ctx.point_size = 1.0

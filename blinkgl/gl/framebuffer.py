@@ -186,6 +186,7 @@ class Target(Releasing):
         self._bind(_DRAW_FRAMEBUFFER, other.fbo.glo)
         edges = edges or (0, 0, self.width, self.height)
         self._blit(*edges, *edges, _COLOR_BIT * bool(self.formats) | _DEPTH_BIT * depth, _NEAREST)
+        # moderngl has not seen the calls above and believes that its own framebuffer is still bound.
         other.fbo.use()
 
     def read(

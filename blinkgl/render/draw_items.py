@@ -174,6 +174,7 @@ class _Greys:
             return False
         pictured = material.texture is not None and not self._grey(material.texture.image)
         tinted = mesh.colours is not None and not self._grey(mesh.colours)
+        # Two pictures in colour multiply: no single colour times a brightness is their product.
         if pictured and tinted:
             return True
         if material.unlit:

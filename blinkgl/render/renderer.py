@@ -261,6 +261,7 @@ class Renderer(Releasing):
             if pass_.common and (last := self._last.get(pass_)) is not None and pass_.serves(last.moment, moment):
                 done[pass_] = last
                 return last
+            # A pass that several others read is drawn once: ``done`` holds it.
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}
             seen = moment.view.camera  # labels may be of another picture than the rest
             canvases = self._common if pass_.common else self._canvases
@@ -376,6 +377,7 @@ class Labels:
             if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)
         }
         each = request.each
+        # Each interval is a forward flow of its own from the same time.
         leading = {ns: self.frame(t_ns, each, t_ns + ns, None) for ns in request.intervals_ns} if each else {}
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:

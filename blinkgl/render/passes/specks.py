@@ -125,6 +125,7 @@ class Specks(OverPass):
             return
         cells = np.column_stack(np.divmod(np.arange(len(places)), _CELLS)[::-1])
         table = np.empty(len(places), [("body", "4f4"), ("cell", "2i4")])
+        # A portrait shows a little more than the body, so its square in the picture is larger by as much.
         table["body"], table["cell"] = places * (1, 1, _ROOM, 1), cells
         ctx, program = painter.gl.ctx, painter.gl.program(self.program, self.defines(None))
         uniforms = painter.uniforms(program)
@@ -136,6 +137,7 @@ class Specks(OverPass):
         buffer = ctx.buffer(np.ascontiguousarray(table[::-1]))
         array = ctx.vertex_array(program, [(buffer, "4f 2i /i", "in_body", "in_cell")])
         shot.target.use()
+        # Alpha is the share of a pixel that a body covers; the rest of it shows what is behind.
         ctx.enable_only(moderngl.BLEND)
         ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         ctx.point_size = 1.0

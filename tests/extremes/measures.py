@@ -12,7 +12,6 @@ from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
 from blinkgl.tools.shader_debugger import reference
 from tests.render.render_scenes import LEVEL, SECOND, drift, rig
 
-FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 MOTION = LabelRequest("depth", "ids", "velocity", "flow_forward")
 
 

@@ -79,6 +79,7 @@ class Rule:
     paths: tuple[Path, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        # Split once, because rules run for every sequence. A frozen dataclass allows no other way.
         object.__setattr__(self, "paths", tuple(tuple(key.lstrip("?#").split(".")) for key in self.keys))
 
     def __call__(self, model: Config) -> None:
@@ -164,6 +165,7 @@ class Config(BaseModel):
         """Return the given keys over those of the preset, without those of earlier versions."""
         if not isinstance(data, dict):
             return data
+        # Before the fields are checked, which would call them unknown keys.
         former = [key for key in data if key in cls.former]
         for key in former:
             if not cls.former[key].is_off(data[key]):

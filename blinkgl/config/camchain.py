@@ -115,6 +115,7 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
 
 def _tree(text: str, where: str) -> Tree:
     """Return the table of a YAML or JSON file, also of OpenCV's dialect: ``%YAML:1.0`` and the tags of its types."""
+    # OpenCV writes a colon where YAML has a space, and tags that no other reader knows.
     text = re.sub(r"\A\s*%YAML[: ]1\.\d\s*\n(---\s*\n)?", "", text)
     tree = parse_yaml(re.sub(r"!!opencv-\w+", "", text), where)
     if not isinstance(tree, dict):
@@ -141,6 +142,7 @@ def _of_matrix(tree: Mapping[str, object], where: str) -> Calibrated | None:
     numbers = next((name for name in _COEFFICIENTS if name in table), None)
     coefficients = [] if numbers is None else _flat(table[numbers])
     model = table.get("distortion_model", table.get("type", table.get("camera_model")))
+    # Coefficients without a model are OpenCV's own; a flag of its files says which of the two.
     if model in _NONE and any(coefficients or ()):
         model = "equidistant" if table.get("fisheye_model") else "radtan"
     plain = {"resolution": size, "intrinsics": [K[0], K[4], K[2], K[5]], "distortion_model": model}
@@ -185,6 +187,7 @@ def _colmap(text: str, where: str) -> dict[str, Calibrated]:
         numbers = [_number(field) for field in fields[4:]]
         if len(numbers) != len(names.split()) or None in numbers:
             raise ConfigError("wrong numbers", where=place, value=fields[4:], accepted=names)
+        # COLMAP's parameters stand in another order for each of its models.
         by = dict(zip(names.split(), numbers))
         focal = [by.get("fx", by.get("f")), by.get("fy", by.get("f"))]
         # Its pixels begin at 0, ours are centred there.

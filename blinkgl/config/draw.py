@@ -118,6 +118,7 @@ def _number(x: object) -> float:
 
 
 def _is_weighted(spec: Any) -> bool:
+    # Weights need not sum to 1, but something must be left to draw.
     weights = [_number(weight) for weight in spec.values()]
     return min(weights) >= 0 and sum(weights) > 0
 

@@ -66,7 +66,9 @@ def expanded(tree: Tree, base: Path) -> Tree:
         return {**spelled_out(table), **placed_by_calibration(table, base)}
 
     def whole(table: Tree) -> Tree:
+        # Before the names are replaced: a calibration's keys look like those of the camera itself.
         check_one_lens(table)
+        # Only a sensor of a rig has a place, which its calibration may state.
         return with_sections(spelled_out(table), placed)
 
     return with_groups(tree, whole)

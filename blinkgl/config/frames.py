@@ -104,6 +104,7 @@ class FramesConfig(Config):
 
 def check_span(frames: int, fps: float) -> None:
     """Raise Refused for ``frames`` frames at ``fps`` that are longer than one event file can hold."""
+    # n frames have n - 1 intervals between them.
     if (frames - 1) / fps > MAX_SPAN_S:
         raise Refused(
             f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an "

@@ -75,6 +75,7 @@ class PoseConfig(Config):
 
     @rule("look_at", "position")
     def _some_direction(look_at, position):
+        # Nearer than that, rounding would decide the direction.
         if look_at is not None and max(abs(a - b) for a, b in zip(look_at, position)) < 1e-9:
             raise Refused("must differ from the position", where="look_at", value=list(look_at))
 

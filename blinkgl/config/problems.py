@@ -99,6 +99,7 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
             accepted="one of " + ", ".join(f"'{tag[1]}'" for tag in tags if tag),
         )
     if kind == "missing":
+        # A list's missing entry is reported by its number, as if that were a key.
         short = path and path[-1].isdigit() and not owners
         problem, value = ("too few entries", first["input"]) if short else ("is required", ...)
         return ConfigError(

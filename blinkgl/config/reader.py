@@ -83,6 +83,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             raise ComposerError(None, None, _TOO_DEEP, event.start_mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
+        # With everything inside it, so that an alias of aliases counts in full.
         self._sizes[id(node)] = self._values - before
         return node
 
@@ -96,6 +97,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         duplicates among the table's own keys are errors."""
         if not isinstance(node, MappingNode):
             raise ConstructorError(None, None, "not a table", node.start_mark)
+        # Flattening lets a table's own keys replace merged ones, and would hide keys given twice.
         self._refuse_twice(node)
         self.flatten_mapping(node)
         return {self._key(key): self.construct_object(value, deep=True) for key, value in node.value}
@@ -236,6 +238,7 @@ def merge(common: object, own: object) -> Any:
     both = (
         isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
     )
+    # Keys of one kind mean nothing to another.
     if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
         return copy.deepcopy(own)
     laid = {key: copy.deepcopy(value) if key in _WHOLE else merge(common.get(key), value) for key, value in own.items()}

@@ -186,6 +186,7 @@ def _laid(own: list[dict[str, object]], base: list[dict[str, object]]) -> list[d
     by_name: dict[object, dict[str, object]] = {}
     for k, one in enumerate(own):
         name = one.get("name")
+        # Names are folders, and some file systems do not tell upper from lower case. No text is refused later.
         low = name.lower() if isinstance(name, str) else k
         if low in by_name:
             raise ConfigError(

@@ -159,6 +159,7 @@ def _split(template: RunTemplate) -> tuple[Group, ...]:
             raise ConfigError("not a group", where=where, value=own, accepted="a table of keys")
         if "groups" in own:
             raise ConfigError("a group cannot hold groups", where=f"{where}.groups")
+        # A copy: the run's tree keeps its ``enabled``.
         own = dict(own)
         enabled = own.pop("enabled", True)
         if not isinstance(enabled, bool):
@@ -196,6 +197,7 @@ def _group(name: str, template: RunTemplate, enabled: bool) -> Group:
 
 def derived_seed(seed: int, name: str) -> int:
     """Return the 63-bit seed of the group ``name``."""
+    # A digest: Python's own hash of a text differs from process to process.
     return int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little") >> 1
 
 

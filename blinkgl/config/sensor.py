@@ -47,6 +47,7 @@ def _emulator_tables(tables: dict[str, dict[str, object]]) -> dict[str, dict[str
             raise Refused("unknown emulator", value=name, accepted="one of " + ", ".join(models))
         if "emulator" in keys:
             raise Refused("the name of the table is the emulator", where=name, value=keys["emulator"])
+        # A problem is reported by its place in the sensor file, not in ``events:``.
         with placed(lambda key, name=name: name if key in ("", "config") else f"{name}.{key}", Refused):
             validate(models[name], keys)
     return tables
@@ -108,6 +109,7 @@ class SensorConfig(Config):
     @property
     def threshold_known(self) -> bool:
         """Return whether a threshold of its pixels is known; otherwise the emulators' defaults apply."""
+        # k1 is the voltmeter's, whose threshold is 1 / k1 in ln units.
         tables = (*self.emulators.values(), {"contrast_threshold": self.contrast_threshold})
         return any(table.get(key) is not None for table in tables for key in ("contrast_threshold", "k1"))
 

@@ -301,6 +301,7 @@ class SequenceConfig(Config):
         own: dict[str, object] = {key: getattr(one, key) for key in SECTIONS}
         if one.events is None:
             own["events"] = self.events
+        # A copy is not checked: whoever reads a run has the rules checked on it (config/run.py).
         preview = self.preview.model_copy(update={"enabled": False})
         return self.model_copy(update={**own, "rig": None, "sensors": None, "preview": preview})
 

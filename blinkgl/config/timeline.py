@@ -41,6 +41,7 @@ class _AdaptiveTimeline(_Timeline):
 
     @rule("min_step_us", "max_step_us")
     def _ordered(least, most):
+        # Equal ones are a fixed step.
         if least > most:
             raise Refused(f"min_step_us must not exceed max_step_us = {most}", value=least)
 

@@ -60,6 +60,7 @@ class MotionConfig(Config):
         """Return the number of waypoints of a sequence of this duration, >= 2."""
         if self.waypoints_per_s is None:
             return self.waypoints
+        # n intervals have n + 1 ends.
         return min(max(math.ceil(self.waypoints_per_s * seconds) + 1, 2), _MOST_POINTS)
 
 

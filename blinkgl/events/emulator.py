@@ -27,6 +27,7 @@ are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
 _NO_FRAME, _NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
+"""Used for the kind of frame that a step does not have."""
 
 
 class Source(NamedTuple):
@@ -43,9 +44,6 @@ class Source(NamedTuple):
         if frame.dtype == np.uint8:
             return cls(frame=_NO_FRAME, codes=frame, table=table, signals=signals)
         return cls(frame=frame, codes=_NO_CODES, table=table, signals=signals)
-
-
-"""Used for the kind of frame that was not given."""
 
 
 def _flat(array: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from blinkgl.config.readout import LightNoiseConfig
-from blinkgl.events.arith import log_f64
 from blinkgl.events.philox import Stream, pixel_counters, uniform2
+from blinkgl.events.pixels import among, waits_ns
 from blinkgl.types.events import Cause, Events
 
 _BATCH = 1024
@@ -84,11 +84,7 @@ class LightNoise:
             (threshold < on)[kept].astype(np.uint8),
             np.full(len(pixel), Cause.SHOT, np.uint8) if self._causes else None,
         )
-        if not len(events):
-            return own
-        # Stable: at the same microsecond the pixels' events stay before the noise.
-        both = Events.concatenate([events, own])
-        return both.part(np.argsort(both.t, kind="stable"))
+        return among(events, own)
 
     def _more(self) -> np.ndarray:
         """Draw the next batch of candidates of the whole sensor, (n, 3)."""
@@ -96,9 +92,7 @@ class LightNoise:
         self._batch += 1
         wait, pick = uniform2(self._seed, index, _STREAM, _WHEN)
         keep, _ = uniform2(self._seed, index, _STREAM, _WHICH)
-        # Exponential waiting times, ns, at most 13 days, so that the longest batch fits int64.
-        gaps = np.minimum(-log_f64(wait) * (1e9 / (self._sums[-1] * self.most_hz)), 2.0**50).astype(np.int64)
-        t_ns = self._t_ns + np.cumsum(gaps)
+        t_ns = self._t_ns + waits_ns(wait, self._sums[-1] * self.most_hz)
         self._t_ns = int(t_ns[-1])
         pixel = np.minimum(np.searchsorted(self._sums, pick * self._sums[-1], side="right"), len(self._sums) - 1)
         return np.column_stack([t_ns // 1000, pixel, keep])

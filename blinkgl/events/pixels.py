@@ -35,6 +35,21 @@ def _awake(pixel, t_us, dead_us, last):
     return out
 
 
+def waits_ns(uniform: np.ndarray, per_second: float) -> np.ndarray:
+    """Return the times of a Poisson process of this rate from the event before the first, int64 ns."""
+    # Exponential waiting times, at most 13 days, so that the longest batch fits int64.
+    return np.cumsum(np.minimum(-log_f64(uniform) * (1e9 / per_second), 2.0**50).astype(np.int64))
+
+
+def among(events: Events, noise: Events) -> Events:
+    """Return both in order of time."""
+    if not len(events) or not len(noise):
+        return noise if len(noise) else events
+    # Stable: at the same microsecond the pixels' events stay before the noise.
+    both = Events.concatenate([events, noise])
+    return both.part(np.argsort(both.t, kind="stable"))
+
+
 class PixelNoise:
     """Removes the events of dead pixels from an emulator's events and adds noise events.
 
@@ -92,12 +107,7 @@ class PixelNoise:
         if self._last is not None:
             pixel = own.pixel(self._width)
             own = own.part(_awake(pixel, own.t, self.config.refractory_us, self._last))
-        if not len(own):
-            return events
-        if not len(events):
-            return own
-        both = Events.concatenate([events, own])
-        return both.part(np.argsort(both.t, kind="stable"))
+        return among(events, own)
 
     def _more(self) -> Events:
         """Draw the next batch of a Poisson process of the whole sensor and the answers to its events. Pixels are
@@ -109,9 +119,7 @@ class PixelNoise:
         wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
         polarity, answers = uniform2(self._seed, index, _OWN, np.uint64(1))
         total = self._sums[-1]
-        # Exponential waiting times, ns, at most 13 days, so that the longest batch fits int64.
-        gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**50).astype(np.int64)
-        t_ns = self._t_ns + np.cumsum(gaps)
+        t_ns = self._t_ns + waits_ns(wait, total)
         self._t_ns = int(t_ns[-1])
         pixel = np.minimum(np.searchsorted(self._sums, pick * total, side="right"), len(self._sums) - 1)
         cause = np.where(self.hot[pixel], np.uint8(Cause.HOT), np.uint8(Cause.SHOT)) if self._causes else None

@@ -52,6 +52,7 @@ def register(emulator: type[Emulator]) -> type[Emulator]:
     kind = _checked(emulator)
     if EMULATORS.get(kind, emulator) is not emulator:
         raise TypeError(f"emulator '{kind}': there is one already, {EMULATORS[kind].__name__}")
+    # Configuration gets the model alone, so it need not import this room.
     EmulatorConfig.members[kind], EMULATORS[kind] = emulator.Config, emulator
     return emulator
 
@@ -59,6 +60,7 @@ def register(emulator: type[Emulator]) -> type[Emulator]:
 def emulator_of(config: EmulatorConfig) -> type[Emulator]:
     """Return the class of a configuration. Raises TypeError for one that is not in the table."""
     for emulator in EMULATORS.values():
+        # Not isinstance: the configuration of an emulator may inherit from that of another.
         if type(config) is emulator.Config:
             return emulator
     raise TypeError(f"no emulator for {type(config).__name__}")
@@ -118,6 +120,7 @@ def _checked(emulator: object) -> str:
     # The timeline and the judge call both before the first frame.
     response, twin = result("response", emulator.response, config), result("noiseless", emulator.noiseless, config)
     unless(isinstance(response, Response), "response", f"gives {response!r} and not a Response")
+    # This class is not in the table yet, and may be its own judge.
     known = (model, *(other.Config for other in EMULATORS.values()))
     unless(type(twin) in known, "noiseless", f"gives {twin!r} and not the configuration of an emulator in the table")
     return kind

@@ -85,6 +85,7 @@ class SurfaceTruth:
         x, y = events.x.astype(np.intp), events.y.astype(np.intp)
         height, width = after.ids.shape
         pixel = y * width + x
+        # What its pixel shows at the nearer of the two frames.
         speeds = _where(late, _looked_up(after, pixel), _looked_up(before, pixel))
         # found[1] is the depth, and the nearest surface wins.
         best = speeds[1].copy()

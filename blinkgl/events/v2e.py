@@ -47,6 +47,7 @@ from blinkgl.events.v2e_events import End, emit
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
+    corner_hz,
     draw_hot,
     draw_leaks,
     draw_start,
@@ -294,9 +295,8 @@ class V2e(Emulator):
     def memory_s(self, luminance: np.ndarray) -> np.ndarray | None:
         if self.config.cutoff_hz == 0:
             return None
-        # The corner frequency of the first low-pass, f_c (I + 20)/275, as in v2e_model.relax.
-        corner = self.config.cutoff_hz * (luminance.astype(np.float64) * self.config.full_scale + 20.0) / 275.0
-        return _TAIL / (2 * np.pi * corner)
+        level = luminance.astype(np.float64) * self.config.full_scale
+        return _TAIL / (2 * np.pi * corner_hz(level, self.config))
 
     def push(self, luminance: np.ndarray, jump: float, rise_s: float) -> np.ndarray | None:
         memory = self.memory_s(luminance)

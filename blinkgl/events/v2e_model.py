@@ -206,11 +206,15 @@ def noise_threshold(config: V2eConfig) -> float:
     return 0.5 * sum(config.thresholds)
 
 
+def corner_hz(level: np.ndarray, config: V2eConfig) -> np.ndarray:
+    """Return the corner frequency of the first low-pass, f_c (I + 20)/275. level : float64 DN."""
+    return config.cutoff_hz * (level + 20.0) / 275.0
+
+
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
     """Draw stationary photoreceptor noise at the first frame, (H*W,) float32 ln units."""
-    # The low-pass's corner f_c (I + 20)/275 Hz.
-    corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
+    corner = corner_hz(intensity.astype(np.float64), config)
     pixels = np.arange(len(intensity), dtype=np.uint64)
     _, normal = in_blocks(lambda part: normal2(seed, part, np.uint64(Stream.START), np.uint64(1)), pixels)
     return (start_sizes(config.shot_noise_rate_hz, corner, noise_threshold(config)) * normal).astype(np.float32)
@@ -299,7 +303,7 @@ def _start_of(
         # Where noise fires more often than leak: the rung next to its mean, or the last one that the noise has passed.
         often = np.ones(len(on), bool)
         often[moving] = mean * config.shot_noise_rate_hz > 1.0
-        corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
+        corner = corner_hz(intensity.astype(np.float64), config)
         place = start_places(config.shot_noise_rate_hz, corner, first) * np.where(first > 0.5, on, off)
         # Rungs, one threshold apart, that the noise has passed upwards and downwards.
         up, down = np.floor((noise - place) / on), np.floor((place - noise) / off)

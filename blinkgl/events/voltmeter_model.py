@@ -143,21 +143,22 @@ def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint6
     return v, left_us
 
 
+def _still(level: np.ndarray, config: VoltmeterConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return drift and noise, mu and sigma, of a scene that does not change. level : float64 DN."""
+    return config.k4 + config.k5 * level, config.k3 * np.sqrt(level) / (level + config.k2) + config.k6
+
+
 def _voltage_of(
     config: VoltmeterConfig, seed: np.uint64, pixels: np.ndarray, intensity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return :func:`start_voltage` of the pixels of these numbers."""
-    c = config
-    level = intensity.astype(np.float64)
-    # Drift and noise of a scene that does not change.
-    mu = c.k4 + c.k5 * level
-    sigma = c.k3 * np.sqrt(level) / (level + c.k2) + c.k6
+    mu, sigma = _still(intensity.astype(np.float64), config)
     with np.errstate(divide="ignore", invalid="ignore"):
         # r is infinite without noise and NaN without drift and noise.
         r = np.minimum(2.0 * np.abs(mu) / sigma**2, 1e12)
         # Mean time between events, for the share of the dead time: tanh(r/2)/mu, 1/sigma^2 without drift.
         between = np.where(r > 1e-9, one_minus_exp(r) / (2.0 - one_minus_exp(r)) / np.abs(mu), 1 / sigma**2)
-    v = np.zeros(level.size)
+    v = np.zeros(len(intensity))
     wanted = np.flatnonzero(np.isfinite(r))
     for turn in range(200):
         if not wanted.size:
@@ -175,21 +176,19 @@ def _voltage_of(
         wanted = wanted[~kept]
     # For r < 0 the mirror image.
     v = np.where(mu < 0, -v, v)
-    left = np.zeros(level.size)
-    if c.refractory_us:
+    left = np.zeros(len(intensity))
+    if config.refractory_us:
         a, b = uniform2(seed, pixels, _START, np.uint64(1000))
         # The chance to be in the dead time is its share of the whole cycle.
-        dead = np.isfinite(r) & (a * (c.refractory_us + between) < c.refractory_us)
-        left[dead] = b[dead] * c.refractory_us
+        dead = np.isfinite(r) & (a * (config.refractory_us + between) < config.refractory_us)
+        left[dead] = b[dead] * config.refractory_us
     return (np.clip(v, -NEAREST, NEAREST) * V_ONE).astype(np.int32), left
 
 
 def start_by_leak(v: np.ndarray, intensity: np.ndarray, config: VoltmeterConfig) -> np.ndarray:
     """What of the V of :func:`start_voltage` is leak's doing, float32: the share tanh(r/2) that drift has of the way
     from event to event in the mean, where V lies on the drift's side."""
-    level = intensity.astype(np.float64)
-    mu = config.k4 + config.k5 * level
-    sigma = config.k3 * np.sqrt(level) / (level + config.k2) + config.k6
+    mu, sigma = _still(intensity.astype(np.float64), config)
     with np.errstate(divide="ignore", invalid="ignore"):
         # tanh(r/2) = (1 - e^-r)/(1 + e^-r).
         e = exp_f64(-np.minimum(2.0 * np.abs(mu) / sigma**2, 700.0))

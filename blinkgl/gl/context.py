@@ -85,14 +85,10 @@ class OSMesaContext:
 
 
 def _load_library() -> ctypes.CDLL:
-    for name in LIBRARIES:
-        try:
-            lib = ctypes.CDLL(name)
-            break
-        except OSError:
-            continue
-    else:
+    name = _loadable(LIBRARIES)
+    if name is None:
         raise OSMesaUnavailable("libOSMesa.so not found")
+    lib = ctypes.CDLL(name)
     if not hasattr(lib, "OSMesaCreateContextAttribs"):
         raise OSMesaUnavailable("libOSMesa is too old (no OSMesaCreateContextAttribs, Mesa < 12)")
     pointer = ctypes.c_void_p
@@ -411,11 +407,8 @@ def _device_text(query_string: Any, handle: int) -> str:
     extensions = (query_string(handle, _EXTENSIONS) or b"").decode().split()
     if "EGL_MESA_device_software" in extensions:
         return "Mesa software rasteriser"
-    words = []
-    if "EGL_EXT_device_query_name" in extensions:
-        words.append((query_string(handle, _RENDERER_EXT) or b"").decode())
-    if "EGL_EXT_device_drm" in extensions:
-        words.append((query_string(handle, _DRM_FILE) or b"").decode())
+    asked = ("EGL_EXT_device_query_name", _RENDERER_EXT), ("EGL_EXT_device_drm", _DRM_FILE)
+    words = [(query_string(handle, number) or b"").decode() for name, number in asked if name in extensions]
     if "EGL_NV_device_cuda" in extensions:
         words.append("NVIDIA")
     return " ".join(filter(None, words)) or "unnamed device"

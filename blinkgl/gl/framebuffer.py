@@ -145,8 +145,10 @@ class Target(Releasing):
         raise GLError("unknown kind of depth", value=kind, accepted="True, False, 'texture' or 'texture of 16 bits'")
 
     def use(self) -> None:
-        """Make this the target of drawing (sets the viewport, and the scissor of ``fbo.scissor``)."""
+        """Make all of this the target of drawing (sets the viewport, and the scissor of ``fbo.scissor``)."""
         self.fbo.use()
+        # Binding restores the viewport of the last use, which may have been a part.
+        self.gl.ctx.viewport = (0, 0, self.fbo.width, self.fbo.height)
 
     def clear(self, *colour: float | int | Sequence[float], depth: float = 0.0) -> None:
         """Make it current and clear every attachment: value i (scalar or per component) for
@@ -184,6 +186,7 @@ class Target(Releasing):
         self._bind(_DRAW_FRAMEBUFFER, other.fbo.glo)
         edges = edges or (0, 0, self.width, self.height)
         self._blit(*edges, *edges, _COLOR_BIT * bool(self.formats) | _DEPTH_BIT * depth, _NEAREST)
+        # moderngl has not seen the calls above and believes that its own framebuffer is still bound.
         other.fbo.use()
 
     def read(

@@ -104,6 +104,7 @@ def expand(
     folder = shader_folder() if folder is None else folder
     body = _Expansion(folder)
     body.file(name, Path(name) if Path(name).is_absolute() else folder / name, chain=())
+    # #version must come before everything else, so it is taken out of the file and put first.
     head = [body.version or DEFAULT_VERSION, f"#define {stage.upper()}_SHADER 1"]
     head += [f"#define {key} {value}" for key, value in normalised(defines)]
     return ShaderSource(

@@ -97,6 +97,7 @@ class FrameCamera:
 
     @property
     def due_ns(self) -> int | None:
+        # The length of the exposure is known only now, since the images before it decide it.
         return None if self.taken == len(self._starts) else self._exposure().end_ns
 
     def take(self) -> CameraImage:
@@ -124,6 +125,7 @@ class FrameCamera:
         self.taken, self.drawn = k + 1, self.drawn + count
         self.exposed_ns.append((exposure.start_ns, exposure.middle_ns, exposure.end_ns))
         self.largest_step_px = max(self.largest_step_px, step_px)
+        # By the image without its noise, so that two seeds are exposed alike.
         if self.config.auto_exposure is not None and self.taken < len(self._starts):
             dt_s = (self._starts[k + 1] - self._starts[k]) * 1e-9
             self._setting = next_setting(self.config.auto_exposure, setting, _mean(clean), dt_s)
@@ -168,6 +170,7 @@ class FrameCamera:
         changes = max((wave.per_second() for wave in draw.scene.waveforms.values()), default=0.0)
         # As many instants as motion, lens and changing light ask for, whichever needs most.
         count = instants(exposure, speed, config.max_px, points, config.max_instants, changes)
+        # A jump has no speed by which a number could be chosen, so there are as many as are allowed.
         if jumps:
             count = config.max_instants
         lens = config.lens if points > 1 else None

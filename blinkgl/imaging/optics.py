@@ -44,6 +44,7 @@ class Optics:
     def light(self, at: int | Moment) -> np.ndarray:
         """Return the light on the pixels at a time, ns, or of a moment, (H, W) float32, linear."""
         light = self._drawn(at if isinstance(at, Moment) else self._renderer.moment(at))
+        # Before the colour filters: they lie on the pixels, and light is spread on its way there.
         for weights in self._kernels:
             light = np.stack([spread(light[..., c], weights) for c in range(light.shape[2])], axis=2)
         bayer = self._config.bayer
@@ -53,19 +54,19 @@ class Optics:
         """Return (H, W, 1 or 3) float32 before the spread."""
         draw, lens, coloured = self._renderer, self._config.lens, self._config.bayer is not None
         if lens is None or self._points is None:
-            return self._one(moment) if not coloured else draw.colour(moment, draw.antialiasing).read()
+            return (
+                draw.colour(moment, draw.antialiasing).read() if coloured else draw.luminance(moment).read()[..., None]
+            )
         total = None
         for point in self._points:
             seen = thin_lens.through(moment.view.camera, point, lens.focus)
             there = moment.from_place(View.of(seen), thin_lens.at_point(moment.T_world_cam, point))
+            # float64, so that the sum over many points of the lens does not round.
             picture = draw.colour(there, draw.antialiasing).read().astype(np.float64)
             total = picture if total is None else total + picture
         assert total is not None
         mean = total / len(self._points)
         return (mean if coloured else (mean @ LUMA)[..., None]).astype(np.float32)
-
-    def _one(self, moment: Moment) -> np.ndarray:
-        return self._renderer.luminance(moment).read()[..., None]
 
 
 def kernels_of(psf: GaussianPsfConfig | AiryPsfConfig | KernelPsfConfig) -> list[np.ndarray]:
@@ -75,6 +76,7 @@ def kernels_of(psf: GaussianPsfConfig | AiryPsfConfig | KernelPsfConfig) -> list
         return [weights / weights.sum()]
     if isinstance(psf, GaussianPsfConfig):
         edges = np.arange(2 * math.ceil(_REACH * psf.sigma) + 2) - math.ceil(_REACH * psf.sigma) - 0.5
+        # The integral over each pixel, not the value at its centre: a narrow kernel keeps its width.
         share = np.array([math.erf(edge / (math.sqrt(2) * psf.sigma)) for edge in edges])
         row = np.diff(share) / np.diff(share).sum()
         return [row[None], row[:, None]]  # it is separable
@@ -101,6 +103,7 @@ def spread(light: np.ndarray, weights: np.ndarray) -> np.ndarray:
         for x in range(width):
             total = 0.0
             for j in range(weights.shape[0]):
+                # A convolution: the weights say where light goes, so the pixel that it comes from is on the other side.
                 row = min(max(y + up - j, 0), height - 1)
                 for i in range(weights.shape[1]):
                     column = min(max(x + left - i, 0), width - 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import fields
 
 import numpy as np
@@ -46,20 +45,12 @@ class ObjectBoxes(Label):
 
     @property
     def forms(self) -> tuple[Form, ...]:
-        return (Form("boxes", "npz", _npz, _read), Form("boxes_kitti", "txt", _kitti))
+        return (Form("boxes", "npz", encode_boxes, read_boxes), Form("boxes_kitti", "txt", _kitti))
 
     def drawn_on(self, picture: np.ndarray, value: Boxes) -> np.ndarray:
         return with_boxes(picture, value)
 
     views = property(lambda self: ())
-
-
-def _npz(value: Boxes) -> bytes:
-    return encode_boxes(value)
-
-
-def _read(path: str | os.PathLike) -> Boxes:
-    return read_boxes(path)
 
 
 def _kitti(value: Boxes) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 
@@ -39,31 +40,29 @@ class Form:
 
 def npy(folder: str) -> Form:
     """Return the format of any array of numbers as .npy."""
-    return Form(folder, "npy", _images("encode_npy"), _images("read_npy"))
+    return Form(folder, "npy", later("images", "encode_npy"), later("images", "read_npy"))
 
 
 def mask_png(folder: str) -> Form:
     """Return the format of (H, W) bool as 8-bit PNG, 255 and 0."""
-    return Form(folder, "png", _images("encode_mask"), _images("read_mask"))
+    return Form(folder, "png", later("images", "encode_mask"), later("images", "read_mask"))
 
 
 def ids_png(folder: str) -> Form:
     """Return the format of (H, W) numbers from 0 to 65535 as 16-bit PNG."""
-    return Form(folder, "png", _images("encode_ids"), _images("read_ids"))
+    return Form(folder, "png", later("images", "encode_ids"), later("images", "read_ids"))
 
 
 def image_png(folder: str) -> Form:
     """Return the format of (H, W[, C]) linear light or sRGB codes as sRGB PNG; read as codes."""
-    return Form(folder, "png", _images("encode_image"), _images("read_image"))
+    return Form(folder, "png", later("images", "encode_image"), later("images", "read_image"))
 
 
-def _images(name: str) -> Callable[[Any], Any]:
-    """Return a function of :mod:`blinkgl.io.images` that is imported when first used, because configuration imports
-    this module."""
+def later(module: str, name: str) -> Callable[..., Any]:
+    """Return a function of a module of :mod:`blinkgl.io` that is imported when first used, because configuration
+    imports this module."""
 
-    def call(value: object) -> Any:
-        from blinkgl.io import images
-
-        return getattr(images, name)(value)
+    def call(*values: object) -> Any:
+        return getattr(import_module(f"blinkgl.io.{module}"), name)(*values)
 
     return call

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import numpy as np
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.labels import grading
-from blinkgl.labels.files import Form
+from blinkgl.labels.files import Form, later
 from blinkgl.labels.label import Drawn, Label, Shot, Towards, View
 from blinkgl.labels.values import Flow
 from blinkgl.types.trees import Tree
@@ -104,25 +105,13 @@ class FlowTo(Label):
         return true.valid if what == "valid" else np.where(true.valid[..., None], true.flow, 0.0)
 
 
-def _png(value: Flow) -> tuple[bytes, int]:
-    from blinkgl.io.flow import encode_flow_png
-
-    return encode_flow_png(value.flow, value.valid)
-
-
-def _npy(value: Flow) -> bytes:
-    from blinkgl.io.flow import encode_flow_npy
-
-    return encode_flow_npy(value.flow, value.valid)
+def _encoder(name: str) -> Callable[[Flow], bytes | tuple[bytes, int]]:
+    encode = later("flow", name)
+    return lambda value: encode(value.flow, value.valid)
 
 
-def _flo(value: Flow) -> bytes:
-    from blinkgl.io.flow import encode_flo
-
-    return encode_flo(value.flow, value.valid)
+_png, _npy, _flo = (_encoder(name) for name in ("encode_flow_png", "encode_flow_npy", "encode_flo"))
 
 
 def _read(path: str | os.PathLike) -> Flow:
-    from blinkgl.io.flow import read_flow
-
-    return Flow(*read_flow(path))
+    return Flow(*later("flow", "read_flow")(path))

@@ -56,6 +56,7 @@ class _OverIntervals(Label):
     made: type
 
     def intervals(self, labels: LabelsConfig) -> tuple[int, ...]:
+        # Increasing, whatever their order in the configuration.
         return tuple(sorted(round(s * 1e9) for s in seconds_of(labels)))
 
     def _stacked(self, drawn: Drawn, arrays: dict[str, list[np.ndarray]]) -> Any:
@@ -90,6 +91,7 @@ class _OverIntervals(Label):
         from blinkgl.io.intervals import read_intervals
 
         from_us, interval_ns, arrays = read_intervals(path, tuple(self.arrays))
+        # Files count whole microseconds, as DSEC's do.
         return self.made(from_us * 1000, interval_ns, **arrays)
 
     views = property(lambda self: ())  # the debugger shows it as the flow label at other times

@@ -36,6 +36,7 @@ def class_of(obj: SceneObject) -> str:
     "sky" by their category."""
     if obj.category != "object":
         return obj.category
+    # The numbers that copies get: "#12" here, ".001" in Blender. A name of nothing else is kept.
     return re.sub(r"([#.\-_ ]\d+)+$", "", obj.name) or obj.name
 
 
@@ -47,6 +48,7 @@ def names_of(obj: SceneObject) -> list[str]:
 def category_of(obj: SceneObject, categories: Categories) -> int:
     """Return the number of an object's category; 0: no pattern matches."""
     names = names_of(obj)
+    # The first pattern that matches decides, so "*" may stand at the end for the rest.
     return next((number for pattern, number in categories if any(fnmatchcase(n, pattern) for n in names)), 0)
 
 

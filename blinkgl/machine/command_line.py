@@ -104,6 +104,7 @@ def run_app(
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(arguments, resumes)
     except BrokenPipeError:  # `blinkgl … | head`: the reader has gone, which is not an error
+        # Python flushes stdout once more when it ends, which would fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:  # noqa: BLE001 - every error leaves as a line for the user
@@ -209,6 +210,7 @@ def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether memory ran out: MemoryError (NumPy's too), ENOMEM, or the words that OpenCV, LLVM, torch and HDF5
     say it in."""
     seen: set[int] = set()
+    # Causes may lead back to an error that was seen before.
     while error is not None and id(error) not in seen:
         seen.add(id(error))
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):

@@ -19,8 +19,8 @@ class Watch:
     def __init__(self) -> None:
         self.seconds, self.kernels, self._depth, self._began = 0.0, 0, 0, 0.0
         self.say: Callable[[str], None] | None = None
-        self._said = False
-        self.told = 0, 0.0
+        self._announced = False
+        self.reported = 0, 0.0
         """Kernels and seconds that have been reported."""
 
     @property
@@ -30,10 +30,11 @@ class Watch:
 
     def start(self) -> None:
         self._depth += 1
+        # A kernel that calls others compiles them inside its own compilation: only the outermost is timed.
         if self._depth == 1:
             self._began = time.perf_counter()
-            if self.say is not None and not self._said:
-                self._said = True
+            if self.say is not None and not self._announced:
+                self._announced = True
                 self.say("compiling the kernels that this needs, once per machine and version: up to a minute")
 
     def end(self) -> None:
@@ -61,8 +62,9 @@ def announced_compiling(say: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         watch.say = outer
-        kernels, seconds = watch.kernels - watch.told[0], watch.seconds - watch.told[1]
-        watch.told = watch.kernels, watch.seconds
+        kernels, seconds = watch.kernels - watch.reported[0], watch.seconds - watch.reported[1]
+        # An outer listener does not report once more what this one has.
+        watch.reported = watch.kernels, watch.seconds
         if kernels:
             say(f"compiled {kernels} kernels in {seconds:.0f} s")
 

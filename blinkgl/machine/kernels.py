@@ -24,7 +24,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from blinkgl.machine.compiling import kernel_cache_failed, watch
 
-_said: set[str] = set()
+_reported: set[str] = set()
 """Folders that have been reported; "" where there is none."""
 
 
@@ -70,6 +70,7 @@ class _Turn:
         return True
 
     def end(self) -> None:
+        # A kernel that was called is kept before its caller is: the turn lasts until both are.
         if self._file is not None and not watch.compiles:
             os.close(self._file)
             self._file = None
@@ -92,6 +93,7 @@ class _CheckedFile(IndexDataCacheFile):
         entry = super().load(key)
         if entry is None:
             return None
+        # A wrong entry would be machine code for other types: it would crash, not fail.
         its_key, data = entry
         if its_key != key:
             raise ValueError("the index of the kernel cache leads to another entry")
@@ -124,13 +126,14 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: object, target_context: object) -> object:
         try:
             overload = super().load_overload(sig, target_context)
+            # Whoever had the turn before may have compiled and kept this very kernel.
             if overload is None and turn.begin():
                 overload = super().load_overload(sig, target_context)
                 if overload is not None:
                     turn.end()
             return overload
         except Exception:  # noqa: BLE001 - damaged bytes raise anything
-            self._say("the kernels kept there are damaged or unreadable and are compiled again")
+            _report(self.cache_path, "the kernels kept there are damaged or unreadable and are compiled again")
             with contextlib.suppress(OSError):
                 self.flush()
             return None
@@ -139,14 +142,17 @@ class _Cache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            self._say(f"kernels cannot be kept there ({error.strerror}) and are compiled in every process")
+            _report(
+                self.cache_path, f"kernels cannot be kept there ({error.strerror}) and are compiled in every process"
+            )
         finally:
             turn.end()
 
-    def _say(self, what: str) -> None:
-        if self.cache_path not in _said:
-            _said.add(self.cache_path)
-            kernel_cache_failed(f"{self.cache_path}: {what}")
+
+def _report(folder: str, what: str) -> None:
+    if folder not in _reported:
+        _reported.add(folder)
+        kernel_cache_failed(f"{folder}: {what}" if folder else what)
 
 
 def kept() -> tuple[Path, int]:
@@ -194,10 +200,9 @@ def kernel(function: Callable | None = None, *, error_model: Literal["python", "
     try:
         dispatcher._cache = _Cache(function)  # noqa: SLF001 - what njit(cache=True) does, with a class of its own
     except RuntimeError:  # numba found no writable folder
-        if "" not in _said:
-            _said.add("")
-            kernel_cache_failed(
-                "kernels cannot be kept, since neither the package's folder nor the home folder can be written: they "
-                "are compiled in every process. NUMBA_CACHE_DIR=FOLDER keeps them in a folder of yours"
-            )
+        _report(
+            "",
+            "kernels cannot be kept, since neither the package's folder nor the home folder can be written: they "
+            "are compiled in every process. NUMBA_CACHE_DIR=FOLDER keeps them in a folder of yours",
+        )
     return dispatcher

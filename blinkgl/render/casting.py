@@ -29,7 +29,7 @@ import numpy as np
 
 from blinkgl.camera import CameraModel
 from blinkgl.render.moment import cam_from_obj, cam_from_obj_rate
-from blinkgl.render.raycast import Forest, Holes, build_tree, join_trees, nearest_tree
+from blinkgl.render.raycast import Forest, Holes, Tree, build_tree, join_trees, nearest_tree
 from blinkgl.scene.types import Mesh, Part, Scene, SceneObject
 from blinkgl.types.recent import Recent
 
@@ -147,15 +147,17 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
 
 def _planted(scene: Scene, t_ns: int) -> Forest:
     parts = [part for _, part in scene_parts(scene)]
-    trees = []
-    for part in parts:
-        if part.mesh.deformer is not None:
-            trees.append(build_tree(vertices_at(part.mesh, t_ns), part.mesh.faces))
-            continue
-        if part.mesh not in _trees:
-            _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
-        trees.append(_trees[part.mesh])
+    trees = [_tree(part.mesh, t_ns) for part in parts]
     return join_trees(trees, [part.side(t_ns) for part in parts], [_holes_of(part) for part in parts])
+
+
+def _tree(mesh: Mesh, t_ns: int) -> Tree:
+    if mesh.deformer is not None:
+        return build_tree(vertices_at(mesh, t_ns), mesh.faces)
+    # Weak keys: objects of several scenes share meshes, and their trees live as long as they do.
+    if mesh not in _trees:
+        _trees[mesh] = build_tree(mesh.vertices, mesh.faces)
+    return _trees[mesh]
 
 
 def _holes_of(part: Part) -> Holes | None:

@@ -42,8 +42,11 @@ _BUSIEST = 12
 """Pixels with at least this many crossings are not sorted further (:func:`_by_pixel`)."""
 
 
-class _Arrays(NamedTuple):
-    """Of a pool, for kernels."""
+class _Pool(NamedTuple):
+    """Contours one after the other, for kernels: places, faces, planes, edges, sharp, culled as in each, with continued
+    numbers.
+
+    starts : (N + 1, 3) int64: where each one's places, faces and edges begin, and the last one's end."""
 
     starts: np.ndarray
     places: np.ndarray
@@ -54,33 +57,33 @@ class _Arrays(NamedTuple):
     culled: np.ndarray
 
 
-class _Pool:
-    """Contours one after the other: places, faces, planes, edges, sharp, culled as in each, with continued numbers.
-
-    starts : (N + 1, 3) int64: where each one's places, faces and edges begin, and the last one's end."""
-
-    def __init__(self, contours: list[Contour]):
-        sizes = [(len(c.rest), len(c.faces), len(c.edges)) for c in contours]
-        # Running sums, so that numbers count on from contour to contour.
-        self.starts = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.reshape(sizes, (-1, 3)), axis=0)])
-        self.starts = self.starts.astype(np.int64)
-        # An empty part first, so that a pool without contours has arrays of the right shapes, too.
-        empty = [(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty((0, 4)), np.empty((0, 4), np.int32))]
-        # An edge holds two places and two faces, which are renumbered; -1 stays for a face that it does not have.
-        parts = empty + [
-            (
-                c.rest,
-                c.faces + place,
-                c.planes,
-                np.where(c.edges >= 0, c.edges + (place, place, face, face), -1),
-            )
-            for c, (place, face, _) in zip(contours, self.starts[:-1].tolist(), strict=True)
-        ]
-        places, faces, planes, edges = (np.concatenate(kind) for kind in zip(*parts, strict=True))
-        self.places, self.planes = places, planes
-        self.faces, self.edges = faces.astype(np.int32), edges.astype(np.int32)
-        self.sharp = np.concatenate([np.empty(0, np.int8), *(c.sharp for c in contours)])
-        self.culled = np.concatenate([np.empty(0, np.bool_), *(c.culled for c in contours)])
+def _pool_of(contours: list[Contour]) -> _Pool:
+    sizes = [(len(c.rest), len(c.faces), len(c.edges)) for c in contours]
+    # Running sums, so that numbers count on from contour to contour.
+    starts = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.reshape(sizes, (-1, 3)), axis=0)])
+    starts = starts.astype(np.int64)
+    # An empty part first, so that a pool without contours has arrays of the right shapes, too.
+    empty = [(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty((0, 4)), np.empty((0, 4), np.int32))]
+    # An edge holds two places and two faces, which are renumbered; -1 stays for a face that it does not have.
+    parts = empty + [
+        (
+            c.rest,
+            c.faces + place,
+            c.planes,
+            np.where(c.edges >= 0, c.edges + (place, place, face, face), -1),
+        )
+        for c, (place, face, _) in zip(contours, starts[:-1].tolist(), strict=True)
+    ]
+    places, faces, planes, edges = (np.concatenate(kind) for kind in zip(*parts, strict=True))
+    return _Pool(
+        starts=starts,
+        places=places,
+        faces=faces.astype(np.int32),
+        planes=planes,
+        edges=edges.astype(np.int32),
+        sharp=np.concatenate([np.empty(0, np.int8), *(c.sharp for c in contours)]),
+        culled=np.concatenate([np.empty(0, np.bool_), *(c.culled for c in contours)]),
+    )
 
 
 class Lines:
@@ -93,7 +96,7 @@ class Lines:
             tuple[tuple[int, bool], ...], int
         ] = {}  # numbers of contours, by their meshes' ids and sides
         self._of_object: dict[int, int] = {}
-        self._pool = _Pool([])
+        self._pool = _pool_of([])
         self._lines = np.empty((1024, LINE))
         self._crossings = np.empty((4096, CROSSING), np.float32)
         self._sorted = np.empty_like(self._crossings)
@@ -108,7 +111,7 @@ class Lines:
         numbers = np.array([self._number(moment, body) for body in bodies.tolist()], np.int64)
         # A pool's starts have one row more than it has contours; fewer mean that contours have been made since.
         if len(self._pool.starts) <= len(self._contours):
-            self._pool = _Pool(self._contours)
+            self._pool = _pool_of(self._contours)
         pool = self._pool
         for number in dict.fromkeys(numbers.tolist()):
             contour, (place, face, _) = self._contours[number], pool.starts[number]
@@ -121,17 +124,8 @@ class Lines:
         room = int((pool.starts[numbers + 1, 2] - pool.starts[numbers, 2]).sum())
         if room > len(self._lines):
             self._lines = np.empty((2 * room, LINE))
-        arrays = _Arrays(
-            starts=pool.starts,
-            places=pool.places,
-            faces=pool.faces,
-            planes=pool.planes,
-            edges=pool.edges,
-            sharp=pool.sharp,
-            culled=pool.culled,
-        )
         poses = moment.T_cam_obj, moment.mvp
-        count = _emit(numbers, bodies, *poses, arrays, float(width), float(height), self._lines)
+        count = _emit(numbers, bodies, *poses, pool, float(width), float(height), self._lines)
         return self._lines[:count]
 
     def _number(self, moment: Moment, body: int) -> int:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from blinkgl.render.draw_items import SKY
+
 if TYPE_CHECKING:
     from blinkgl.render.contours import Lines
     from blinkgl.render.draw_items import DrawItem
@@ -21,7 +23,6 @@ _LARGEST = 2**20, 2048
 _TANGLED, _HOLED = 0.03, 0.03
 """Shares of the picture from which on outlines crowd: pixels with the lines of several surfaces, and masked surfaces.
 Scenes that ``edges`` draws well have at most 0.025 tangled pixels, those that it draws badly 0.05 and more."""
-_SKY = 2
 
 
 def crowded_as(antialiasing: str, width: int, height: int) -> str:
@@ -47,7 +48,7 @@ def crowding(moments: Sequence[Moment], lines: Lines, width: int, height: int) -
 def _outlined(moment: Moment) -> list[DrawItem]:
     """Return what is drawn with its outlines: neither the sky nor a body under a pixel."""
     specks = set(moment.specks(1, len(moment.T_world_obj))[0].tolist())
-    return [item for item in moment.visible if item.layer != _SKY and item.object_index not in specks]
+    return [item for item in moment.visible if item.layer != SKY and item.object_index not in specks]
 
 
 def _masked(moment: Moment, items: list[DrawItem], width: int, height: int) -> float:

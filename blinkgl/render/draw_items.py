@@ -14,6 +14,7 @@ from blinkgl.scene.lights import is_coloured
 from blinkgl.scene.shapes.sweep import sweep
 from blinkgl.scene.shapes.table import define_of
 from blinkgl.scene.types import Deformer, Light, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.types.recent import Kept
 
 
 class Kind(NamedTuple):
@@ -150,7 +151,8 @@ class DrawItem:
 
 MAX_RADIUS = 1e18
 """Largest radius: times the largest focal length, 1e9 px, it is far below float32's 3e38."""
-_LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
+SKY = 2
+_LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": SKY}
 
 
 class _Greys:
@@ -158,12 +160,11 @@ class _Greys:
 
     def __init__(self, coloured_light: bool):
         self._coloured_light = coloured_light
-        self._known: dict[int, bool] = {}
+        self._known: Kept[int, bool] = Kept()
 
     def _grey(self, values: np.ndarray) -> bool:
-        if id(values) not in self._known:
-            self._known[id(values)] = all(np.array_equal(values[..., 0], values[..., k]) for k in (1, 2))
-        return self._known[id(values)]
+        equal = lambda: all(np.array_equal(values[..., 0], values[..., k]) for k in (1, 2))
+        return self._known.of(id(values), equal)
 
     def rgb(self, material: Material, mesh: Mesh) -> bool:
         gloss = None if material.unlit else material.gloss
@@ -173,6 +174,7 @@ class _Greys:
             return False
         pictured = material.texture is not None and not self._grey(material.texture.image)
         tinted = mesh.colours is not None and not self._grey(mesh.colours)
+        # Two pictures in colour multiply: no single colour times a brightness is their product.
         if pictured and tinted:
             return True
         if material.unlit:
@@ -190,31 +192,30 @@ class _Facets:
 
     def __init__(self, light: Light):
         self._asked, self._shadows = not light.plain, light.shadows != "off"
-        self._known: dict[int, bool] = {}
-        self._slopes: dict[int, float] = {}
+        self._known: Kept[int, bool] = Kept()
+        self._slopes: Kept[int, float] = Kept()
 
     def slope(self, mesh: Mesh) -> float:
         """Return the tangent of the angle that 95 % of the corners keep to their facet; 0 without shadows."""
-        if not self._shadows:
-            return 0.0
-        if id(mesh) not in self._slopes:
-            a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-            flat = np.cross(b - a, c - a)
-            flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
-            cosine = np.einsum("fk,fck->fc", flat, mesh.normals[mesh.faces].astype(np.float64))
-            # A quantile, so that a few corners do not count; cosines below 0.1 would make the tangent large.
-            angle = math.acos(min(1.0, max(0.1, float(np.quantile(cosine, 0.05)))))
-            self._slopes[id(mesh)] = math.tan(angle)
-        return self._slopes[id(mesh)]
+        return self._slopes.of(id(mesh), lambda: _slope(mesh)) if self._shadows else 0.0
 
     def flat(self, mesh: Mesh) -> bool:
-        if not self._asked or mesh.deformer is not None:
-            return False
-        # Compares the normals of each face's corners with its first one's.
-        if id(mesh) not in self._known:
-            corners = mesh.normals[mesh.faces]
-            self._known[id(mesh)] = bool((np.abs(corners[:, 1:] - corners[:, :1]) <= 1e-6).all())
-        return self._known[id(mesh)]
+        return self._asked and mesh.deformer is None and self._known.of(id(mesh), lambda: _is_flat(mesh))
+
+
+def _slope(mesh: Mesh) -> float:
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    flat = np.cross(b - a, c - a)
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    cosine = np.einsum("fk,fck->fc", flat, mesh.normals[mesh.faces].astype(np.float64))
+    # A quantile, so that a few corners do not count; cosines below 0.1 would make the tangent large.
+    return math.tan(math.acos(min(1.0, max(0.1, float(np.quantile(cosine, 0.05))))))
+
+
+def _is_flat(mesh: Mesh) -> bool:
+    # The normals of each face's corners are those of its first one.
+    corners = mesh.normals[mesh.faces]
+    return bool((np.abs(corners[:, 1:] - corners[:, :1]) <= 1e-6).all())
 
 
 def _draw_item(index: int, obj: SceneObject, part: Part, scene: Scene, grey: _Greys, facets: _Facets) -> DrawItem:

@@ -110,8 +110,7 @@ class Frame:
     @property
     def target(self) -> Target:
         """Return the target that it was drawn into, for a pass that resolves or copies it."""
-        self._check()
-        return self._memory.target
+        return self._live.target
 
     def texture(self, output: str = "") -> moderngl.Texture:
         """Return the texture of an output (default: the first), or of :data:`DEPTH_BUFFER`, for another pass: as the
@@ -132,14 +131,12 @@ class Frame:
         """Return a copy of an output, (H, W) or (H, W, C), dtype of its format; row 0 is the top row.
 
         out : written and returned when given (C-contiguous, that shape and dtype)."""
-        self._check()
-        return self._memory.read(name, out)
+        return self._live.read(name, out)
 
     def view(self, name: str = "") -> np.ndarray:
         """Return an output as a read-only array in memory of the renderer that the next frame overwrites: no
         allocation, and only changed parts are transferred. Copy it to keep it."""
-        self._check()
-        return self._memory.view(name, self)
+        return self._live.view(name, self)
 
     def tensor(self, device: object = "cuda", name: str = "") -> Any:
         """Return an output as a new torch tensor, (H, W) or (H, W, C), dtype of its format.
@@ -147,14 +144,12 @@ class Frame:
         device : torch's. On the GPU that draws it, the picture stays there if CUDA can share it; see
         :mod:`blinkgl.render.tensors`, and :meth:`transfer` for the way used.
         Raises GLError: no torch, no such device, no such output."""
-        self._check()
-        return self._memory.tensor(device, name)
+        return self._live.tensor(device, name)
 
     def transfer(self, device: object = "cuda", name: str = "") -> str:
         """Return the way of :meth:`tensor`: "interop", "pinned" or "plain", with the reason why no faster way is
         used."""
-        self._check()
-        reader = self._memory.reader(device, name)
+        reader = self._live.reader(device, name)
         return f"{reader.way}: {reader.why}" if reader.why else reader.way
 
     def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
@@ -173,13 +168,16 @@ class Frame:
             return None
         return (min(r.y0 for r in changed), max(r.y1 for r in changed)) if changed else (0, 0)
 
-    def _check(self) -> None:
+    @property
+    def _live(self) -> Memory:
+        """Return the memory, which still holds this frame."""
         if self._memory.number != self._number:
             raise GLError(
                 "this frame is no longer on the GPU: its pass has drawn another one",
                 where=f"frame at {self.t_ns * 1e-9:.9g} s",
                 accepted="read() before the next frame is drawn",
             )
+        return self._memory
 
 
 class Memory:
@@ -213,6 +211,7 @@ class Memory:
         if not self.outputs[i].components:
             out = self.target.read(i, out=out)
         else:
+            # Formats have one, two or four components; those beyond ``components`` are read and left out.
             picture = self._given_out(i, self.target.read(i))
             out = checked_array(out, picture.shape, picture.dtype)
             out[...] = picture

@@ -20,6 +20,7 @@ import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.camera.drawing import seen_through
+from blinkgl.types.recent import Kept
 
 if TYPE_CHECKING:
     import moderngl
@@ -89,7 +90,7 @@ class Lens:
 
     def __init__(self, gl: GLContext, camera: CameraModel, flat: PinHole):
         self.camera, self.flat, self._gl = camera, flat, gl
-        self._textures: dict[tuple, moderngl.Texture] = {}
+        self._textures: Kept[tuple, moderngl.Texture] = Kept()
 
     @classmethod
     def of(cls, gl: GLContext, camera: CameraModel) -> Lens | None:
@@ -99,23 +100,22 @@ class Lens:
 
     def places(self, width: int, height: int) -> moderngl.Texture:
         """Return the texture of places for a picture of this size."""
-        return self._texture(("places", width, height), lambda: places_of(self.camera, self.flat, width, height).places)
+        make = lambda: self._texture(places_of(self.camera, self.flat, width, height).places)
+        return self._textures.of(("places", width, height), make)
 
     def slopes(self, width: int, height: int) -> moderngl.Texture:
-        return self._texture(("slopes", width, height), lambda: places_of(self.camera, self.flat, width, height).slopes)
+        make = lambda: self._texture(places_of(self.camera, self.flat, width, height).slopes)
+        return self._textures.of(("slopes", width, height), make)
 
     @property
     def claims(self) -> moderngl.Texture:
-        return self._texture(("claims",), lambda: claims_of(self.camera, self.flat))
+        return self._textures.of(("claims",), lambda: self._texture(claims_of(self.camera, self.flat)))
 
-    def _texture(self, key: tuple, make) -> moderngl.Texture:
-        if key not in self._textures:
-            array = np.ascontiguousarray(make(), np.float32)
-            height, width, components = array.shape
-            texture = self._gl.ctx.texture((width, height), components, array.tobytes(), dtype="f4")
-            texture.filter = self._gl.ctx.NEAREST, self._gl.ctx.NEAREST
-            self._textures[key] = texture
-        return self._textures[key]
+    def _texture(self, array: np.ndarray) -> moderngl.Texture:
+        height, width, components = array.shape
+        texture = self._gl.ctx.texture((width, height), components, array.tobytes(), dtype="f4")
+        texture.filter = self._gl.ctx.NEAREST, self._gl.ctx.NEAREST
+        return texture
 
     @cached_property
     def _numbers(self) -> tuple[float, ...]:
@@ -141,4 +141,4 @@ class Lens:
     def release(self) -> None:
         for texture in self._textures.values():
             texture.release()
-        self._textures = {}
+        self._textures.clear()

@@ -16,6 +16,7 @@ from blinkgl.gl.shader import Uniforms
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.lights import is_coloured, lamps_of, quadric_of, quartic_of
 from blinkgl.scene.types import Light
+from blinkgl.types.recent import Kept
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
@@ -64,7 +65,7 @@ class Lighting:
             "lamp_fading": np.array([lamp.reach**-4.0 for lamp in near]),  # 0 for an infinite reach
             "spot_cone": np.array([lamp.cone for lamp in near if lamp.kind == "spot"]),
         }
-        self._weights: dict[tuple[float, ...], np.ndarray] = {}
+        self._weights: Kept[tuple[float, ...], np.ndarray] = Kept()
         self._bytes: dict[tuple, bytes] = {}  # constant values, by uniform and by the channel that one value represents
         self._last: tuple[Moment | None, bool, dict[str, np.ndarray]] = None, False, {}
         none = np.zeros((0, 3), np.float32)
@@ -146,11 +147,7 @@ class Lighting:
 
     def channel(self, base: tuple[float, ...]) -> np.ndarray:
         """Return (3,) the shares of r, g, b in the luminance of this base colour, which one channel represents."""
-        if base not in self._weights:
-            shares = LUMA * np.asarray(base, np.float64)
-            total = shares.sum()
-            self._weights[base] = shares / total if total > 0 else LUMA
-        return self._weights[base]
+        return self._weights.of(base, lambda: _shares(LUMA * np.asarray(base, np.float64)))
 
     def _placed(self, moment: Moment, rates: bool) -> dict[str, np.ndarray]:
         """Return, by uniform, (objects, ...) float32 in the objects' axes; those of the last moment are kept."""
@@ -190,6 +187,12 @@ class Lighting:
         placed = {name: np.ascontiguousarray(values, np.float32) for name, values in placed.items()}
         self._last = moment, rates, placed
         return placed
+
+
+def _shares(weights: np.ndarray) -> np.ndarray:
+    total = weights.sum()
+    # Black has no shares; what it shows is black with any.
+    return weights / total if total > 0 else LUMA
 
 
 def _seen_turned(form: np.ndarray, turn: np.ndarray, rate: np.ndarray | None = None) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from blinkgl.gl import GLContext, Target
 from blinkgl.gl.shader import Uniforms, unused
 from blinkgl.render.contours import CROSSING, Lines
+from blinkgl.types.recent import Kept
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
@@ -24,13 +25,13 @@ ROW = 512
 class LineDrawer:
     """The lines of one renderer. lines : the contours that it draws.   uniforms : returns a program's table."""
 
-    def __init__(self, gl: GLContext, uniforms: Callable[[moderngl.Program], Uniforms] = Uniforms):
+    def __init__(self, gl: GLContext, uniforms: Callable[[moderngl.Program], Uniforms]):
         self.gl, self.lines, self._uniforms = gl, Lines(), uniforms
         self._count = 0
         self._pixels: moderngl.Buffer | None = None
         self._crossings: moderngl.Texture | None = None
         self._rows = np.empty((0, ROW, CROSSING), np.float32)
-        self._programs: dict[tuple, tuple[Uniforms, moderngl.VertexArray]] = {}
+        self._programs: Kept[tuple, tuple[Uniforms, moderngl.VertexArray]] = Kept()
 
     def upload(self, moment: Moment, items: Iterable[DrawItem], width: int, height: int) -> None:
         """Upload the lines of these items in a picture of width x height px, for the next drawing."""
@@ -61,14 +62,15 @@ class LineDrawer:
         """Return the uniforms of a program and the array to draw; None where no pixel has a line."""
         if not self._count:
             return None
-        key = name, *sorted(defines.items())
-        if key not in self._programs:
-            program = self.gl.program(name, defines)
-            if "in_pixel" not in program:
-                raise unused(program, "in_pixel")
-            array = self.gl.ctx.vertex_array(program, [(self._pixels, "4i", "in_pixel")])
-            self._programs[key] = self._uniforms(program), array
-        return self._programs[key]
+        return self._programs.of(
+            (name, *sorted(defines.items())), lambda: self._drawing(self.gl.program(name, defines))
+        )
+
+    def _drawing(self, program: moderngl.Program) -> tuple[Uniforms, moderngl.VertexArray]:
+        if "in_pixel" not in program:
+            raise unused(program, "in_pixel")
+        array = self.gl.ctx.vertex_array(program, [(self._pixels, "4i", "in_pixel")])
+        return self._uniforms(program), array
 
     def use(self, unit: int) -> None:
         """Bind the crossings' texture to a unit."""
@@ -78,8 +80,7 @@ class LineDrawer:
     def draw(self, array: moderngl.VertexArray, target: Target) -> None:
         """Draw each of the pixels over the content of ``target``."""
         ctx = self.gl.ctx
-        target.fbo.use()
-        ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
+        target.use()
         ctx.enable_only(moderngl.NOTHING)
         ctx.point_size = 1.0
         array.render(moderngl.POINTS, vertices=self._count)
@@ -88,7 +89,7 @@ class LineDrawer:
         """Drop all programs, so that they are requested again."""
         for _, array in self._programs.values():
             array.release()
-        self._programs = {}
+        self._programs.clear()
 
     def release(self) -> None:
         self.forget()

@@ -20,7 +20,7 @@ from blinkgl.camera.drawing import seen_through
 from blinkgl.scene.motion import piecewise
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.scene.waveforms import factor_at
-from blinkgl.types.recent import Recent
+from blinkgl.types.recent import Kept, Recent
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem
@@ -141,13 +141,8 @@ class Moment:
     held: Held | None = None
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
-        self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
-            t_ns,
-            view,
-            T_world_cam,
-            T_world_obj,
-            stage,
-        )
+        self.t_ns, self.view, self._stage = t_ns, view, stage
+        self.T_world_cam, self.T_world_obj = T_world_cam, T_world_obj
 
     def over(self, begin_ns: int, end_ns: int) -> Moment:
         """Return the same instant in the mean light of a span."""
@@ -253,15 +248,13 @@ class Moment:
         """Return the nearest ``most`` bodies whose bounding sphere is under :data:`SPECK` samples of a picture of
         ``grid`` samples per pixel in x and y, front to back: (k,) int64 and (k, 4) float64, the sphere's middle, from
         the picture's corner, and its diameter, in samples, and its depth (near / Z), the nearest point's."""
-        if (grid, most) not in self._specks:
-            self._specks[grid, most] = self._found_specks(grid, most)
-        return self._specks[grid, most]
+        return self._specks.of((grid, most), lambda: self._smallest(grid, most))
 
     @cached_property
-    def _specks(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
-        return {}
+    def _specks(self) -> Kept[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
+        return Kept()
 
-    def _found_specks(self, grid: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    def _smallest(self, grid: int, most: int) -> tuple[np.ndarray, np.ndarray]:
         stage, camera, P = self._stage, self.view.camera, self.view.projection
         T, radius = self.T_cam_obj, stage.body_radius
         X, Y, Z = ((T[:, :3, :3] @ stage.body_centre[..., None])[..., 0] + T[:, :3, 3]).T

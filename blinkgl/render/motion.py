@@ -141,6 +141,7 @@ class Motion:
             largest = max(largest, self.look(b).largest)
             if 256 * (b - a) > tb_ns - ta_ns and b - a > 1:
                 if self.hides(self.look(a), self.look(b), tolerance):
+                    # The earlier half is taken first, so that the look at its end is kept for the start of the other.
                     intervals += [((a + b) // 2, b), (a, (a + b) // 2)]
             elif not self.unbounded and b > a:
                 jumps = jumps or self.hides(self.look(a), self.look(b), max_px / (b - a) * 1e9)
@@ -163,6 +164,7 @@ class Motion:
             if lamp.kind == "sun" and self._casters.any():
                 # Only its direction counts: shadows turn about what casts them.
                 T[:3, 3], dT[:3, 3] = centres[self._casters].mean(axis=0), 0.0
+            # d(point)/dt of a pattern that is fixed to the lamp: its place in the lamp's axes, T^-1 p, does not change.
             twists[k] = (dT @ np.linalg.inv(T))[:3]
             cosine = math.cos(lamp.outer) if lamp.kind == "spot" else -2.0
             cones[k] = *T[:3, 3], *-T[:3, 2], cosine, lamp.reach if lamp.kind != "sun" else math.inf
@@ -267,9 +269,7 @@ class View:
 
     @classmethod
     def of(cls, camera: CameraModel) -> View:
-        if camera not in _views:
-            _views.of(camera, lambda: cls._made(camera))
-        return _views[camera]
+        return _views.of(camera, lambda: cls._made(camera))
 
     @classmethod
     def _made(cls, camera: CameraModel) -> View:

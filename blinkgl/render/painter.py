@@ -18,6 +18,7 @@ from blinkgl.render.lighting import Lighting
 from blinkgl.render.line_drawer import LineDrawer
 from blinkgl.render.moment import Moment, linear_xyw_bytes
 from blinkgl.scene.types import Map, Scene
+from blinkgl.types.recent import Kept
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
@@ -54,8 +55,8 @@ class Painter:
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
         self.lighting = Lighting(scene.light)
         self.lens: Lens | None = None
-        self.programs: dict[Hashable, dict[Kind, Uniforms]] = {}
-        self._covers: dict[Hashable, tuple[Uniforms, moderngl.VertexArray]] = {}
+        self.programs: Kept[Hashable, dict[Kind, Uniforms]] = Kept()
+        self._covers: Kept[Hashable, tuple[Uniforms, moderngl.VertexArray]] = Kept()
         self._side = 0
         self.line_drawer = LineDrawer(gl, self.uniforms)
 
@@ -69,8 +70,7 @@ class Painter:
     def prepare(self, target: Target) -> None:
         """Make ``target`` the one that is drawn to, and keep its content."""
         ctx = self.gl.ctx
-        target.fbo.use()
-        ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
+        target.use()
         ctx.enable_only(moderngl.DEPTH_TEST)
         ctx.depth_func = ">"
         # Reversed depth: 1 at the near plane, so larger is nearer.
@@ -209,16 +209,14 @@ class Painter:
 
     def cover(self, source: str, defines: Mapping[str, object]) -> tuple[Uniforms, moderngl.VertexArray]:
         """Return the program over the whole target, and the empty vertex array that draws its one triangle."""
-        key = (source, *defines.items())
-        if key not in self._covers:
-            program = self.gl.program(source, defines)
-            self._covers[key] = self.uniforms(program), self.gl.ctx.vertex_array(program, [])
-        return self._covers[key]
+        return self._covers.of((source, *defines.items()), lambda: self._covering(self.gl.program(source, defines)))
+
+    def _covering(self, program: moderngl.Program) -> tuple[Uniforms, moderngl.VertexArray]:
+        return self.uniforms(program), self.gl.ctx.vertex_array(program, [])
 
     def fill(self, array: moderngl.VertexArray, target: Target) -> None:
         """Draw one triangle over all of ``target``."""
-        target.fbo.use()
-        self.gl.ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
+        target.use()
         self.gl.ctx.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         array.render(moderngl.TRIANGLES, vertices=3)
 
@@ -232,6 +230,7 @@ class Painter:
         """Drop all programs, before the context's programs are replaced."""
         for _, array in self._covers.values():
             array.release()
-        self.programs, self._covers = {}, {}
+        self.programs.clear()
+        self._covers.clear()
         self.line_drawer.release()
         self.resources.forget_vertex_arrays()

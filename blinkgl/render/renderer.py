@@ -52,7 +52,7 @@ from blinkgl.render.passes import (
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 from blinkgl.scene.types import Scene
-from blinkgl.types.recent import Recent
+from blinkgl.types.recent import Kept, Recent
 
 if TYPE_CHECKING:
     from blinkgl.config.sequence import RenderConfig
@@ -102,7 +102,7 @@ class Renderer(Releasing):
         self._canvases: dict[tuple[Pass, int, int], Canvas] = {}
         self._common: dict[tuple[Pass, int, int], Canvas] = {} if beside is None else beside._common  # noqa: SLF001
         self._last: dict[Pass, Frame] = {} if beside is None else beside._last  # noqa: SLF001
-        self._labels: dict[PinHole | None, Labels] = {}
+        self._labels: Kept[PinHole | None, Labels] = Kept()
         # Useful when something besides the camera stands still; a scene of only moving objects is drawn completely.
         some_stand = any(o.is_static for o in scene.objects)
         lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
@@ -182,7 +182,7 @@ class Renderer(Releasing):
         self._canvases = {}
         self._common.clear()
         self._last.clear()
-        self._labels = {}
+        self._labels.clear()
         self._painter.forget()
 
     def look_through(self, camera: CameraModel) -> None:
@@ -191,7 +191,7 @@ class Renderer(Releasing):
         self.scene = self.scene.with_camera(camera)
         self._moments.look_through(camera)
         self.motion.camera = camera
-        self._labels = {}
+        self._labels.clear()
         self.whole = True  # the static part of one picture is not valid for the other
         lens, new = self._painter.lens, Lens.of(self.gl, camera)
         if lens is not None:
@@ -261,6 +261,7 @@ class Renderer(Releasing):
             if pass_.common and (last := self._last.get(pass_)) is not None and pass_.serves(last.moment, moment):
                 done[pass_] = last
                 return last
+            # A pass that several others read is drawn once: ``done`` holds it.
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}
             seen = moment.view.camera  # labels may be of another picture than the rest
             canvases = self._common if pass_.common else self._canvases
@@ -335,9 +336,7 @@ class Renderer(Releasing):
         return self._labels_in(camera).frame(t_ns, request, t_forward_ns, t_backward_ns)
 
     def _labels_in(self, camera: PinHole | None) -> Labels:
-        if camera not in self._labels:
-            self._labels[camera] = Labels(self, camera)
-        return self._labels[camera]
+        return self._labels.of(camera, lambda: Labels(self, camera))
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """Return what is seen at the centre of pixel (x, y) at t_ns, as text for messages."""
@@ -378,6 +377,7 @@ class Labels:
             if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)
         }
         each = request.each
+        # Each interval is a forward flow of its own from the same time.
         leading = {ns: self.frame(t_ns, each, t_ns + ns, None) for ns in request.intervals_ns} if each else {}
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:

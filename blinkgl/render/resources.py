@@ -21,6 +21,7 @@ from blinkgl.scene.lights import surroundings_of
 from blinkgl.scene.shapes.table import includes
 from blinkgl.scene.surfaces.gloss import energy, looks, mean_energy
 from blinkgl.scene.types import IDENTITY, REPEAT, Deformer, Map, Material, Mesh, Scene, Texture, Wrap
+from blinkgl.types.recent import Kept
 
 MADE.append(includes)
 
@@ -131,12 +132,12 @@ class SceneResources:
     def __init__(self, gl: GLContext, scene: Scene, anisotropy: float = 1.0, mip_bias: float = 0.0):
         self.ctx, self.scene, self.anisotropy, self.mip_bias = gl.ctx, scene, anisotropy, mip_bias
         self._parameter = gl.function("glTexParameterf", None, ctypes.c_uint, ctypes.c_uint, ctypes.c_float)
-        self._buffers: dict[tuple, tuple[moderngl.Buffer, ...]] = {}
-        self._textures: dict[tuple, moderngl.Texture] = {}
-        self._vaos: dict[tuple, moderngl.VertexArray] = {}
-        self._vaos_of_items: dict[tuple[int, int], moderngl.VertexArray] = {}
-        self._shapes: dict[int, Shape] = {}
-        self._volumes: dict[str, moderngl.Texture3D] = {}
+        self._buffers: Kept[tuple, tuple[moderngl.Buffer, ...]] = Kept()
+        self._textures: Kept[tuple, moderngl.Texture] = Kept()
+        self._vaos: Kept[tuple, moderngl.VertexArray] = Kept()
+        self._vaos_of_items: Kept[tuple[int, int], moderngl.VertexArray] = Kept()
+        self._shapes: Kept[int, Shape] = Kept()
+        self._volumes: Kept[str, moderngl.Texture3D] = Kept()
         self.items = draw_items(scene)
 
     @property
@@ -146,100 +147,82 @@ class SceneResources:
     def vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
         """Return the vertex array of the attributes that ``program`` uses; the rest of the interleaved vertex is
         skipped."""
-        known = self._vaos_of_items.get((id(program), item.number))
-        if known is None:
-            known = self._vaos_of_items[id(program), item.number] = self._vertex_array(program, item)
-        return known
+        return self._vaos_of_items.of((id(program), item.number), lambda: self._shared_array(program, item))
 
-    def _vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
+    def _shared_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
         # The texture coordinates of a buffer depend on both, so they are part of its key.
-        whole = _by_whole_repeats(item.material)
-        key = (id(program), id(item.mesh), item.material.uv_scale, whole)
-        if key not in self._vaos:
-            vertices, indices = self._mesh_buffers(item.mesh, item.material.uv_scale, whole)
-            # OpenGL would draw nothing, or refuse an empty vertex.
-            if "in_position" not in program:
-                raise unused(program, "in_position")
-            formats, names = [], []
-            for name, fmt, size in _ATTRIBUTES:
-                used = name in program
-                # "12x" skips the bytes of an attribute that the program does not use.
-                formats.append(fmt if used else f"{size}x")
-                if used:
-                    names.append(name)
-            streams = [(vertices, " ".join(formats), *names)]
-            if item.deformer is not None:
-                streams += self.shape(item.deformer).streams(program)
-            streams += [
-                (self._stream(item.mesh, name), f"{n}f", name)
-                for name, n in (("in_tangent", 4), ("in_tint", 3))
-                if name in program
-            ]
-            # The last 4 is the size of an index in bytes.
-            self._vaos[key] = self.ctx.vertex_array(program, streams, indices, 4)
-        return self._vaos[key]
+        scale, whole = item.material.uv_scale, _by_whole_repeats(item.material)
+        key = (id(program), id(item.mesh), scale, whole)
+        buffers = lambda: self._buffers.of((id(item.mesh), scale, whole), lambda: self._mesh(item.mesh, scale, whole))
+        return self._vaos.of(key, lambda: self._vertex_array(program, item, *buffers()))
+
+    def _vertex_array(
+        self, program: moderngl.Program, item: DrawItem, vertices: moderngl.Buffer, indices: moderngl.Buffer
+    ) -> moderngl.VertexArray:
+        # OpenGL would draw nothing, or refuse an empty vertex.
+        if "in_position" not in program:
+            raise unused(program, "in_position")
+        # "12x" skips the bytes of an attribute that the program does not use.
+        formats = [fmt if name in program else f"{size}x" for name, fmt, size in _ATTRIBUTES]
+        streams = [(vertices, " ".join(formats), *(name for name, _, _ in _ATTRIBUTES if name in program))]
+        if item.deformer is not None:
+            streams += self.shape(item.deformer).streams(program)
+        streams += [
+            (self._stream(item.mesh, name), f"{n}f", name)
+            for name, n in (("in_tangent", 4), ("in_tint", 3))
+            if name in program
+        ]
+        # The last 4 is the size of an index in bytes.
+        return self.ctx.vertex_array(program, streams, indices, 4)
 
     def shape(self, deformer: Deformer) -> Shape:
         """Return the OpenGL resources of a deformer."""
-        if id(deformer) not in self._shapes:
-            self._shapes[id(deformer)] = Shape(self.ctx, deformer)
-        return self._shapes[id(deformer)]
+        return self._shapes.of(id(deformer), lambda: Shape(self.ctx, deformer))
 
     def luminance_texture(self, material: Material) -> moderngl.Texture:
         """Return the luminance of texture * base_color, mip-mapped in linear light: R16F for 8-bit images where
         :func:`half_floats` applies, else R32F."""
         texture = _of(material.texture)
         key = ("luminance", id(texture), material.base_color, material.wrap)
-        if key not in self._textures:
-            image = luminance_image(texture.image, material.base_color)[..., None]
-            self._textures[key] = self._light(image, texture, material.wrap)
-        return self._textures[key]
+        image = lambda: luminance_image(texture.image, material.base_color)[..., None]
+        return self._textures.of(key, lambda: self._light(image(), texture, material.wrap))
 
     def shares_texture(self, material: Material) -> moderngl.Texture:
         """Return the shares of r, g and b of texture * base_color in its luminance, RGB16F or RGB32F; their sum is
         :meth:`luminance_texture`."""
         texture = _of(material.texture)
         key = ("shares", id(texture), material.base_color, material.wrap)
-        if key not in self._textures:
-            # Each channel's share of the luminance, so that r + g + b of the texture is it.
-            shares = (LUMA * np.asarray(material.base_color, np.float64)).astype(np.float32)
-            image = linear_image(texture.image) * shares
-            self._textures[key] = self._light(image, texture, material.wrap)
-        return self._textures[key]
+        # Each channel's share of the luminance, so that r + g + b of the texture is it.
+        shares = lambda: (LUMA * np.asarray(material.base_color, np.float64)).astype(np.float32)
+        image = lambda: linear_image(texture.image) * shares()
+        return self._textures.of(key, lambda: self._light(image(), texture, material.wrap))
 
     def colour_texture(self, material: Material) -> moderngl.Texture:
         """Return the linear rgb of the texture alone: sRGB8 when the image is 8-bit, else RGB32F."""
         return self._colour(_of(material.texture), material.wrap)
 
     def _colour(self, texture: Texture, wrap: tuple[Wrap, Wrap]) -> moderngl.Texture:
-        key = ("colour", id(texture), wrap)
-        if key not in self._textures:
-            image = texture.image
-            srgb8 = image.dtype == np.uint8
-            # 0x8C41: GL_SRGB8.
-            self._textures[key] = self._upload(
-                image if srgb8 else linear_image(image), texture.name, 0x8C41 if srgb8 else None, wrap
-            )
-        return self._textures[key]
+        image, srgb8 = texture.image, texture.image.dtype == np.uint8
+        # 0x8C41: GL_SRGB8.
+        make = lambda: self._upload(
+            image if srgb8 else linear_image(image), texture.name, 0x8C41 if srgb8 else None, wrap
+        )
+        return self._textures.of(("colour", id(texture), wrap), make)
 
     # ---- of materials that are more than a base colour
 
     def coverage_texture(self, material: Material) -> moderngl.Texture:
         """Return the opacity, R32F, one level."""
-        key = ("coverage", id(material.mask), material.wrap)
-        if key not in self._textures:
-            image = _of(material.mask).alpha.astype(np.float32)[..., None] / np.float32(255)
-            self._textures[key] = self._upload(image, "mask", wrap=material.wrap, levels=False)
-        return self._textures[key]
+        image = lambda: _of(material.mask).alpha.astype(np.float32)[..., None] / np.float32(255)
+        make = lambda: self._upload(image(), "mask", wrap=material.wrap, levels=False)
+        return self._textures.of(("coverage", id(material.mask), material.wrap), make)
 
-    def numbers_texture(self, given: Map) -> moderngl.Texture:
+    def numbers_texture(self, map_: Map) -> moderngl.Texture:
         """Return three numbers per pixel as they are stored, RGB32F. Drivers filter 8-bit textures to 8 bits: smooth
         surfaces would then shine in steps, with noisy rates."""
-        key = ("numbers", id(given.texture), given.wrap)
-        if key not in self._textures:
-            image = given.texture.image.astype(np.float32) / np.float32(255)
-            self._textures[key] = self._upload(image, given.texture.name, wrap=given.wrap)
-        return self._textures[key]
+        texture, wrap = map_.texture, map_.wrap
+        make = lambda: self._upload(texture.image.astype(np.float32) / np.float32(255), texture.name, wrap=wrap)
+        return self._textures.of(("numbers", id(texture), wrap), make)
 
     def emission_texture(self, material: Material, colour: bool) -> moderngl.Texture:
         """Return the material's own emission, linear rgb, or R16F or R32F as :meth:`luminance_texture`, scaled to a
@@ -247,12 +230,10 @@ class SceneResources:
         texels = _of(material.emission_map)
         if colour:
             return self._colour(texels.texture, texels.wrap)
+        shares = lambda: tuple(np.asarray(material.emission, np.float64) / self.emitted_luminance(material))
+        image = lambda: luminance_image(texels.texture.image, shares())[..., None]
         key = ("emission", id(texels.texture), material.emission, texels.wrap)
-        if key not in self._textures:
-            shares = np.asarray(material.emission, np.float64) / self.emitted_luminance(material)
-            image = luminance_image(texels.texture.image, tuple(shares))[..., None]
-            self._textures[key] = self._light(image, texels.texture, texels.wrap)
-        return self._textures[key]
+        return self._textures.of(key, lambda: self._light(image(), texels.texture, texels.wrap))
 
     def emitted_luminance(self, material: Material) -> float:
         return float(LUMA @ np.asarray(material.emission, np.float64))
@@ -260,39 +241,35 @@ class SceneResources:
     def energy_texture(self) -> moderngl.Texture:
         """Return RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.energy`, its mean, and the weight of the first
         look."""
-        once = energy()
-        mean = np.broadcast_to(mean_energy()[:, None, None], (*once.shape[:2], 1))
-        return self._table("energy", np.concatenate([once, mean, looks()[..., 4:]], axis=2))
+        return self._table("energy", _energy_table)
 
     def looks_texture(self) -> moderngl.Texture:
         """Return RGBA32F of :func:`~blinkgl.scene.surfaces.gloss.looks`: for both looks, the fraction of the way to the
         mirror direction, and the roughness."""
-        return self._table("looks", looks()[..., :4])
+        return self._table("looks", lambda: looks()[..., :4])
 
-    def _table(self, name: str, numbers: np.ndarray) -> moderngl.Texture:
-        if (name,) not in self._textures:
-            table = self._textures[name,] = self._upload(
-                numbers.astype(np.float32), name, wrap=("clamp", "clamp"), levels=False
-            )
-            table.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        return self._textures[name,]
+    def _table(self, name: str, numbers: Callable[[], np.ndarray]) -> moderngl.Texture:
+        make = lambda: self._upload(numbers().astype(np.float32), name, wrap=("clamp", "clamp"), levels=False)
+        return self._textures.of((name,), make)
 
     def surroundings_texture(self, coloured: bool) -> moderngl.Texture3D:
         """Return RGBA32F, a: 1, of :func:`~blinkgl.scene.surfaces.gloss.blurred`: longitude, latitude, roughness; or
         R32F of its luminance."""
         name = "surroundings" if coloured else "luminance of surroundings"
-        if name not in self._volumes:
-            levels = self._surroundings
-            if coloured:
-                levels = np.concatenate([levels, np.ones_like(levels[..., :1])], axis=3)
-            else:
-                levels = (levels @ LUMA)[..., None].astype(np.float32)
-            depth, height, width, channels = levels.shape
-            volume = self.ctx.texture3d((width, height, depth), channels, levels.tobytes(), dtype="f4")
-            volume.filter = (moderngl.LINEAR, moderngl.LINEAR)
-            volume.repeat_x, volume.repeat_y, volume.repeat_z = True, False, False
-            self._volumes[name] = volume
-        return self._volumes[name]
+        return self._volumes.of(name, lambda: self._volume(coloured))
+
+    def _volume(self, coloured: bool) -> moderngl.Texture3D:
+        levels = self._surroundings
+        if coloured:
+            levels = np.concatenate([levels, np.ones_like(levels[..., :1])], axis=3)
+        else:
+            levels = (levels @ LUMA)[..., None].astype(np.float32)
+        depth, height, width, channels = levels.shape
+        volume = self.ctx.texture3d((width, height, depth), channels, levels.tobytes(), dtype="f4")
+        volume.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        # Only the longitude goes round; the poles and the ends of the roughness do not meet.
+        volume.repeat_x, volume.repeat_y, volume.repeat_z = True, False, False
+        return volume
 
     @cached_property
     def _surroundings(self) -> np.ndarray:
@@ -300,11 +277,9 @@ class SceneResources:
 
     def _stream(self, mesh: Mesh, name: str) -> moderngl.Buffer:
         """Return the buffer of the vertices' tangents or colours."""
-        key = (name, id(mesh))
-        if key not in self._buffers:
-            values = tangents(mesh) if name == "in_tangent" else mesh.colours
-            self._buffers[key] = (self.ctx.buffer(np.ascontiguousarray(values, np.float32).tobytes()),)
-        return self._buffers[key][0]
+        values = lambda: tangents(mesh) if name == "in_tangent" else mesh.colours
+        make = lambda: (self.ctx.buffer(np.ascontiguousarray(values(), np.float32).tobytes()),)
+        return self._buffers.of((name, id(mesh)), make)[0]
 
     def albedo_luminance(self, material: Material) -> float:
         """Return the albedo's luminance of a material without texture."""
@@ -314,39 +289,34 @@ class SceneResources:
         """Drop all vertex arrays, before the programs they were made for are replaced."""
         for vao in self._vaos.values():
             vao.release()
-        self._vaos, self._vaos_of_items = {}, {}
+        self._vaos.clear()
+        self._vaos_of_items.clear()
 
     def release(self) -> None:
         self.forget_vertex_arrays()
-        for pair in self._buffers.values():
-            for buffer in pair:
-                buffer.release()
-        for owned in (*self._textures.values(), *self._volumes.values(), *self._shapes.values()):
+        buffers = (buffer for several in self._buffers.values() for buffer in several)
+        for owned in (*buffers, *self._textures.values(), *self._volumes.values(), *self._shapes.values()):
             owned.release()
-        self._buffers, self._textures, self._volumes, self._shapes = {}, {}, {}, {}
+        for kept in (self._buffers, self._textures, self._volumes, self._shapes):
+            kept.clear()
 
-    def _mesh_buffers(self, mesh: Mesh, uv_scale: tuple[float, float], whole: bool) -> tuple[moderngl.Buffer, ...]:
-        """Return the buffers of a mesh's vertices and faces."""
-        key = (id(mesh), uv_scale, whole)
-        if key not in self._buffers:
-            data = np.empty((len(mesh.vertices), 8), np.float32)
-            data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
-            uvs = mesh.uvs * np.asarray(uv_scale, np.float64)
-            data[:, 6:] = _near_zero(uvs) if whole else uvs
-            # A GPU would draw infinities and NaN anywhere.
-            if not np.isfinite(data).all():
-                first = int(np.flatnonzero(~np.isfinite(data).all(axis=1))[0])
-                raise AssetError(
-                    f"vertex {first} has a position, normal or texture coordinate (x, y, z; n; u, v) beyond float32",
-                    where=mesh.name or "mesh",
-                    value=data[first].tolist(),
-                    accepted="finite numbers",
-                )
-            self._buffers[key] = (
-                self.ctx.buffer(data.tobytes()),
-                self.ctx.buffer(np.ascontiguousarray(mesh.faces, np.int32).tobytes()),
+    def _mesh(self, mesh: Mesh, uv_scale: tuple[float, float], whole: bool) -> tuple[moderngl.Buffer, ...]:
+        """Return new buffers of a mesh's vertices and faces."""
+        data = np.empty((len(mesh.vertices), 8), np.float32)
+        data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
+        uvs = mesh.uvs * np.asarray(uv_scale, np.float64)
+        data[:, 6:] = _near_zero(uvs) if whole else uvs
+        # A GPU would draw infinities and NaN anywhere.
+        if not np.isfinite(data).all():
+            first = int(np.flatnonzero(~np.isfinite(data).all(axis=1))[0])
+            raise AssetError(
+                f"vertex {first} has a position, normal or texture coordinate (x, y, z; n; u, v) beyond float32",
+                where=mesh.name or "mesh",
+                value=data[first].tolist(),
+                accepted="finite numbers",
             )
-        return self._buffers[key]
+        faces = np.ascontiguousarray(mesh.faces, np.int32)
+        return self.ctx.buffer(data.tobytes()), self.ctx.buffer(faces.tobytes())
 
     def _light(self, image: np.ndarray, texture: Texture, wrap: tuple[Wrap, Wrap]) -> moderngl.Texture:
         """Return a texture of ``image``, (h, w, c) float32, which was made from ``texture``."""
@@ -405,6 +375,13 @@ class SceneResources:
             texture.use(0)
             self._parameter(_TEXTURE_2D, _TEXTURE_LOD_BIAS, self.mip_bias)
         return texture
+
+
+def _energy_table() -> np.ndarray:
+    """Return the numbers of :meth:`SceneResources.energy_texture`."""
+    once = energy()
+    mean = np.broadcast_to(mean_energy()[:, None, None], (*once.shape[:2], 1))
+    return np.concatenate([once, mean, looks()[..., 4:]], axis=2)
 
 
 def _by_whole_repeats(material: Material) -> bool:

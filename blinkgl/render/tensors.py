@@ -81,6 +81,7 @@ class TextureReader:
             return self._torch.from_numpy(self._target.read(self._i)).to(self.device)
         if self._sent is not None:
             self._sent.synchronize()  # the previous frame may still be in transfer from this memory
+        # Pinned memory is slow to allocate, so one block serves all frames.
         if self._pinned is None:
             like = self._torch.from_numpy(self._target.read(self._i))
             self._pinned = self._torch.empty(like.shape, dtype=like.dtype, pin_memory=True)

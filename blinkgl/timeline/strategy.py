@@ -50,6 +50,7 @@ def speeds_of_edges(drawn: Drawn, luminance: np.ndarray, response: Response, per
     signal, edge = response.signal(luminance), np.zeros(luminance.shape, bool)
     for s, on in ((signal, edge), (signal.T, edge.T)):
         step = np.abs(np.diff(s, axis=0)) >= response.threshold
+        # Both pixels beside a step are on its edge.
         on[1:] |= step
         on[:-1] |= step
     return ranked(np.linalg.norm(drawn.read(), axis=-1)[edge], percent) if edge.any() else STILL
@@ -173,6 +174,7 @@ class Timeline:
         span = self.t0_ns, self.t1_ns
         jumps = {t for light in self.lights for t in light.jumps(*span)} | {*self.scene.motion.jumps(*span)}
         turns = {t for light in self.lights for t in light.corners(*span)}
+        # The frame at a jump shows what was before it, that a nanosecond later what is after it.
         exact = sorted({*jumps, *(t + 1 for t in jumps), *turns})
         for t_ns in bounded_times(self, least, most, *span, self.stops_ns, exact):
             if last not in jumps and last - 1 not in jumps:  # what jumps is faster than any step

@@ -15,6 +15,7 @@ from blinkgl.config.problems import validate
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.run import load_run
 from blinkgl.errors import ConfigError
+from tests.refusals import refusal
 
 RADTAN = {"width": 120, "height": 90, "fx": 95.0, "fy": 99.0, "cx": 60.5, "cy": 43.0, "lens": "radtan"}
 RADTAN["distortion"] = [-0.32, 0.11, 1e-3, -2e-3]
@@ -55,9 +56,7 @@ def test_the_keys_are_the_models():
     ],
 )
 def test_what_cannot_be(keys, said):
-    with pytest.raises(ConfigError) as caught:
-        camera(**keys)
-    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert said in refusal(camera, **keys)
 
 
 # ---- calibrations ---------------------------------------------------------------------------------------------------
@@ -176,9 +175,8 @@ def test_calibrations_of_others_project_as_opencv_does(tmp_path, name, text, D, 
 )  # fmt: skip
 def test_what_a_calibration_says_is_never_dropped(tmp_path, text, said):
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
-        read_camchain(tmp_path / "c.yaml")
-    assert said in str(caught.value) and "c.yaml" in str(caught.value) and "\n" not in str(caught.value)
+    line = refusal(read_camchain, tmp_path / "c.yaml")
+    assert said in line and "c.yaml" in line
 
 
 @pytest.mark.parametrize("key", ["T_BS", "T_body_sensor", "T_imu_cam", "T_cam_imu"])
@@ -257,9 +255,7 @@ def test_calibrations_that_cannot_be(tmp_path, change, keys, said):
     (tmp_path / "k.yaml").write_text(KALIBR.replace(*change), encoding="utf-8")
     tree = {"calibration": "k.yaml", **keys}
     (tmp_path / "run.yaml").write_text(f"camera: {tree}", encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
-        load_run(tmp_path / "run.yaml")
-    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert said in refusal(load_run, tmp_path / "run.yaml")
 
 
 WHOLE = "binning_x: 0\nbinning_y: 1\nroi: {x_offset: 0, y_offset: 0, height: 90, width: 120, do_rectify: true}\n"

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from blinkgl.config.reader import MAX_DEPTH, MAX_VALUES, parse_yaml, read_yaml, to_yaml
-from blinkgl.errors import ConfigError
+from tests.refusals import refusal
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi")
@@ -46,10 +46,8 @@ MERGE_BOMB = "a: &a {x: 1}\n" + "".join(
 )
 def test_refused_at_once(text, problem):
     started = time.process_time()
-    with pytest.raises(ConfigError) as caught:
-        parse_yaml(text, "c.yaml")
-    assert problem in str(caught.value) and str(caught.value).startswith("c.yaml") and "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 200
+    line = refusal(parse_yaml, text, "c.yaml")
+    assert problem in line and line.startswith("c.yaml") and len(line) < 200
     assert time.process_time() - started < 600, "the bomb would take hours"
 
 

@@ -20,6 +20,7 @@ from blinkgl.dataset.assets import check_assets
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import ConfigError
 from blinkgl.show.simulate import emulator_options
+from tests.refusals import refusal
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -121,9 +122,7 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
     ],
 )
 def test_bad_recipes(tmp_path, changes, message):
-    with pytest.raises(ConfigError) as error:
-        Plan.of(load(tmp_path, {**TREE, **changes}))
-    assert message in str(error.value) and "\n" not in str(error.value)
+    assert message in refusal(lambda: Plan.of(load(tmp_path, {**TREE, **changes})))
 
 
 @pytest.mark.parametrize(
@@ -142,9 +141,8 @@ def test_bad_recipes(tmp_path, changes, message):
     ],
 )
 def test_pools_that_cannot_serve_the_split(tmp_path, scene, message):
-    with pytest.raises(ConfigError) as error:
-        check_assets(Plan.of(load(tmp_path, {**TREE, "scene": {"kind": "random", **scene}})))
-    assert message in str(error.value)
+    made = Plan.of(load(tmp_path, {**TREE, "scene": {"kind": "random", **scene}}))
+    assert message in refusal(check_assets, made)
 
 
 def test_shares_are_dealt_out():

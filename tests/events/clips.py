@@ -33,3 +33,10 @@ def assert_same(a: Events, b: Events) -> None:
     assert a.columns == b.columns
     for name in a.columns:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def by_pixel(events: Events, width: int) -> tuple[np.ndarray, Events]:
+    """(pixels, events): pixel after pixel, in order of time."""
+    pixel = events.y.astype(np.int64) * width + events.x
+    order = np.lexsort((events.t, pixel))
+    return pixel[order], events.part(order)

@@ -17,6 +17,7 @@ from scipy import integrate, stats
 
 from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import Events, make_emulator
+from tests.events.clips import by_pixel
 
 FRAMES = {"50": 50.0, "500": 500.0, "5000": 5000.0, "uneven": None}
 """Column -> frames per second; None: uneven."""
@@ -184,9 +185,8 @@ def watch(case: Case, fps: float | None, side: int, seed: int) -> Events:
 def judge(events: Events, case: Case, side: int) -> Seen:
     """Compares the events of :func:`watch` with the case's law."""
     law, seconds, pixels = case.law, case.seconds, side * side
-    pixel = events.y.astype(np.int64) * side + events.x
-    order = np.lexsort((events.t, pixel))
-    pixel, t = pixel[order], (events.t[order] + 0.5) * 1e-6
+    pixel, events = by_pixel(events, side)
+    t = (events.t + 0.5) * 1e-6
     start = np.flatnonzero(np.diff(pixel, prepend=-1))
     first = t[start]
     second = start[np.append(np.diff(start), len(t) - start[-1]) > 1]

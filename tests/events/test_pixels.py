@@ -15,7 +15,7 @@ from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame, Readout
 from blinkgl.events.pixels import PixelNoise
 from blinkgl.types.events import Cause
-from tests.events.clips import assert_same
+from tests.events.clips import assert_same, by_pixel
 
 H, W = 60, 80
 NOISY = PixelsConfig(hot_fraction=0.02, hot_rate_hz=200.0, hot_spread_decades=0.3, rate_hz=2.0, spread_decades=0.5,
@@ -67,10 +67,8 @@ def test_an_answer_is_of_the_other_polarity_and_later_by_the_stated_law():
     """Rates so low that what follows within seconds is the answer."""
     config = ANSWERED.model_copy(update={"rate_hz": 0.02, "spread_decades": 0.0})
     _, events = noise_of(config, [0, 30_000_000])
-    pixel = events.y.astype(int) * W + events.x
-    order = np.lexsort((events.t, pixel))
-    pixel, t, p = pixel[order], events.t[order], events.p[order]
-    gap = np.where(np.diff(pixel) == 0, np.diff(t) / 1000, np.inf)
+    pixel, events = by_pixel(events, W)
+    p, gap = events.p, np.where(np.diff(pixel) == 0, np.diff(events.t) / 1000, np.inf)
     follows = gap < 20 * 10**1.6
     assert (p[1:][follows] != p[:-1][follows]).mean() > 0.97
     first = ~np.concatenate([[False], follows])

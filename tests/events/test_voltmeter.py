@@ -21,7 +21,7 @@ from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, Events
 from blinkgl.events.philox import normal2_and_uniform
 from blinkgl.events.voltmeter_model import crosses, hitting_time, reached, start_voltage
-from tests.events.clips import assert_same, run
+from tests.events.clips import assert_same, by_pixel, run
 
 MS = 10**6
 VARIANTS = {
@@ -124,6 +124,5 @@ def test_a_pixel_rests_for_its_dead_time():
     events = Events.concatenate(
         [emulator.step(np.ones((30, 30), np.float32), 2 * MS), emulator.step(np.zeros((30, 30), np.float32), 3 * MS)]
     )
-    pixel = events.y.astype(int) * 30 + events.x
-    order = np.lexsort((events.t, pixel))
-    assert np.diff(events.t[order])[np.diff(pixel[order]) == 0].min() >= 699
+    pixel, events = by_pixel(events, 30)
+    assert np.diff(events.t)[np.diff(pixel) == 0].min() >= 699

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
 from blinkgl.tools.shader_debugger import reference
-from tests.render.render_scenes import LEVEL, SECOND, drift, rig
+from tests.render.render_scenes import LEVEL, SECOND, drift, length, rig
 
-FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 MOTION = LabelRequest("depth", "ids", "velocity", "flow_forward")
 
 
@@ -42,10 +41,6 @@ class Errors:
     def worst(self) -> float:
         """Largest error of the flow over its median length (single pixels may stand still)."""
         return float(self.flow.max() / np.median(self.size))
-
-
-def length(v) -> np.ndarray:
-    return np.linalg.norm(np.asarray(v, np.float64), axis=-1)
 
 
 def moving_camera(near=0.05, step=1.0, **keys):

@@ -24,8 +24,7 @@ from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
 from blinkgl.sequence_files.sequence_dir import verify_sequence
-from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
+from tests.render.render_scenes import FACING, LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
 from tests.shared_data import shared
 
 MS = 1_000_000

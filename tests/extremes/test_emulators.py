@@ -17,8 +17,7 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Texture
 from blinkgl.tools.shader_debugger import reference
-from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, SECOND, drift, quad, rig, scene, still, thing
+from tests.render.render_scenes import FACING, LEVEL, SECOND, drift, quad, rig, scene, still, thing
 
 DAY = 86_400 * SECOND
 LONGEST = 1000 * SECOND  # below the emulators' limit of 17 minutes

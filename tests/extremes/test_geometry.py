@@ -16,10 +16,12 @@ from blinkgl.render import casting
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger import reference
-from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
+from tests.extremes.measures import MOTION, compare, moving_camera
 from tests.render.render_scenes import (
+    FACING,
     LEVEL,
     drift,
+    length,
     mesh,
     mixed_scene,
     quad,

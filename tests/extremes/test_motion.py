@@ -17,13 +17,15 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.timeline import uniform_times
-from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
+from tests.extremes.measures import MOTION, compare, moving_camera
 from tests.render.render_scenes import (
+    FACING,
     LEVEL,
     SECOND,
     cube,
     curve,
     drift,
+    length,
     mixed_scene,
     moved_scene,
     quad,

@@ -87,37 +87,34 @@ def test_clear_honours_the_scissor(gl):
         np.testing.assert_array_equal(target.read_depth(), np.where(wanted == 2, np.float32(0.75), np.float32(0.5)))
 
 
+def depths(gl, kind, colour, places):
+    """Yield the depth of a target of this kind after triangles over all of it, of these clip z and w."""
+    program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
+    gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
+    gl.ctx.depth_func = ">"
+    with Target(gl, 4, 4, colour, depth=kind) as target:
+        for place in places:
+            target.clear(depth=0.0)
+            program["depth_w"] = place
+            vertices.render(vertices=3)
+            yield target.read_depth()
+    vertices.release()
+    program.release()
+
+
 @pytest.mark.parametrize("kind", [True, "texture"])
 def test_reversed_z_keeps_float_precision(gl, kind):
     """near/z to one rounding over 8 decades: 24-bit or [-1, 1] depth is wrong by tens of percent beyond 1e5 units."""
-    near = 0.01
-    program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
-    gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
-    gl.ctx.depth_func = ">"
-    with Target(gl, 4, 4, ("R32F",), depth=kind) as target:
-        for z in np.geomspace(0.011, 1e6, 25):
-            target.clear(depth=0.0)
-            program["depth_w"] = (near, z)
-            vertices.render(vertices=3)
-            np.testing.assert_allclose(target.read_depth(), near / z, rtol=2.5e-7)
-    vertices.release()
-    program.release()
+    near, far = 0.01, np.geomspace(0.011, 1e6, 25)
+    for z, depth in zip(far, depths(gl, kind, ("R32F",), [(near, z) for z in far]), strict=True):
+        np.testing.assert_allclose(depth, near / z, rtol=2.5e-7)
 
 
 def test_depth_of_16_bits_is_rounded_to_its_steps(gl):
-    program, vertices = full_screen(gl, "out float value; void main() { value = 1.0; }")
-    gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
-    gl.ctx.depth_func = ">"
-    with Target(gl, 4, 4, (), depth="texture of 16 bits") as target:
-        worst = 0.0
-        for depth in np.linspace(0.001, 0.999, 57):
-            target.clear(depth=0.0)
-            program["depth_w"] = (depth, 1.0)
-            vertices.render(vertices=3)
-            worst = max(worst, float(np.abs(target.read_depth() - depth).max()))
-        assert 0.2 / 65535 < worst < 0.51 / 65535  # of floats it would be a hundredth of that
-    vertices.release()
-    program.release()
+    true = np.linspace(0.001, 0.999, 57)
+    made = np.array([*depths(gl, "texture of 16 bits", (), [(depth, 1.0) for depth in true])])
+    # Of floats it would be a hundredth of that.
+    assert 0.2 / 65535 < np.abs(made - true[:, None, None]).max() < 0.51 / 65535
 
 
 def test_depth_texture_can_be_sampled(gl):

@@ -55,13 +55,19 @@ def test_stages_and_total_are_without_compilation(watch):
     assert clock.seconds == {"events": 1.5} and clock.total == 1.5 and clock.compile_s == 14.0
 
 
-def test_what_compiles_is_said_once_and_counted_at_the_end(kept, tmp_path):
+@pytest.fixture
+def fresh(kept, tmp_path):
+    """The same, with nothing on disk."""
     for file in tmp_path.rglob("*.nb?"):
         file.unlink()
+    return kept
+
+
+def test_what_compiles_is_said_once_and_counted_at_the_end(fresh):
     outer, inner = [], []
-    compiling.watch._said, compiling.watch.told = False, (compiling.watch.kernels, compiling.watch.seconds)
+    compiling.watch._announced, compiling.watch.reported = False, (compiling.watch.kernels, compiling.watch.seconds)
     with compiling.announced_compiling(outer.append), compiling.announced_compiling(inner.append):
-        twice = kept()
+        twice = fresh()
         assert twice(3) == 6 and twice(1.5) == 3.0
     # Another process of the tests may have the turn.
     inner = [line for line in inner if not line.startswith("waiting for another process")]
@@ -71,7 +77,7 @@ def test_what_compiles_is_said_once_and_counted_at_the_end(kept, tmp_path):
     assert inner[1].startswith("compiled 2 kernels in ") and outer == []
     again = []
     with compiling.announced_compiling(again.append):
-        assert kept()(3) == 6
+        assert fresh()(3) == 6
     assert not again, "it was kept"
 
 
@@ -86,10 +92,9 @@ print(watch.kernels)
 """
 
 
-def test_one_process_compiles_and_the_others_find_it(kept, tmp_path):
+@pytest.mark.usefixtures("fresh")
+def test_one_process_compiles_and_the_others_find_it(tmp_path):
     """Four processes need the same three kernels at the same time."""
-    for file in tmp_path.rglob("*.nb?"):
-        file.unlink()
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     processes = [subprocess.Popen(command, **pipes) for _ in range(4)]
@@ -100,9 +105,8 @@ def test_one_process_compiles_and_the_others_find_it(kept, tmp_path):
     assert sum(int(process.communicate()[0]) for process in processes) == 3
 
 
-def test_a_process_that_is_ended_passes_its_turn_on(kept, tmp_path):
-    for file in tmp_path.rglob("*.nb?"):
-        file.unlink()
+@pytest.mark.usefixtures("fresh")
+def test_a_process_that_is_ended_passes_its_turn_on(tmp_path):
     holder = subprocess.Popen(
         [sys.executable, "-c", "from blinkgl.machine.kernels import turn; turn.begin(); print(1, flush=True); input()"],
         stdin=subprocess.PIPE,
@@ -186,7 +190,7 @@ def test_no_folder_for_kernels_is_a_line_and_kernels_run(monkeypatch):
         raise RuntimeError("cannot cache function 'thrice': no locator available")
 
     monkeypatch.setattr("blinkgl.machine.kernels._Cache.__init__", nowhere)
-    monkeypatch.setattr(kernels, "_said", set())
+    monkeypatch.setattr(kernels, "_reported", set())
     with pytest.warns(RuntimeWarning, match="compiled in every process. NUMBA_CACHE_DIR=FOLDER keeps them") as said:
         thrice, fourfold = map(kernel, (lambda x: 3 * x, lambda x: 4 * x))
     assert thrice(2) == 6 and fourfold(2) == 8 and len(said) == 1

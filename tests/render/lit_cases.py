@@ -34,6 +34,7 @@ from blinkgl.scene.worlds.sky import panorama_light
 from blinkgl.tools.shader_debugger import reference
 from blinkgl.tools.shader_debugger.lamps import near_an_edge
 from blinkgl.tools.shader_debugger.session import DebugRenderer
+from render_scenes import placed
 
 EXPOSURE_US = 20_000
 ROUGHNESSES = (0.1, 0.25, 0.45, 0.7, 1.0)
@@ -55,10 +56,7 @@ class Case:
 
 
 def _body(number: int, mesh: Mesh, place, material: Material, turn=(0.0, 0.0, 0.0), category="object") -> SceneObject:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
-    T[:3, 3] = place
-    return SceneObject(f"{number}", number, (Part(mesh, material),), StaticPath(T), category)
+    return placed(number, mesh, place, Rotation.from_euler("xyz", turn, degrees=True), material, category)
 
 
 def _seen(objects, light: Light, size: tuple[int, int]) -> Scene:

@@ -23,6 +23,7 @@ def pose(position=(0, 0, 0), rotation=None) -> np.ndarray:
 
 # Camera axes for a camera at the origin that looks along world +y with world +z up.
 LEVEL = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 
 
 def still(position=(0, 0, 0), rotation=None) -> StaticPath:
@@ -104,6 +105,12 @@ def thing(name, instance_id, shape, path, material=None) -> SceneObject:
     return SceneObject(name, instance_id, (Part(shape, material or Material()),), path)
 
 
+def placed(number: int, shape, place, rotation=None, material=None, category="object") -> SceneObject:
+    """A thing by its number, which stands."""
+    part = Part(shape, material or Material())
+    return SceneObject(f"{number}", number, (part,), still(place, rotation), category)
+
+
 def rig(width=160, height=120, focal=150.0, path=None, near=0.05) -> Rig:
     return Rig.alone(
         PinHole(width, height, focal, focal * 1.03, width / 2 - 1.7, height / 2 + 0.6, near),
@@ -171,6 +178,17 @@ def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, t
     )
     path = curve(seed + 3, (0, 0, 0), 0.15, 0.05, LEVEL) if camera_moves else still(rotation=LEVEL)
     return scene(objects, rig(width, height, 0.94 * width, path), background=0.0)
+
+
+def length(vectors: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
+
+
+def rates(renderer, t_ns: int, h: int = 1_000_000) -> tuple[np.ndarray, np.ndarray]:
+    """d(luminance)/dt as it is drawn, and the difference quotient of frames h ns before and after, (H, W) float64."""
+    drawn = renderer.brightness(t_ns).read()[..., 1].astype(np.float64)
+    before, after = (renderer.luminance(t_ns + dt).read().astype(np.float64) for dt in (-h, h))
+    return drawn, (after - before) / (2e-9 * h)
 
 
 def largest_speed(velocity: np.ndarray) -> float:

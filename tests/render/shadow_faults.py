@@ -25,26 +25,29 @@ from blinkgl.scene.lights import lamp_pose
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.types import Lamp, Light, Material, Part, Scene, SceneObject
+from blinkgl.scene.types import Lamp, Light, Material, Scene
 from blinkgl.tools.shader_debugger import reference
 from blinkgl.tools.shader_debugger.appearance import seen_share
 from blinkgl.tools.shader_debugger.lamps import lit_points
+from render_scenes import placed
 
 SKY = 0.2
+
+
+def towards_of(rng: np.random.Generator, least: float, most: float) -> np.ndarray:
+    """The direction to a random sun, which stands between two heights, rad."""
+    elevation, azimuth = rng.uniform(least, most), rng.uniform(-math.pi, math.pi)
+    flat = math.cos(elevation)
+    return np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
 
 
 def frame(rng: np.random.Generator, size: int) -> Scene:
     """A scene of one moment."""
 
     def body(number, mesh, place, turned=True, category="object", **paint):
-        T = np.eye(4)
-        T[:3, :3] = Rotation.random(rng=rng).as_matrix() if turned else np.eye(3)
-        T[:3, 3] = place
-        return SceneObject(f"{number}", number, (Part(mesh, Material(**paint)),), StaticPath(T), category)
+        return placed(number, mesh, place, Rotation.random(rng=rng) if turned else None, Material(**paint), category)
 
-    elevation, azimuth = rng.uniform(0.35, 1.4), rng.uniform(-math.pi, math.pi)
-    flat = math.cos(elevation)
-    towards = (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
+    towards = tuple(towards_of(rng, 0.35, 1.4))
     eye, target = np.array([*rng.uniform(-0.5, 0.5, 2), 1.6]), np.array([0.0, 4.5, 0.4])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = look_rotation(target - eye), eye
@@ -70,11 +73,9 @@ def coarse_frame(rng: np.random.Generator, size: int) -> Scene:
         (cylinder(radius=0.04, height=1.2, segments=10), (-0.3, 3.3, 0.9)),
         (icosphere(radius=0.15, subdivisions=2), (0.4, 3.2, 0.7)),
     )
-    bodies = []
-    for number, (mesh, place) in enumerate(meshes, start=2):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), place
-        bodies.append(SceneObject(f"{number}", number, (Part(mesh, Material()),), StaticPath(T)))
+    bodies = (
+        placed(number, mesh, place, Rotation.random(rng=rng)) for number, (mesh, place) in enumerate(meshes, start=2)
+    )
     return replace(scene, objects=(scene.objects[0], *bodies))
 
 
@@ -96,14 +97,7 @@ def contact_frame(rng: np.random.Generator, kind: str, shadows: str) -> Scene:
     """A scene of one moment in which things stand on the ground and on each other: boxes, a stack, a thin plate, what
     is as small as a foot; and two boxes far away, so that a sun's map is as coarse as that of a whole world."""
 
-    def body(number, mesh, place, turn=0.0, category="object"):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = Rotation.from_euler("z", turn).as_matrix(), place
-        return SceneObject(f"{number}", number, (Part(mesh, Material()),), StaticPath(T), category)
-
-    elevation, azimuth = rng.uniform(0.35, 1.3), rng.uniform(-math.pi, math.pi)
-    flat = math.cos(elevation)
-    towards = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+    towards = towards_of(rng, 0.35, 1.3)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = look_rotation(np.array([0, 3.2, -1.3])), (0, 0, 1.4)
     boxes = (
@@ -115,9 +109,10 @@ def contact_frame(rng: np.random.Generator, kind: str, shadows: str) -> Scene:
         ((0.3, 0.3, 0.3), (-6.0, 8.0, 0.15)),
         ((0.3, 0.3, 0.3), (6.0, 9.0, 0.15)),
     )
-    ground = body(1, grid(width=20, depth=20), (0, 5, 0), category="ground")
+    ground = placed(1, grid(width=20, depth=20), (0, 5, 0), category="ground")
     standing = (
-        body(k, cuboid(extents=size), place, rng.uniform(-3, 3)) for k, (size, place) in enumerate(boxes, start=2)
+        placed(k, cuboid(extents=size), place, Rotation.from_euler("z", rng.uniform(-3, 3)))
+        for k, (size, place) in enumerate(boxes, start=2)
     )
     light = Light(tuple(towards), 1.0, SKY, shadows=shadows, shadow_size=1024)
     if kind == "spot":

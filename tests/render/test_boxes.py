@@ -20,7 +20,7 @@ from blinkgl.render.boxes import before
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.types import Mask, Material, Part, SceneObject
-from render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, sphere, still, thing
+from render_scenes import FACING, cube, drift, mesh, quad, rig, scene, sphere, still, thing
 
 MS = 1_000_000
 T = 300 * MS
@@ -34,11 +34,10 @@ def world():
     ball = sphere(0.4, 2)
     kind = BreatheConfig(amount=(0.5, 0.2, 0.1), period=0.5)
     ball = replace(ball, deformer=deformer_of(kind, ball.vertices.min(axis=0), ball.vertices.max(axis=0)))
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
     return scene(
         (
             thing("cuboid-3#1", 1, cube(0.5), drift((-0.9, 4, 0.1), (-0.3, 4.6, 0.4), Rotation.identity(), SPIN)),
-            replace(thing("board", 2, quad(0.5, 0.6), still((-1.2, 3, 0), facing)), category="wall"),
+            replace(thing("board", 2, quad(0.5, 0.6), still((-1.2, 3, 0), FACING)), category="wall"),
             thing("Chair.001", 3, cube(0.4), still((2.0, 4, 0), SPIN)),
             thing("behind", 4, cube(0.4), still((0, -4, 0))),
             thing("hidden", 5, cube(0.05), still((0, 6, 0))),
@@ -204,7 +203,7 @@ def test_bodies_with_holes_and_of_one_side_are_as_large_as_they_are_seen(gl, tur
     faces = np.concatenate([np.stack([k, k + 1, k + 25], 1), np.stack([k + 25, k + 1, k + 26], 1)])
     shell = mesh(0.5 * tube, faces)
     front = Material(both_sides=False)
-    facing = Rotation.from_euler("z", turn) * LEVEL * Rotation.from_euler("x", 180, degrees=True)
+    facing = Rotation.from_euler("z", turn) * FACING
     half = Rotation.from_euler("z", 3.0 + turn)
     both = SceneObject(
         "both", 3, (Part(quad(0.3, 0.3), leaf), Part(replace(shell, vertices=shell.vertices + [0, 0, 0.7]), front)),
@@ -230,13 +229,12 @@ def test_a_holed_body_at_the_edge_of_the_picture_is_cut_there(gl):
     """The opaque half of a plate lies outside: nothing of it is in the picture, and what is has no pixel."""
     alpha = np.zeros((64, 64), np.uint8)
     alpha[:, :32] = 255
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
     camera = rig().sensors[0].camera
     # The plate's middle on the left edge of the picture.
     x = (-0.5 - camera.cx) / camera.fx * 3
     for at, seen in ((x, False), (x + 0.25, True)):
         plate = thing(
-            "plate", 1, quad(0.5, 0.5), still((at, 3, 0), facing), Material(mask=Mask(alpha), both_sides=True)
+            "plate", 1, quad(0.5, 0.5), still((at, 3, 0), FACING), Material(mask=Mask(alpha), both_sides=True)
         )
         with Renderer(gl, scene([plate]), RenderConfig()) as renderer:
             boxes = renderer.labels(0, asked_for(LabelsConfig(boxes=True, ids=True, flow=(), images=False))).boxes

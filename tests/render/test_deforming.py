@@ -21,7 +21,7 @@ from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger import reference
-from render_scenes import LEVEL, drift, quad, rig, scene, smooth_texture, sphere, still, thing
+from render_scenes import FACING, LEVEL, drift, length, quad, rates, rig, scene, smooth_texture, sphere, still, thing
 
 MS = 1_000_000
 T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
@@ -45,7 +45,7 @@ def by_formula(mesh, kind):
 def world(mesh, texture=None, moves=True, camera_moves=True):
     path = drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), Rotation.identity(), SPIN) if moves else still((0.2, 4, 0.1))
     eye = drift((0, 0, 0), (0.2, 0.1, -0.1), LEVEL, LEVEL * SPIN) if camera_moves else None
-    wall = thing("wall", 1, quad(9, 9), still((0, 9, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True)))
+    wall = thing("wall", 1, quad(9, 9), still((0, 9, 0), FACING))
     return scene([thing("body", 3, mesh, path, Material(texture, (0.9, 0.5, 0.3))), wall], rig(path=eye))
 
 
@@ -55,10 +55,6 @@ def graded(gl, what, t=T0, forward=T1, backward=T_BACK):
         labels = renderer.labels(t, LABELS, forward, backward)
     off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth)
     return ref, labels, off
-
-
-def length(v):
-    return np.linalg.norm(np.asarray(v, np.float64), axis=-1)
 
 
 @pytest.mark.parametrize("kind", FORMS)
@@ -83,13 +79,10 @@ def test_motions_of_a_millionth_of_a_pixel(gl, kind):
 def test_rate_of_luminance_is_that_of_the_frames(gl, kind, textured):
     egg = transform_mesh(sphere(1.0, 4), np.diag([1.0, 0.5, 0.8]))
     what = world(by_formula(egg, kind), smooth_texture() if textured else None, moves=False, camera_moves=False)
-    h = MS
     ref = reference.render(what, T0)
     with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
-        before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-h, h))
-        rate = renderer.brightness(T0).read()[..., 1].astype(np.float64)
+        rate, true = rates(renderer, T0)
     off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
-    true = (after - before) / (2e-9 * h)
     error = np.abs(rate - true)[off]
     assert np.abs(true[off]).max() > 0.1
     assert np.quantile(error, 0.9) < 0.03 * np.abs(true[off]).max()

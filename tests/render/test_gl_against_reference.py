@@ -27,10 +27,12 @@ from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material
 from blinkgl.tools.shader_debugger import appearance, reference
 from render_scenes import (
+    FACING,
     LEVEL,
     SECOND,
     cube,
     drift,
+    length,
     mixed_scene,
     quad,
     rig,
@@ -54,7 +56,6 @@ EVERYTHING = LabelRequest(
     "occlusion_forward",
     "occlusion_backward",
 )
-FLAT_WAY = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 
 
 def moving_camera():
@@ -85,10 +86,6 @@ def drawn(gl, world, t=T0, request=EVERYTHING, forward=T1, backward=T_BACK, **co
     with Renderer(gl, world, RenderConfig(image_antialiasing="none", **config)) as renderer:
         labels = renderer.labels(t, request, forward, backward)
         return labels, renderer.luminance(t).read()
-
-
-def length(v):
-    return np.linalg.norm(np.asarray(v, np.float64), axis=-1)
 
 
 def off_silhouettes(frame: reference.ReferenceFrame):
@@ -169,7 +166,7 @@ def test_magnified_texture_is_the_bilinear_one(gl):
     rng = np.random.default_rng(2)
     texture = replace(smooth_texture(1, 16), image=rng.integers(0, 256, (16, 16, 3), dtype=np.uint8))
     paint = Material(texture=texture, uv_scale=(0.5, 0.75), base_color=(1.0, 0.7, 0.4))
-    world = scene([thing("picture", 1, quad(4, 3), drift((0, 4, 0), (0.2, 4, 0), FLAT_WAY), paint)])
+    world = scene([thing("picture", 1, quad(4, 3), drift((0, 4, 0), (0.2, 4, 0), FACING), paint)])
     ref = reference.render(world, T0)
     labels, luminance = drawn(gl, world, request=LabelRequest("images"))
     # 8-bit weights are what OpenGL asks of a GPU's bilinear filter: half of 1/256 per axis
@@ -226,7 +223,7 @@ def test_supersampling_is_the_mean_of_finer_rays(gl, factor):
 
 def test_tiny_flow_keeps_its_relative_precision_and_no_motion_gives_none(gl):
     step = 1e-9  # units over the second: 4e-8 px
-    world = scene([thing("plane", 1, quad(9, 9), drift((0, 4, 0), (step, 4, 0), FLAT_WAY))])
+    world = scene([thing("plane", 1, quad(9, 9), drift((0, 4, 0), (step, 4, 0), FACING))])
     labels, _ = drawn(gl, world, t=0, forward=SECOND, backward=0)
     np.testing.assert_allclose(labels.forward.flow[..., 0], world.camera.fx * step / 4, rtol=2e-6)
     assert (labels.forward.flow[..., 1] == 0).all() and (labels.backward.flow == 0).all()
@@ -270,9 +267,9 @@ def test_warping_by_the_flow_reproduces_the_frame(gl):
 def test_behind_the_camera_and_before_the_near_plane(gl):
     """Driving through a fence and right up to a wall: passed points are invalid, too near ones are occluded."""
     eye = drift((0, 0, 0), (0, 4.0, 0), LEVEL, LEVEL)
-    fence = thing("fence", 1, quad(0.6, 0.6), still((-1.0, 3.0, 0), FLAT_WAY))
-    pane = thing("pane", 3, quad(0.3, 0.3), still((0, 4.4, 0), FLAT_WAY))
-    wall = thing("wall", 2, quad(30, 30), still((0, 9.0, 0), FLAT_WAY))
+    fence = thing("fence", 1, quad(0.6, 0.6), still((-1.0, 3.0, 0), FACING))
+    pane = thing("pane", 3, quad(0.3, 0.3), still((0, 4.4, 0), FACING))
+    wall = thing("wall", 2, quad(30, 30), still((0, 9.0, 0), FACING))
     world = scene([fence, pane, wall], rig(path=eye, near=0.5))
     ref = reference.render(world, 0, forward_ns=SECOND)
     labels, _ = drawn(gl, world, t=0, forward=SECOND)

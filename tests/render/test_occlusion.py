@@ -15,7 +15,7 @@ from blinkgl.render import casting
 from blinkgl.render.occlusion import HIDDEN, NARROW, REACH, SEEN, UNDECIDED, judged_by_samples, near_thin
 from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger import reference
-from render_scenes import LEVEL, SECOND, cube, drift, mesh, mixed_scene, quad, rig, scene, sphere, still, thing
+from render_scenes import FACING, LEVEL, SECOND, cube, drift, mesh, mixed_scene, quad, rig, scene, sphere, still, thing
 
 MS = 1_000_000
 
@@ -97,14 +97,13 @@ def test_samples_equal_their_slow_twin(shape):
 def test_the_outer_half_pixel_is_looked_up(gl):
     """A wall moves up by 0.3 px behind a bar that covers what is above y = -0.2: the first row's points land at -0.3,
     in the picture and hidden."""
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
     what = scene([], rig(64, 48, 60.0))
     camera = what.camera
     # z of the world where a point 5 units away is at y = -0.2.
     edge = -(-0.2 - camera.cy) / camera.fy * 5
-    bar = thing("bar", 1, quad(9, 1), still((0, 5, edge + 1), facing))
+    bar = thing("bar", 1, quad(9, 1), still((0, 5, edge + 1), FACING))
     rise = 0.3 / camera.fy * 10
-    wall = thing("wall", 2, quad(30, 30), drift((0, 10, 0), (0, 10, rise), facing, facing))
+    wall = thing("wall", 2, quad(30, 30), drift((0, 10, 0), (0, 10, rise), FACING, FACING))
     with Renderer(gl, replace(what, objects=(bar, wall)), RenderConfig()) as renderer:
         frame = renderer.labels(0, LabelRequest("ids", "flow_forward", "occlusion_forward"), SECOND)
     assert (frame.ids == 2).all() and frame.forward.flow[0, :, 1] == pytest.approx(-0.3, abs=1e-3)
@@ -125,10 +124,9 @@ def masks(gl, world, t_ns: int, to_ns: int):
 def test_the_shadow_of_a_card_is_exact(gl):
     """A card of 1 x 1 at Z = 2 before a wall at Z = 4, both still; the camera moves sideways. What is hidden of the
     wall is a rectangle by similar triangles, to the pixel."""
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
     camera = rig(path=drift((0, 0, 0), (0.37, 0, 0.11), LEVEL, LEVEL))
-    wall = thing("wall", 1, quad(6, 6), still((0, 4, 0), facing))
-    card = thing("card", 2, quad(0.5, 0.5), still((0.1, 2, 0.05), facing))
+    wall = thing("wall", 1, quad(6, 6), still((0, 4, 0), FACING))
+    card = thing("card", 2, quad(0.5, 0.5), still((0.1, 2, 0.05), FACING))
     world = scene([wall, card], camera)
     t_ns, to_ns = 300 * MS, 700 * MS
     mask, flow, same = masks(gl, world, t_ns, to_ns)
@@ -155,8 +153,7 @@ def crowd():
         at = np.array([rng.uniform(-1.6, 1.6), rng.uniform(3, 6), rng.uniform(-1.2, 1.2)])
         turns = [Rotation.random(random_state=rng) for _ in range(2)]
         things.append(thing(f"{k}", k + 1, mesh, drift(at, at + rng.uniform(-1, 1, 3), *turns)))
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
-    things.append(thing("wall", 99, quad(15, 15), still((0, 8, 0), facing)))
+    things.append(thing("wall", 99, quad(15, 15), still((0, 8, 0), FACING)))
     return scene(things, rig(path=drift((0, 0, 0), (0.3, 0.1, 0.1), LEVEL, LEVEL)))
 
 
@@ -196,11 +193,10 @@ def test_a_part_hides_another_of_the_same_mesh(gl):
 
 def wires():
     """Five of a third of a pixel to two, at all angles, before a wall; the camera slides by."""
-    facing = LEVEL * Rotation.from_euler("x", 180, degrees=True)
-    things = [thing("wall", 99, quad(15, 15), still((0, 8, 0), facing))]
+    things = [thing("wall", 99, quad(15, 15), still((0, 8, 0), FACING))]
     for k, (px, turn) in enumerate(((0.33, 3), (0.5, 40), (0.7, 75), (1.0, 110), (2.0, 160))):
         half = px * 3 / 150 / 2
-        turned = facing * Rotation.from_euler("z", turn, degrees=True)
+        turned = FACING * Rotation.from_euler("z", turn, degrees=True)
         things.append(thing(f"{k}", k + 1, quad(half, 3), still((0.5 * k - 1, 3, 0.2 * k - 0.4), turned)))
     return scene(things, rig(path=drift((0, 0, 0), (1.0, 0, 0.3), LEVEL, LEVEL)))
 

@@ -16,6 +16,7 @@ from blinkgl.srgb import linear_from_srgb
 from blinkgl.tools.shader_debugger import appearance, reference
 from exhaustive import nearest_exhaustive
 from render_scenes import (
+    FACING,
     LEVEL,
     SECOND,
     cube,
@@ -242,8 +243,8 @@ def test_tiny_motion_keeps_its_relative_precision():
 def test_behind_the_camera_at_the_other_time():
     """The camera drives through a fence: what it has passed is invalid, not flung to a wrong finite place."""
     eye = drift((0, 0, 0), (0, 4.0, 0), LEVEL, LEVEL)
-    fence = thing("fence", 1, quad(0.6, 0.6), still((0, 3.0, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True)))
-    wall = thing("wall", 2, quad(30, 30), still((0, 9.0, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True)))
+    fence = thing("fence", 1, quad(0.6, 0.6), still((0, 3.0, 0), FACING))
+    wall = thing("wall", 2, quad(30, 30), still((0, 9.0, 0), FACING))
     world = scene([fence, wall], rig(path=eye))
     frame = reference.render(world, 0, forward_ns=SECOND)
     on_fence = frame.instance == 1
@@ -358,9 +359,7 @@ def test_silhouette_band():
     world = scene(
         [
             thing("ground", 1, quad(500, 500), still((0, 0, -1.0))),
-            thing(
-                "step", 2, quad(0.3, 0.3), still((0.0, 3.0, 0.2), LEVEL * Rotation.from_euler("x", 180, degrees=True))
-            ),
+            thing("step", 2, quad(0.3, 0.3), still((0.0, 3.0, 0.2), FACING)),
         ]
     )
     frame = reference.render(world, 0)

@@ -23,7 +23,7 @@ from blinkgl.render.resources import HALF_LEAST, HALF_MOST, half_floats
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
-from render_scenes import LEVEL, SECOND, cube, curve, drift, largest_speed, rig, scene, still, thing
+from render_scenes import LEVEL, SECOND, cube, curve, drift, largest_speed, pose, rig, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
 
@@ -164,6 +164,7 @@ def test_projection_puts_points_on_the_documented_pixel():
     window = (ndc[:, :2] + 1) / 2 * (640, 480) - 0.5
     np.testing.assert_allclose(window, points[:, :2] / points[:, 2:] * (500, 510) + (300, 250), atol=1e-10)
     np.testing.assert_allclose(ndc[:, 2], 0.1 / points[:, 2], rtol=1e-14)
+    np.testing.assert_allclose(clip[:, 3], points[:, 2], rtol=1e-14)
 
 
 # --- Poses to clip space: the frustum's planes lie where the image ends, and stacks of poses are stacks of single
@@ -197,14 +198,6 @@ def test_a_plane_is_where_the_image_ends(plane, inside, outside):
 def test_the_last_plane_is_the_cameras_own():
     planes = CAMERA.frustum_planes()
     assert (planes @ [0, 0, 1.0])[4] > 0 > (planes @ [0, 0, -1.0])[4]
-
-
-def test_projection_lands_where_the_camera_says():
-    x, y, depth = 11.25, 33.5, 7.0
-    clip = CAMERA.clip_from_cam() @ [*seen_at(x, y, depth), 1.0]
-    window = (clip[:2] / clip[3] + 1) / 2 * [CAMERA.width, CAMERA.height]
-    np.testing.assert_allclose(window, [x + 0.5, y + 0.5], rtol=1e-12)
-    assert clip[3] == pytest.approx(depth) and clip[2] / clip[3] == pytest.approx(CAMERA.near / depth)
 
 
 def poses(count: int, seed: int) -> np.ndarray:
@@ -345,12 +338,6 @@ def test_frames_of_half_floats_are_those_of_floats(gl, monkeypatch):
 CAMERA_RECTANGLES = PinHole(64, 40, 50.0, 70.0, 20.0, 28.0, near=0.1)
 
 
-def pose(position, turn=(0.0, 0.0, 0.0)) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), position
-    return T
-
-
 def item(low, high):
     return SimpleNamespace(corners=box_corners(np.array(low, float), np.array(high, float)))
 
@@ -361,7 +348,7 @@ def test_a_box_is_inside_its_rectangle_with_a_pixel_to_spare_and_no_more():
     for _ in range(300):
         low = dice.uniform(-0.5, 0, 3)
         high = low + dice.uniform(0.05, 0.8, 3)
-        T = pose([*dice.uniform(-2, 2, 2), dice.uniform(1.5, 6)], dice.normal(size=3))
+        T = pose([*dice.uniform(-2, 2, 2), dice.uniform(1.5, 6)], Rotation.from_rotvec(dice.normal(size=3)))
         corners = (
             np.array(
                 [

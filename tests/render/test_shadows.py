@@ -19,7 +19,7 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
 from blinkgl.tools.shader_debugger import reference
 from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
-from shadow_faults import coarse_frame, contact_frame, faults, frame as random_frame, leaks
+from shadow_faults import coarse_frame, contact_frame, faults, frame as random_frame, leaks, towards_of
 
 PLAIN = RenderConfig(image_antialiasing="none")
 SEEN = ShadowMap.seen
@@ -81,8 +81,7 @@ def test_the_edge_of_a_balls_shadow_is_where_it_should_be(gl, kind):
 def moving_world(seed, camera=True, shadows="hard", lamps=()):
     """Ball, box, open sheet over a floor, all moving, random sun."""
     rng = np.random.default_rng(seed)
-    elevation, azimuth = rng.uniform(0.4, 1.4), rng.uniform(-np.pi, np.pi)
-    towards = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
+    towards = tuple(towards_of(rng, 0.4, 1.4))
     things = [
         thing("ball", 2, sphere(0.5, 4), curve(seed, (-0.9, 4.5, 0.0), 0.3, 0.4)),
         thing("box", 3, cube(0.4), curve(seed + 1, (0.8, 4.0, -0.1), 0.3, 0.5)),

@@ -17,12 +17,25 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import CutPath, KeyframePath, OffsetPath, PausedPath, StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Deformer
-from render_scenes import LEVEL, SECOND, cube, curve, drift, largest_speed, mixed_scene, quad, rig, scene, still, thing
+from render_scenes import (
+    FACING,
+    LEVEL,
+    SECOND,
+    cube,
+    curve,
+    drift,
+    largest_speed,
+    mixed_scene,
+    quad,
+    rig,
+    scene,
+    still,
+    thing,
+)
 from tests.skinned import arm
 
 MS = 1_000_000
 PLAIN = RenderConfig(image_antialiasing="none")
-FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)
 
 
 def seen(world, t_ns, gl, share=99.0):

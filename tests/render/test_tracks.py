@@ -21,7 +21,7 @@ from blinkgl.render.tracks import track_points
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.tools.shader_debugger import reference
-from render_scenes import LEVEL, cube, drift, quad, rig, scene, sphere, still, thing
+from render_scenes import FACING, LEVEL, cube, drift, quad, rig, scene, sphere, still, thing
 
 RNG = np.random.default_rng
 
@@ -132,7 +132,7 @@ def world(camera=None):
     things = (
         thing("cube", 2, cube(0.5), drift((-0.9, 4, 0.1), (-0.3, 4.6, 0.4), Rotation.identity(), SPIN)),
         thing("ball", 3, replace(ball, deformer=breath), drift((0.8, 4, 0), (0.7, 3.5, 0.2), SPIN, SPIN * SPIN)),
-        thing("wall", 1, quad(9, 9), still((0, 9, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True))),
+        thing("wall", 1, quad(9, 9), still((0, 9, 0), FACING)),
     )
     return scene(things, rig(path=EYE) if camera is None else Rig.alone(camera, EYE))
 

@@ -27,6 +27,7 @@ from blinkgl.sequence.rendered import drawn
 from blinkgl.timeline import make_timeline
 from blinkgl.tools.trade.matching import match_events
 from tests.render.render_scenes import (
+    FACING,
     LEVEL,
     SECOND,
     drift,
@@ -42,7 +43,6 @@ from tests.skinned import Swinging
 
 MS = 1_000_000
 WIDTH, HEIGHT, FOCAL = 80, 60, 80.0
-FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)
 ESIM = EsimConfig(contrast_threshold=0.15, threshold_sigma=0.0)
 GREY, WHITE = Material(base_color=(0.1,) * 3, unlit=True), Material(base_color=(0.9,) * 3, unlit=True)
 PICTURE = Material(smooth_texture(1), unlit=True, uv_scale=(3.0, 3.0))
@@ -66,6 +66,11 @@ def wall(material=PICTURE, half=3.0, away=3.0):
 
 def seen(objects, path=None, light=None, background=0.1, focal=FOCAL) -> Scene:
     return replace(scene(objects, rig(WIDTH, HEIGHT, focal, path), light, background), t1_ns=END)
+
+
+def pixel_steps(renderer):
+    """Times at most a pixel apart."""
+    return make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
 
 
 def sine(amplitude: float, hertz: float):
@@ -100,7 +105,7 @@ def bouncing_ball() -> Scene:
 def flash() -> Scene:
     """A beam sweeps over a wall within 8 ms of 80, and back."""
     swing = lambda t: (0, 0, 1.0 if abs(t - 0.04) > 0.008 else 1 - math.cos(math.pi / 2 * (t - 0.04) / 0.008))
-    path = keyed(lambda t: (0, 0.5, 0), swing, LEVEL * Rotation.from_euler("x", 180, degrees=True))
+    path = keyed(lambda t: (0, 0.5, 0), swing, FACING)
     spot = Lamp("spot", (40.0,) * 3, path, inner=0.1, outer=0.25)
     lit = Material(base_color=(0.8,) * 3)
     return seen([wall(lit)], light=replace(Light(), sun=0.0, sky=0.05, lamps=(spot,)))
@@ -238,7 +243,7 @@ def test_no_motion_between_two_frames_goes_unseen(gl, world):
 @pytest.mark.parametrize("world", [stepped_body, leaping_body])
 def test_jumps_of_clips_cost_two_frames_each_and_are_no_motion_too_fast(gl, world):
     with Renderer(gl, world(), RenderConfig()) as renderer:
-        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        made = pixel_steps(renderer)
         jumps = renderer.motion.jumps(0, END)
         times = list(made)
     assert jumps and {t + after for t in jumps for after in (0, 1)} <= set(times)
@@ -253,7 +258,7 @@ def test_motion_too_fast_for_the_shortest_step_is_said(gl):
     flies = drift((-40, 2, 0), (85, 2, 0), seconds=0.1)
     world = seen([thing("ball", 2, sphere(0.25, 3), flies, WHITE)])
     with Renderer(gl, world, RenderConfig()) as renderer:
-        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        made = pixel_steps(renderer)
         times = list(made)
     assert len(times) < 100 and made.longest == pytest.approx(1250 * FOCAL / 1.75 * 200e-6, rel=0.01)
     (note,) = made.notes
@@ -261,7 +266,7 @@ def test_motion_too_fast_for_the_shortest_step_is_said(gl):
     assert note.endswith("times shorter for this motion; expected a smaller timeline.min_step_us")
     flies = drift((-5e3, 2, 0), (2e4, 2, 0), seconds=0.1)
     with Renderer(gl, seen([thing("ball", 2, sphere(0.25, 3), flies, WHITE)]), RenderConfig()) as renderer:
-        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        made = pixel_steps(renderer)
         assert len(list(made)) < 20
     (note,) = made.notes
     assert note.startswith("something may pass, or move to and fro, unseen within 200 µs, first at 0.01")
@@ -273,7 +278,7 @@ def test_many_keys_close_to_each_other_cost_no_more_than_looks(gl):
     tremble = 1e-3 / FOCAL * np.random.default_rng(0).normal(0, 1, (len(times), 3))
     path = KeyframePath(times, tremble, Rotation.concatenate([LEVEL] * len(times)))
     with Renderer(gl, seen([wall()], path), RenderConfig()) as renderer:
-        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        made = pixel_steps(renderer)
         assert len(list(made)) < 600 and made.looks < 6000
 
 
@@ -282,7 +287,7 @@ def test_a_deformer_without_a_time_scale_is_named(gl):
     mesh.deformer.timescale_ns = None
     body = thing("flag", 2, mesh, still((0, 3, 0)), SHARP)
     with Renderer(gl, seen([wall(GREY), body]), RenderConfig()) as renderer:
-        made = make_timeline(DisplacementTimeline(max_px=1.0), 0, END, renderer, Esim.response(ESIM))
+        made = pixel_steps(renderer)
         assert made.notes == (
             "the deformer of 'flag' has no timescale_ns, so steps are examined every timeline.min_step_us",
         )

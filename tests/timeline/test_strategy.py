@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.integrate import trapezoid
-from scipy.spatial.transform import Rotation
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import RenderConfig
@@ -23,11 +22,10 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
 from blinkgl.timeline import make_timeline, together, uniform_times
-from tests.render.render_scenes import LEVEL, drift, mixed_scene, quad, rig, scene, still, thing
+from tests.render.render_scenes import FACING, drift, mixed_scene, quad, rig, scene, still, thing
 from tests.timeline.paces import displacement_times
 
 MS = 1_000_000
-FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)
 WHITE = Material(unlit=True)
 PLAIN = RenderConfig(image_antialiasing="none")
 ESIM = EsimConfig(threshold_sigma=0.0)

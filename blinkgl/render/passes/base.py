@@ -126,6 +126,20 @@ class Pass:
             uniforms[one.sampler].value = unit
 
 
+class OverPass(Pass):
+    """A pass over the picture of another one, with its outputs, on every n-th pixel where that is."""
+
+    of: Pass
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
+        return self.of.outputs
+
+    @property
+    def every(self) -> int:  # type: ignore[bad-override]
+        return self.of.every
+
+
 class Programs(dict["Kind", Uniforms]):
     """The programs of one pass: uniforms per kind of material, compiled when first needed."""
 
@@ -173,9 +187,7 @@ class ScenePass(Pass):
 
     def programs(self, painter: Painter) -> dict[Kind, Uniforms]:
         """Return the painter's programs for this pass, by kind of material."""
-        if self not in painter.programs:
-            painter.programs[self] = Programs(painter, self)
-        return painter.programs[self]
+        return painter.programs.of(self, lambda: Programs(painter, self))
 
     def draw_item(self, painter: Painter, shot: Shot, item: DrawItem, uniforms: Uniforms) -> None:
         """Draw one item with the program that ``uniforms`` belong to."""

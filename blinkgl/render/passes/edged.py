@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from blinkgl.render.antialiasing import Samples
+from blinkgl.render.draw_items import SKY
 from blinkgl.render.frames import DEPTH_BUFFER, Rectangle, merged
-from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
+from blinkgl.render.passes.base import Input, OverPass, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
     from blinkgl.render.draw_items import DrawItem, Kind
     from blinkgl.render.painter import Painter
 
-SKY = 2
 _CROSSINGS_UNIT = 8
 
 
@@ -24,7 +24,7 @@ _CHANNELS = {"R32F": 1, "RG32F": 2}
 
 
 @dataclass(frozen=True)
-class Edged(Pass):
+class Edged(OverPass):
     """One output of another pass's picture, in which pixels on a silhouette or a crease have the mean of the surfaces
     on its two sides, weighted by their areas in the pixel's square. Outputs and grid are those of the pass: with a
     finer picture, pixels are those of its grid.
@@ -41,14 +41,6 @@ class Edged(Pass):
     @property
     def inputs(self) -> tuple[Input, ...]:
         return Input("picture", self.of), Input("depths", self.of, DEPTH_BUFFER)
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return self.of.outputs
-
-    @property
-    def every(self) -> int:
-        return self.of.every
 
     @property
     def samples(self) -> Samples:  # type: ignore[bad-override]

@@ -13,7 +13,7 @@ from blinkgl.gl import FORMATS
 from blinkgl.labels import LABELS
 from blinkgl.render.frames import Rectangle
 from blinkgl.render.lens import steps_of
-from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
+from blinkgl.render.passes.base import Input, OverPass, Pass, ScreenPass, Shot
 from blinkgl.render.passes.geometry import Geometry, Velocity
 from blinkgl.render.passes.luminance import Colour
 
@@ -25,7 +25,7 @@ _FREE_UNIT = 8
 
 
 @dataclass(frozen=True)
-class Gather(ScreenPass):
+class Gather(OverPass, ScreenPass):
     """The value of another pass at each pixel of a lens's picture: all outputs of its nearest pixel or, with
     ``smooth``, the mean of one output over its own area. It has every n-th pixel where the other has."""
 
@@ -38,10 +38,6 @@ class Gather(ScreenPass):
     @property
     def inputs(self) -> tuple[Input, ...]:  # type: ignore[bad-override]
         return tuple(Input(f"picked_{k}", self.of, output.name) for k, output in enumerate(self.of.outputs))
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
-        return self.of.outputs
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         every = self.of.every

@@ -65,23 +65,22 @@ class Geometry(ScenePass):
                 checked.add(item.kind)
                 own = {k: v for k, v in values.items() if item.deformer is not None or k not in of_shapes}
                 self._check(uniforms, own, item)
-            painter.place(uniforms, item, shot.moment)
-            if item.deformer is not None:
-                painter.deform(uniforms, item, shot.moment, shot.ends)
-            if "image_size" in uniforms:
-                uniforms["image_size"].value = shot.size
-            if "target_size" in uniforms:
-                uniforms["target_size"].value = shot.size
-            # Uniforms of the lens: the ray through a fragment, and its model.
-            if self.lens:
-                assert painter.lens is not None
-                painter.lens.set(uniforms, shot.moment, LENS_UNIT)
+            self.dress_item(painter, shot, item, uniforms)
             # Values of the labels, of this item's object.
             for name, (_, rows) in values.items():
                 if item.deformer is None and name in of_shapes:
                     continue
                 uniforms[name].write(rows[item.object_index])
             painter.draw(uniforms, item, shot.moment.t_ns)
+
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        for name in ("image_size", "target_size"):
+            if name in uniforms:
+                uniforms[name].value = shot.size
+        # Uniforms of the lens: the ray through a fragment, and its model.
+        if self.lens:
+            assert painter.lens is not None
+            painter.lens.set(uniforms, shot.moment, LENS_UNIT)
 
     def _values(self, shot: Shot) -> dict[str, tuple[str, list[bytes]]]:
         """Return uniform -> the label that gives it, and its bytes for each object."""

@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.colour import LUMA
 from blinkgl.render.moment import rows_xyw_bytes
-from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
+from blinkgl.render.passes.base import Input, Output, OverPass, Pass, ScreenPass, Shot
 from blinkgl.render.passes.shadow import Shaded, ShadowMap
 from blinkgl.scene.types import Scene
 
@@ -136,7 +136,7 @@ class Colour(Picture):
 
 
 @dataclass(frozen=True)
-class Mean(ScreenPass):
+class Mean(OverPass, ScreenPass):
     """The mean of each pixel's samples of one output of another pass."""
 
     of: Pass
@@ -147,19 +147,10 @@ class Mean(ScreenPass):
     def inputs(self) -> tuple[Input, ...]:
         return (Input("fine", self.of),)
 
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return self.of.outputs
-
-    @property
-    def every(self) -> int:
-        return self.of.every
-
     def defines(self, kind: Kind | None) -> dict[str, object]:
         # Samples per pixel in x and in y.
         return {"FACTOR": self.of.samples.grid}
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-
         return (cls(Colour(Samples(grid=factor))) for factor in (2, 4, 8))

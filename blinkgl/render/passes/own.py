@@ -65,6 +65,7 @@ def register(
     unless(name not in OWN, "name", "is taken: there is such a pass already")
     unless(isinstance(pass_, Pass), "pass_", "is no instance of Pass")
     program, outputs = Path(pass_.program), [one.name for one in pass_.outputs]
+    # A relative name is one of the shader folder, whose loader reports what is not there.
     unless(not program.is_absolute() or program.is_file(), "program", f"is no file: {program}")
     unless(outputs, "outputs", "is empty: a pass that writes depth alone has no buffer to show")
     unless(output in ("", *outputs), "output", f"is none of {', '.join(outputs)}")
@@ -86,6 +87,7 @@ def register(
 
 def own_passes() -> list[type[Pass]]:
     """Return the classes of the registered passes."""
+    # One class may be registered for several of its outputs.
     return list(dict.fromkeys(type(one.pass_) for one in OWN.values()))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.frames import DEPTH_BUFFER
-from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
+from blinkgl.render.passes.base import Input, Output, OverPass, Pass, ScenePass, Shot
 from blinkgl.render.passes.edged import Edged
 from blinkgl.render.passes.luminance import Colour, Luminance, LuminancePass, Mean, Picture
 from blinkgl.render.passes.shadow import ShadowMap
@@ -89,7 +89,7 @@ class ColourPortraits(Portraits, Colour):
 
 
 @dataclass(frozen=True)
-class Specks(Pass):
+class Specks(OverPass):
     """A picture of light, with filtered edges or without, and the specks that it leaves out, far ones first. Outputs
     and grid are those of the pass."""
 
@@ -112,10 +112,6 @@ class Specks(Pass):
         return base
 
     @property
-    def outputs(self) -> tuple[Output, ...]:  # type: ignore[bad-override]
-        return self.of.outputs
-
-    @property
     def samples(self) -> Samples:  # type: ignore[bad-override]
         return self.of.samples
 
@@ -129,6 +125,7 @@ class Specks(Pass):
             return
         cells = np.column_stack(np.divmod(np.arange(len(places)), _CELLS)[::-1])
         table = np.empty(len(places), [("body", "4f4"), ("cell", "2i4")])
+        # A portrait shows a little more than the body, so its square in the picture is larger by as much.
         table["body"], table["cell"] = places * (1, 1, _ROOM, 1), cells
         ctx, program = painter.gl.ctx, painter.gl.program(self.program, self.defines(None))
         uniforms = painter.uniforms(program)
@@ -139,8 +136,8 @@ class Specks(Pass):
         # The nearest comes first among the portraits, and last into the picture.
         buffer = ctx.buffer(np.ascontiguousarray(table[::-1]))
         array = ctx.vertex_array(program, [(buffer, "4f 2i /i", "in_body", "in_cell")])
-        shot.target.fbo.use()
-        ctx.viewport = (0, 0, shot.target.fbo.width, shot.target.fbo.height)
+        shot.target.use()
+        # Alpha is the share of a pixel that a body covers; the rest of it shows what is behind.
         ctx.enable_only(moderngl.BLEND)
         ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         ctx.point_size = 1.0

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.shapes.sweep import filled
-from blinkgl.scene.types import Deformer, Mesh, Scene
+from blinkgl.scene.types import Deformer, Mesh, Scene, SceneObject
 from blinkgl.types.poses import pose_of
 
 CREASE_DEGREES = 40.0
@@ -167,31 +167,24 @@ def faces_in_float32(mesh: Mesh) -> np.ndarray:
 def without_collapsed_faces(scene: Scene) -> Scene:
     """Return the scene without the faces that are lines in float32 (:func:`faces_in_float32`), with a line in its log
     that counts them; the scene itself when there are none."""
-    made: dict[int, Mesh | None] = {}  # id of a mesh -> the mesh without them; None: nothing is left
-    objects, dropped = [], 0
-    for obj in scene.objects:
-        parts = []
-        for part in obj.parts:
-            if id(part.mesh) not in made:
-                kept = faces_in_float32(part.mesh)
-                faces = part.mesh.faces[kept]
-                made[id(part.mesh)] = (
-                    part.mesh if kept.all() else replace(part.mesh, faces=faces) if len(faces) else None
-                )
-            mesh = made[id(part.mesh)]
-            dropped += len(part.mesh.faces) - (0 if mesh is None else len(mesh.faces))
-            if mesh is not None:
-                parts.append(part if mesh is part.mesh else replace(part, mesh=mesh))
-        objects.append(
-            obj
-            if len(parts) == len(obj.parts) and all(a is b for a, b in zip(parts, obj.parts))
-            else replace(obj, parts=tuple(parts))
-        )
+    # By identity, so that parts that share a mesh share what is left of it.
+    meshes = {id(part.mesh): part.mesh for obj in scene.objects for part in obj.parts}
+    kept = {key: faces_in_float32(mesh) for key, mesh in meshes.items()}
+    made = {
+        key: mesh if kept[key].all() else replace(mesh, faces=mesh.faces[kept[key]]) for key, mesh in meshes.items()
+    }
+    dropped = sum(int((~kept[id(part.mesh)]).sum()) for obj in scene.objects for part in obj.parts)
     if not dropped:
         return scene
-    return replace(
-        scene, objects=tuple(objects), log=(*scene.log, f"{dropped} triangles without width in float32 are not drawn")
-    )
+
+    def drawn(obj: SceneObject) -> SceneObject:
+        if all(kept[id(part.mesh)].all() for part in obj.parts):
+            return obj
+        parts = (replace(part, mesh=made[id(part.mesh)]) for part in obj.parts if kept[id(part.mesh)].any())
+        return replace(obj, parts=tuple(parts))
+
+    log = (*scene.log, f"{dropped} triangles without width in float32 are not drawn")
+    return replace(scene, objects=tuple(map(drawn, scene.objects)), log=log)
 
 
 def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -69,7 +69,8 @@ class Builder(Protocol):
     checked: Callable[..., inspect.BoundArguments]
     at_level: Callable[..., Mesh] | None
 
-    def __call__(self, **parameters: object) -> Mesh: ...
+    def __call__(self, **parameters: object) -> Mesh:
+        """Return the mesh with these parameters."""
 
 
 BUILDERS: dict[str, Builder] = {}

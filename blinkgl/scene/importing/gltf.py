@@ -10,6 +10,7 @@ are collected in :attr:`Document.omissions`.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -208,15 +209,7 @@ class Document:
         """Return the displacements of a morph target, (count, 3); 0 without them."""
         if name not in target:
             return np.zeros((count, 3))
-        a = item(self.tree, "accessors", target[name], self.where)
-        if a["count"] != count or a["type"] != "VEC3":
-            raise AssetError(
-                f"a morph target has another size than its mesh ({name})",
-                where=self.where,
-                value=f"{a['count']} {a['type']}",
-                accepted=f"{count} VEC3",
-            )
-        values = self.accessor(target[name]).astype(np.float64)
+        values = self._sized(target[name], count, 3, f"a morph target has another size than its mesh ({name})")
         if not (np.abs(values) <= 1e12).all():  # NaN compares false
             raise AssetError(f"a morph target is not a number, or beyond 1e12 ({name})", where=self.where)
         return values
@@ -286,18 +279,18 @@ class Document:
         return np.array(weights, np.float64)
 
     def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
-        """Return an attribute, (count, width) float64, None without it. Its length is checked before it is read."""
-        if name not in primitive["attributes"]:
-            return None
-        index = primitive["attributes"][name]
+        """Return an attribute, (count, width) float64, None without it."""
+        index = primitive["attributes"].get(name)
+        problem = f"the file is no valid glTF ({name} does not fit the positions)"
+        return None if index is None else self._sized(index, count, width, problem)
+
+    def _sized(self, index: int, count: int, width: int, problem: str) -> np.ndarray:
+        """Return an accessor's values, (count, width) float64. Raises AssetError with this ``problem`` where it has
+        another size, before it is read: a file may declare any."""
         a = item(self.tree, "accessors", index, self.where)
         if a["count"] != count or _WIDTHS[a["type"]] != width:
-            raise AssetError(
-                f"the file is no valid glTF ({name} does not fit the positions)",
-                where=self.where,
-                value=f"{a['count']} {a['type']}",
-                accepted=f"{count} VEC{width}",
-            )
+            has, accepted = f"{a['count']} {a['type']}", f"{count} VEC{width}"
+            raise AssetError(problem, where=self.where, value=has, accepted=accepted)
         return self.accessor(index).astype(np.float64)
 
     def _coloured(
@@ -482,19 +475,13 @@ def _extensions(tree: Any) -> Iterator[str]:
 def _check_faces(document: Document, max_faces: int) -> None:
     """Check the number of triangles of the scene, from the accessors' counts (for every node that shows a mesh)."""
     tree, where = document.tree, document.where
-    per_mesh = {}
-    for node in document.nodes.values():
-        if not node.shows:
-            continue
-        if node.mesh not in per_mesh:
-            total = 0
-            for primitive in item(tree, "meshes", node.mesh, where)["primitives"]:
-                position = primitive["attributes"].get("POSITION")
-                vertices = item(tree, "accessors", position, where)["count"] if position is not None else 0
-                corners = vertices
-                if "indices" in primitive:
-                    corners = item(tree, "accessors", primitive["indices"], where)["count"]
-                # A strip or a fan has a triangle for every corner after the second.
-                total += max(corners, vertices) // (3 if primitive.get("mode", 4) == 4 else 1)
-            per_mesh[node.mesh] = total
-    limit_faces(sum(per_mesh[n.mesh] for n in document.nodes.values() if n.shows), max_faces, where)
+
+    def triangles(primitive: dict) -> int:
+        references = primitive["attributes"].get("POSITION"), primitive.get("indices")
+        counts = [item(tree, "accessors", one, where)["count"] for one in references if one is not None]
+        # A strip or a fan has a triangle for every corner after the second.
+        return max(counts, default=0) // (3 if primitive.get("mode", 4) == 4 else 1)
+
+    meshes = Counter(node.mesh for node in document.nodes.values() if node.shows)
+    primitives = {mesh: item(tree, "meshes", mesh, where)["primitives"] for mesh in meshes}
+    limit_faces(sum(times * sum(map(triangles, primitives[mesh])) for mesh, times in meshes.items()), max_faces, where)

@@ -180,6 +180,7 @@ def object_pool(config: PoolConfig, base: Path, max_texture: int = 1024) -> Pool
         limits = {"max_faces": config.max_faces, "max_bytes": limit, "max_texture": max_texture, "up": config.up}
         known = {"source_hash": entry.source_hash, "border": entry.border}
         asset = load_asset(entry.file, keep_materials=dressed, **limits, **known)
+        # Whether a file chose its looks is known only once it is read with them.
         if config.keep_materials == "auto" and not asset.has_looks:
             asset = load_asset(entry.file, keep_materials=False, **limits, **known)
         if config.keep_materials == "auto":
@@ -294,6 +295,7 @@ def _walk(folder: Path, hidden: list[str]) -> Iterator[Path]:
     seen, waiting = set(), [folder]
     while waiting:
         for here, folders, names in os.walk(waiting.pop(0), onerror=_raise):
+            # Links may lead round in circles, and to one folder by many names: device and inode are its identity.
             if (number := (os.stat(here).st_dev, os.stat(here).st_ino)) in seen:
                 folders.clear()
                 continue

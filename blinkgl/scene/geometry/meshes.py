@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.polygons import face_cross
 from blinkgl.scene.shapes.sweep import filled
 from blinkgl.scene.types import Deformer, Mesh, Scene, SceneObject
 from blinkgl.types.poses import pose_of
@@ -187,12 +188,6 @@ def without_collapsed_faces(scene: Scene) -> Scene:
     return replace(scene, objects=tuple(map(drawn, scene.objects)), log=log)
 
 
-def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (F, 3) outward vectors of twice the area."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
 def _usable_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> bool:
     normals = np.asarray(normals, np.float64)
     if normals.shape != vertices.shape:
@@ -259,7 +254,7 @@ def crease_normals(
     """Return (F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point
     that are joined by edges bent less than ``crease_degrees``; with (F,) ``groups`` instead by edges between two faces
     of one smoothing group, 0: of none."""
-    unit = _face_cross(vertices, faces)
+    unit = face_cross(vertices, faces)
     unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-300)
     fan = _fans(welded, unit, crease_degrees, groups)
     angle = corner_angles(vertices[faces])
@@ -316,7 +311,7 @@ def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None =
     low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
     size = float((high - low).max()) if uv_size is None else float(uv_size)
     centred = (vertices[faces] - (low + high) / 2) / max(size, 1e-300)
-    normal = _face_cross(vertices, faces)
+    normal = face_cross(vertices, faces)
     axis = np.abs(normal).argmax(axis=1)
     sign = np.where(np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0, -1, 1)
     uvs = np.empty((len(faces), 3, 2))
@@ -333,7 +328,7 @@ def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> 
     a, b, c = (uvs[faces[:, i]] for i in range(3))
     # Twice the area of each triangle in the texture.
     uv_area = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
-    area = np.linalg.norm(_face_cross(vertices, faces), axis=1)
+    area = np.linalg.norm(face_cross(vertices, faces), axis=1)
     return bool(area[uv_area < 1e-10].sum() > 0.5 * area.sum())
 
 

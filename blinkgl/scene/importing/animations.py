@@ -38,19 +38,11 @@ class Animation:
 
     def moves(self, node: int) -> bool:
         """Return whether a node or one of its ancestors is moved."""
-        return any(self._places[step] in self._moved for step in self._chain(node))
-
-    def _chain(self, node: int) -> list[int]:
-        """Return a node and its ancestors."""
-        chain, step = [], node
-        while step is not None:
-            chain.append(step)
-            step = self.document.nodes[step].parent
-        return chain
+        return any(self._places[step] in self._moved for step in self.document.chain(node))
 
     def tracks_of(self, node: int) -> list[Track]:
         """Return the tracks that move a node or one of its ancestors."""
-        return [track for step in self._chain(node) for track in self._moved.get(self._places[step], ())]
+        return [track for step in self.document.chain(node) for track in self._moved.get(self._places[step], ())]
 
     def motion(self, node: int, turn: np.ndarray, before: np.ndarray) -> Motion:
         """Return the function that gives (turn @ T @ before, its rate), ((4, 4), (4, 4) 1/s), of a node's transform T

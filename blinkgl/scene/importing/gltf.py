@@ -83,29 +83,30 @@ class Document:
         defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
         table = gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights).lights
-        lights: dict[int, Tree] = {}
-        for index in (index for index, node in self.nodes.items() if node.visible):
-            if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
-                number = index_of(reference.get("light"), len(table), "lights", self.where)
-                lights[index] = table[number].model_dump()
-        return lights
+        extensions = {i: self.tree["nodes"][i].get("extensions", {}) for i, node in self.nodes.items() if node.visible}
+        lights = {i: own[_LIGHTS].get("light") for i, own in extensions.items() if own.get(_LIGHTS) is not None}
+        return {i: table[index_of(n, len(table), "lights", self.where)].model_dump() for i, n in lights.items()}
 
     # ---- geometry
     def world(self, node: int) -> np.ndarray:
         """Return the rest transform of a node to the file's world, (4, 4)."""
         T = np.eye(4)
+        for step in self.chain(node):
+            T = self.nodes[step].local() @ T
+        return T
+
+    def chain(self, node: int) -> Iterator[int]:
+        """Yield a node and its ancestors."""
         step: int | None = node
         while step is not None:
-            T = self.nodes[step].local() @ T
+            yield step
             step = self.nodes[step].parent
-        return T
 
     def raw_meshes(self, mesh: int) -> list[RawMesh]:
         """Return the triangles of a mesh in its own coordinates, one entry per primitive, with bindings to joints and
         morph targets; points and lines are left out."""
         primitives = item(self.tree, "meshes", mesh, self.where)["primitives"]
-        made = [self._primitive(primitive, mesh) for primitive in primitives]
-        return [raw for raw in made if raw is not None]
+        return [raw for one in primitives if (raw := self._primitive(one, mesh)) is not None]
 
     def _primitive(self, primitive: dict, mesh: int) -> RawMesh | None:
         """Return one primitive of a mesh; None: it has no visible surface."""
@@ -448,8 +449,7 @@ def read(
         near.omissions.unknown("properties", unknown)
         buffers = buffers_of(tree, binary, near)
         made = Materials(tree, buffers, near, max_texture, materials)
-        document = Document(path, tree, buffers, made, near.omissions, log=near.log)
-        document.nodes = nodes_of(tree, where)
+        document = Document(path, tree, buffers, made, near.omissions, nodes_of(tree, where), near.log)
         _check_faces(document, max_faces)
         for name in dict.fromkeys([*tree.get("extensionsUsed", []), *_extensions(tree)]):
             # Extensions of materials and textures are reported where one is used, and lights by kind.

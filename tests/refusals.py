@@ -1,4 +1,4 @@
-"""The line in which something is refused."""
+"""What is refused, and how it is said: in one line."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import pytest
 
-from blinkgl.errors import ConfigError
 
-
-def refusal(call: Callable[..., object], *arguments: object, **keys: object) -> str:
-    """Return what the ConfigError of a call says, in one line."""
-    with pytest.raises(ConfigError) as caught:
-        call(*arguments, **keys)
+def refusal(
+    error: type[Exception] | tuple[type[Exception], ...], call: Callable, *args, match: str | None = None, **options
+) -> str:
+    """The message with which a call is refused, of one line.   match : a pattern that is in it."""
+    with pytest.raises(error, match=match) as caught:
+        call(*args, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)

@@ -93,11 +93,12 @@ class Blender(Closing):
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
-            start_new_session=True,
+            start_new_session=True,  # so that one signal ends it with its children
         )
 
     def close(self) -> None:
         """End the process and its children."""
+        # It may end between the question and the signal.
         if self._process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)

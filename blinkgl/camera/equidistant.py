@@ -41,6 +41,7 @@ class Equidistant(DistortedModel):
     @cached_property
     def _limit(self) -> float:
         """Return the largest angle, rad."""
+        # No direction is farther from the axis than straight back.
         return min(math.pi, radius_limit(self._k))
 
     @property

@@ -122,6 +122,7 @@ def _with_room(config: SequenceConfig) -> SceneConfig:
     scene = config.scene
     if not isinstance(scene, RandomSceneConfig):
         return scene
+    # A camera beside the rig's origin stays within a ball around it, however the rig turns.
     reach = [
         float(np.linalg.norm(one.place.T[:3, 3])) + camera_radius(one.camera.model, scene.camera_clearance)
         for one in config.sensors or ()
@@ -135,6 +136,7 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
     base = Path(base)
     if isinstance(config, RandomSceneConfig):
         objects, textures = pools(config, base)
+        # A world without objects draws none, so that an empty pool is no fault there.
         if config.objects.count:
             objects.split(split)
         textures.split(split)

@@ -30,7 +30,7 @@ from blinkgl.scene.motion.paths import OffsetPath, StaticPath
 from blinkgl.scene.motion.pose_path import PosePath
 from blinkgl.scene.surfaces.environment import Environment, pixel_directions
 from blinkgl.scene.surfaces.gloss import blurred
-from blinkgl.scene.types import Lamp, Light, Panorama
+from blinkgl.scene.types import Lamp, Light
 from blinkgl.scene.waveforms import Code, Keys, Pwm, Sine, Waveform
 from blinkgl.types.poses import pose_of
 
@@ -63,8 +63,7 @@ def lamps_of(light: Light) -> tuple[Lamp, ...]:
         strength = _scaled(light.sun_color, light.sun)
         towards = lamp_pose(shines=-np.asarray(light.sun_direction))
         lamps = (Lamp("sun", strength, StaticPath(towards), size=light.sun_size, over_time=light.over_time), *lamps)
-    order = ("sun", "point", "spot")
-    return tuple(sorted(lamps, key=lambda lamp: order.index(lamp.kind)))
+    return tuple(sorted(lamps, key=lambda lamp: ("sun", "point", "spot").index(lamp.kind)))
 
 
 MAX_SHADOWS, MAX_SOFT = 4, 2
@@ -122,10 +121,10 @@ def seen_around(light: Light) -> np.ndarray:
     """Return the radiance of the surroundings, (h, w, 3) float32, without lamps, as a panorama with pixels as in
     :func:`~blinkgl.scene.surfaces.environment.pixel_directions`. Light known only by its quadric is replaced by the
     radiance of a white surface under it, which is as smooth."""
-    height, width = _SKY_SIZE if light.surroundings is None else light.surroundings.pixels.shape[:2]
+    height, width = _SKY_SIZE if light.surroundings is None else light.surroundings.shape[:2]
     picture = np.zeros((height, width, 3), np.float32)
     if light.surroundings is not None:
-        picture += light.surroundings.pixels
+        picture += light.surroundings
     elif light.quadric is not None:
         directions, _ = pixel_directions(height, width)
         picture += ambient(np.asarray(light.quadric, np.float64), directions, quartic_of(light))
@@ -259,7 +258,7 @@ def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
         None if form is None else tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in form)
         for form in (panorama.quadric, panorama.quartic)
     )
-    lamps, picture = (*suns, *light.lamps), Panorama(panorama.picture * np.float32(factor))
+    lamps, picture = (*suns, *light.lamps), panorama.picture * np.float32(factor)
     return replace(light, sun=0.0, sky=0.0, lamps=lamps, quadric=around, quartic=finer, surroundings=picture)
 
 

@@ -62,6 +62,7 @@ def contents(path: Path, what: str, where: str | None = None, max_bytes: int = M
     try:
         size = path.stat().st_size
         if size > max_bytes:
+            # Before reading: a sparse file of terabytes costs no more than its directory entry.
             raise AssetError(
                 f"the {what} file is too large",
                 where=where,

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -345,13 +345,6 @@ class Lamp:
 WHITE = (1.0, 1.0, 1.0)
 
 
-class Panorama(NamedTuple):
-    """A panorama. pixels : (h, w, 3) float32 radiance of the surroundings, as in
-    :func:`~blinkgl.scene.surfaces.environment.pixel_directions`."""
-
-    pixels: np.ndarray
-
-
 @dataclass(frozen=True)
 class Light:
     """Sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E. Both are
@@ -363,8 +356,9 @@ class Light:
     quadric : form of the other light of the surroundings (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers;
         None: none.
     quartic : form of the same, 3 x 9 x 9 numbers, where ``quadric`` alone is not accurate enough.
-    surroundings : the same as a picture without its suns, for reflections; lights that differ only in it are equal.
-        None: the sky alone, ``sky`` above the horizon.
+    surroundings : the same as a picture without its suns, (h, w, 3) float32 radiance with pixels as in
+        :func:`~blinkgl.scene.surfaces.environment.pixel_directions`, for reflections; lights that differ only in it are
+        equal. None: the sky alone, ``sky`` above the horizon.
     shadows : of suns and spot lights; soft by their size.   shadow_size : px per side of each map.
     over_time : factor on the sun and the light of the surroundings; None: 1.
 
@@ -380,7 +374,7 @@ class Light:
     lamps: tuple[Lamp, ...] = ()
     quadric: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     quartic: tuple[tuple[tuple[float, ...], ...], ...] | None = None
-    surroundings: Panorama | None = field(default=None, compare=False, repr=False)
+    surroundings: np.ndarray | None = field(default=None, compare=False, repr=False)
     shadows: Literal["off", "hard", "soft"] = "off"
     shadow_size: int = LightConfig().shadow_size
     over_time: Waveform | None = None

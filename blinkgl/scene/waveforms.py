@@ -26,27 +26,21 @@ class Waveform(Protocol):
 
     def factor(self, t_ns: int) -> float:
         """Return the factor at a time."""
-        ...
 
     def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
         """Return the times in (t0, t1) at which the factor jumps, ns, increasing."""
-        ...
 
     def corners(self, t0_ns: int, t1_ns: int) -> list[int]:
         """Return the times in (t0, t1) at which it turns or bends, ns, increasing; in between it is monotone."""
-        ...
 
     def steepness(self, t_ns: int) -> float:
         """Return a bound of its relative change between the corners around t, 1/s."""
-        ...
 
     def per_second(self) -> float:
         """Return the average number of jumps and corners in a second."""
-        ...
 
     def mean(self, t0_ns: int, t1_ns: int) -> float:
         """Return the mean factor from t0 to t1."""
-        ...
 
 
 def factor_at(wave: Waveform | None, t_ns: int, t0_ns: int) -> float:
@@ -56,13 +50,10 @@ def factor_at(wave: Waveform | None, t_ns: int, t0_ns: int) -> float:
 
 def _times(first: float, period: float, t0_ns: int, t1_ns: int) -> list[int]:
     """Return the whole ns of first + k period (s) in (t0, t1)."""
-    k = math.floor((t0_ns * 1e-9 - first) / period) - 1
-    times = []
-    while (t := round((first + k * period) * NS_PER_S)) < t1_ns:
-        if t > t0_ns:
-            times.append(t)
-        k += 1
-    return times
+    # One period early: the quotient may be rounded up.
+    begin = math.floor((t0_ns * 1e-9 - first) / period) - 1
+    times = (round((first + k * period) * NS_PER_S) for k in itertools.count(begin))
+    return [t for t in itertools.takewhile(lambda t: t < t1_ns, times) if t > t0_ns]
 
 
 @dataclass(frozen=True)
@@ -97,14 +88,8 @@ class Sine:
         return 1.0 + self.depth * swing / (2 * math.pi * self.frequency * (t1_ns - t0_ns) * 1e-9)
 
 
-class _Steps:
+class _Steps(Waveform):
     """What a waveform of constant pieces has in common."""
-
-    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
-        raise NotImplementedError
-
-    def factor(self, t_ns: int) -> float:
-        raise NotImplementedError
 
     def corners(self, t0_ns: int, t1_ns: int) -> list[int]:
         return []
@@ -160,8 +145,7 @@ class Code(_Steps):
     repeat: bool = True
 
     def _bit(self, k: int) -> str:
-        inside = 0 <= k < len(self.bits)
-        return self.bits[k % len(self.bits)] if self.repeat or inside else "0"
+        return self.bits[k % len(self.bits)] if self.repeat or 0 <= k < len(self.bits) else "0"
 
     def factor(self, t_ns: int) -> float:
         k = math.floor(self.rate * t_ns * 1e-9)
@@ -194,6 +178,7 @@ class Keys:
 
     def factor(self, t_ns: int) -> float:
         k = self._piece(t_ns)
+        # Before the first key its factor, after the last one that one's.
         if k < 0 or k == len(self.times_ns) - 1 or self.hold:
             return self.factors[max(k, 0)]
         part = (t_ns - self.times_ns[k]) / (self.times_ns[k + 1] - self.times_ns[k])

@@ -27,21 +27,23 @@ def factor_that_fits(
     contrast and stay inside, as shares of the images' contrast."""
     errors = np.zeros(len(FACTORS))
     for a, b, flow, valid in pairs:
+        # Blurred: noise of single pixels differs between the images, whatever the factor.
         first, second = (cv2.GaussianBlur(_grey(image), (0, 0), 1.0) for image in (a, b))
         row, column = np.indices(first.shape, np.float32)
         slope = np.abs(cv2.Sobel(first, cv2.CV_32F, 1, 0)) + np.abs(cv2.Sobel(first, cv2.CV_32F, 0, 1))
         moving = valid & (np.abs(flow).max(axis=-1) > _MOVES_PX) & (slope > np.median(slope))
-        for factor in FACTORS:
-            x, y = column + np.float32(factor) * flow[..., 0], row + np.float32(factor) * flow[..., 1]
+        ends = [
+            (column + np.float32(factor) * flow[..., 0], row + np.float32(factor) * flow[..., 1]) for factor in FACTORS
+        ]
+        for x, y in ends:
             # The same pixels for every factor: those that stay inside with all of them.
             moving &= (x >= 0) & (y >= 0) & (x <= first.shape[1] - 1) & (y <= first.shape[0] - 1)
         if np.count_nonzero(moving) < _LEAST_PX:
             continue
         scale = float(np.std(first)) or 1.0
-        for k, factor in enumerate(FACTORS):
-            place = (column + np.float32(factor) * flow[..., 0]).astype(np.float32)
-            below = (row + np.float32(factor) * flow[..., 1]).astype(np.float32)
-            followed = cv2.remap(second, place, below, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for k, end in enumerate(ends):
+            x, y = (places.astype(np.float32) for places in end)
+            followed = cv2.remap(second, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             errors[k] += float(np.abs(followed - first)[moving].mean()) / scale
     own = errors[FACTORS.index(1.0)]
     best = int(np.argmin(errors))

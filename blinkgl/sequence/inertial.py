@@ -99,9 +99,8 @@ def _ideal(body: PosePath, times: list[int], gravity: np.ndarray) -> tuple[np.nd
 def _second(path: PosePath, t_ns: int) -> np.ndarray:
     """Return the second derivative, (4, 4), 1/s², one-sided at the ends of the path."""
     h, seconds = _HALF_NS, _HALF_NS * 1e-9
-    if not path.t0_ns <= t_ns <= path.t1_ns:
-        return np.zeros((4, 4))
-    if path.t1_ns - path.t0_ns < 2 * h:
+    # Beyond its ends a path stands still; within so short a one there is no room for the difference.
+    if not path.t0_ns <= t_ns <= path.t1_ns or path.t1_ns - path.t0_ns < 2 * h:
         return np.zeros((4, 4))
     if t_ns - h < path.t0_ns or t_ns + h > path.t1_ns:
         sign = 1 if t_ns - h < path.t0_ns else -1

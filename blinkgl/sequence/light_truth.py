@@ -47,6 +47,7 @@ class LightTruth:
                 share = now - self._light(self._moment(t_ns).holding(held))
                 shares.append((number, share))
                 rest -= share
+        # Only a part in the direction of the whole change can be what made it.
         most = np.maximum(most, rest * np.sign(total))
         for number, share in shares:
             part = share * np.sign(total)

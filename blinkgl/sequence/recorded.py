@@ -42,7 +42,6 @@ from blinkgl.types.events import Events
 # outside the image in the next frame). All are used in the order of their names. A third may hold the backward flow,
 # one file per pair of frames, too.
 
-_FLOW = READ_ENDINGS
 _BACKWARD = re.compile(r"backward|bwd|into_?past|flow_?bw", re.IGNORECASE)
 _UNEQUAL = 0.05
 """Part of a frame's interval by which times beside the images may differ from ``frames.fps``."""
@@ -178,7 +177,7 @@ def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> GivenF
         return GivenFlow([], [])
     where, pairs = _folder_of_flow(folder, frames.flow), len(images) - 1
     is_mask = lambda path: path.stem.endswith("_mask")
-    flows, masks = series(where, _FLOW, lambda path: not is_mask(path)), series(where, _FLOW, is_mask)
+    flows, masks = series(where, READ_ENDINGS, lambda path: not is_mask(path)), series(where, READ_ENDINGS, is_mask)
     notes = flows.notes + masks.notes
     backward = frames.flow_direction == "backward"
     if frames.flow_direction == "auto" and flows.files:
@@ -242,11 +241,6 @@ def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
     return mask != 0
 
 
-def read_frame(path: Path) -> np.ndarray:
-    """Return (H, W) or (H, W, 3) RGB of an image file, upright, without alpha. Raises AssetError."""
-    return read_any_image(path)
-
-
 RECORDED = ("images", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 """Labels that recorded frames may have."""
 
@@ -278,7 +272,7 @@ class RecordedSequence(SensorSimulation):
                 accepted=f"[{self.flow.direction}], or frames.flow: null",
             )
         self._kept: dict[int, np.ndarray] = {
-            0: read_frame(self.files[0])
+            0: read_any_image(self.files[0])
         }  # read already, together with an image of a later label
         size = self._kept[0].shape[:2]
         self._form = None if frames.flow_format == "auto" else frames.flow_format
@@ -325,7 +319,7 @@ class RecordedSequence(SensorSimulation):
         """Raise AssetError for flow that contradicts the images, on a few pairs spread over the sequence."""
         files, back = self.flow.files, self.flow.backward
         chosen = np.unique(np.linspace(0, len(files) - 1, _CHECKED_PAIRS if files else 0).astype(int))
-        ends = {k: [read_frame(self.files[n]) for n in ((k + 1, k) if back else (k, k + 1))] for k in chosen}
+        ends = {k: [read_any_image(self.files[n]) for n in ((k + 1, k) if back else (k, k + 1))] for k in chosen}
         pairs = [(one, other, *read_flow_of(files[k], size, self._form)) for k, (one, other) in ends.items()]
         if pairs and not any(valid.any() for _, _, _, valid in pairs):
             raise AssetError(
@@ -350,9 +344,10 @@ class RecordedSequence(SensorSimulation):
         return round(k * 1e9 / fps)
 
     def _given(self) -> Iterator[tuple[np.ndarray, int, str]]:
+        # The emulator is a frame ahead of the labels: what one of them shows need not be read twice.
         keep = self._labels and "images" in asked_for(self.config.labels)
         for k, file in enumerate(self.files):
-            frame = self._kept.pop(0) if k == 0 else read_frame(file)
+            frame = self._kept.pop(0) if k == 0 else read_any_image(file)
             if keep and k:
                 self._kept[k] = frame
             yield frame, self._time_of(k, self._recorded.fps), str(file)
@@ -387,7 +382,7 @@ class RecordedSequence(SensorSimulation):
     def _truth(self, k: int, t_ns: int) -> GroundTruth:
         number, request, values = k + 1, asked_for(self.config.labels), {}  # number: of the frame
         if "images" in request:
-            values["images"] = self._kept.pop(number) if number in self._kept else read_frame(self.files[number])
+            values["images"] = self._kept.pop(number) if number in self._kept else read_any_image(self.files[number])
         way, file = self.flow.direction, self.flow.of_frame(number)
         if number == len(self.files) - 1 or not self.flow.files or f"flow_{way}" not in request:
             return GroundTruth(k, t_ns, LabelFrame(t_ns, values))

@@ -159,19 +159,14 @@ class RenderedSequence(SensorSimulation):
         self.renderer.gl.resume()
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
-        assert self.camera is not None
+        assert self.camera is not None and self.timeline is not None
         try:
             # A tensor's frame stays on the card, which works beside the processor by itself.
-            run = emulate_beside if self.camera.tensor_device is None else emulate
-            yield from run(self._frames(), self.camera, self.clock)
+            device = self.camera.tensor_device
+            frames = drawn(self.renderer, self.timeline, self.camera.records_truth, device, self._optics)
+            yield from (emulate_beside if device is None else emulate)(frames, self.camera, self.clock)
         except EventDataError as error:
             raise self._explained(error) from error
-
-    def _frames(self) -> Iterator[EventFrame]:
-        """Yield the frames of the event pass."""
-        assert self.camera is not None and self.timeline is not None
-        device = self.camera.tensor_device
-        return drawn(self.renderer, self.timeline, self.camera.records_truth, device, self._optics)
 
     def _in_order(self) -> Iterator[Item]:
         yield from super()._in_order()
@@ -364,6 +359,7 @@ def nothing_in_view(scene: Scene) -> tuple[str, ...]:
     bodies = [one for one in scene.objects if one.category == "object"]
     for one in bodies:
         at = world @ one.path.poses(times)
+        # A sphere meets the picture if its centre is outside no plane by more than its radius.
         if (at[:, :3, 3] @ planes.T >= -one.radius).all(axis=1).any():
             return ()
     return ("no body is ever in the camera's view: its pose may be meant otherwise",) if bodies else ()

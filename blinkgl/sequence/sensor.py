@@ -43,6 +43,7 @@ class _Due:
     def label(self) -> tuple[int, int] | None:
         """Return number and time of the next label, and mark it as done; None: the camera is next."""
         label = self._next
+        # Of one time the label comes before the image.
         if label is None or label[1] != self.ns:
             return None
         self._next = next(self._labels, None)
@@ -216,10 +217,13 @@ class SensorSimulation(ABC):
         """Yield number and time, ns, of every label."""
 
     @abstractmethod
-    def _event_pass(self) -> Iterator[tuple[int, Events]]: ...
+    def _event_pass(self) -> Iterator[tuple[int, Events]]:
+        """Yield the time of every frame of the event pass, ns, and the events up to it."""
 
     @abstractmethod
-    def _truth(self, k: int, t_ns: int) -> GroundTruth: ...
+    def _truth(self, k: int, t_ns: int) -> GroundTruth:
+        """Return the ground truth of a label, by its number and time."""
 
     @abstractmethod
-    def _picture(self, t_ns: int) -> Picture: ...
+    def _picture(self, t_ns: int) -> Picture:
+        """Return the picture at a frame of the event pass."""

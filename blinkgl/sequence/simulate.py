@@ -103,6 +103,7 @@ class Simulation(Closing):
         self.t0_ns, self.t1_ns = spans[0] if spans else (self.config.time.t0_ns, self.config.time.t1_ns)
 
     def __getattr__(self, name: str) -> Any:
+        # Private names are Python's own questions, such as those of copy and pickle, and no camera's to answer.
         if name.startswith("_") or not self.members:
             raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
         return getattr(self.members[0], name)
@@ -134,6 +135,7 @@ class Simulation(Closing):
             waiting = [iter(member) for member in self.members]
             heads = [next(items, None) for items in waiting]
             while there := [(head.t_ns, k, head) for k, head in enumerate(heads) if head is not None]:
+                # Never by the items themselves, which have no order.
                 _, k, head = min(there, key=itemgetter(0, 1))
                 yield self.members[k], head
                 heads[k] = next(waiting[k], None)
@@ -163,6 +165,7 @@ class Simulation(Closing):
 
     @property
     def triangles(self) -> int:
+        # All draw the same scene: a sum would count it once for each camera.
         return max((member.triangles for member in self.members), default=0)
 
     @property

@@ -16,6 +16,7 @@ from blinkgl import cli
 from blinkgl.blender import importing, process
 from blinkgl.blender.importing import import_scene
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError, OutputError
+from tests.refusals import refusal
 
 WRITES = '(folder / "scene.glb").write_bytes(glb); say(report=REPORT)\n'
 
@@ -100,8 +101,7 @@ def test_no_bpy_says_how_to_get_it(blend, tmp_path, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert error.startswith("error: no bpy") and "pip install 'bpy>=4.5,<4.6'" in error and error.count("\n") == 1
     monkeypatch.setenv(process.ENVIRONMENT, str(tmp_path / "nothing"))
-    with pytest.raises(BlinkGLError, match="names no interpreter that runs"):
-        import_scene(blend, tmp_path / "out.glb")
+    refusal(BlinkGLError, import_scene, blend, tmp_path / "out.glb", match="names no interpreter that runs")
     bare.unlink()
     nothing_left(tmp_path, blend.name)
 

@@ -21,6 +21,7 @@ from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject
 from blinkgl.scene.worlds.random_world import random_world
 from blinkgl.tools.shader_debugger import reference
+from tests.refusals import refusal
 
 SIZE = {
     "width": 120,
@@ -160,8 +161,7 @@ def test_a_part_and_another_size_see_the_same(camera):
 )
 @every
 def test_what_no_camera_has(camera, changes, message):
-    with pytest.raises(ConfigError, match=f"^{type(camera).__name__}{message}"):
-        replace(camera, **changes)
+    refusal(ConfigError, replace, camera, match=f"^{type(camera).__name__}{message}", **changes)
 
 
 # ---- pin-hole, by hand ---------------------------------------------------------------------------------------------
@@ -221,10 +221,6 @@ def test_planes_touch_the_picture(camera):
         rays = camera.rays(side)
         nearest = (rays @ plane).min() / np.linalg.norm(rays, axis=1).max()
         assert abs(nearest) < 1e-12 if exact else -1e-12 < nearest < 0.1 / camera.fx
-
-
-def points_at(camera, xy, z=2.0):
-    return z * camera.rays(np.asarray(xy, np.float64))
 
 
 # --- A camera model that nothing but this file knows, and each part of it taken away in turn.

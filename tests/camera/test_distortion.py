@@ -35,6 +35,11 @@ def fisheye(name):
     return Equidistant(*size, 0.05, *k)
 
 
+def lens(camera):
+    """Matrix and coefficients, as OpenCV takes them."""
+    return camera.K, np.array(camera.distortion)
+
+
 def seen(camera, count=3000):
     """Points ahead of the camera (at least 5 degrees) whose pixels fill the picture."""
     dice = np.random.default_rng(0)
@@ -49,8 +54,7 @@ def seen(camera, count=3000):
 @pytest.mark.parametrize("name", CALIBRATIONS)
 def test_radtan_projects_as_opencv(name):
     camera, points = radtan(name), seen(radtan(name))
-    k = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
-    expected, slopes = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, k)
+    expected, slopes = cv2.projectPoints(points, np.zeros(3), np.zeros(3), *lens(camera))
     np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
     # OpenCV's derivative by the translation is ours by the point
     np.testing.assert_allclose(camera.jacobian(points).reshape(-1, 3), slopes[:, 3:6], rtol=1e-9, atol=1e-7)
@@ -60,20 +64,18 @@ def test_radtan_projects_as_opencv(name):
 def test_radtan_undistorts_as_opencv(name):
     camera = radtan(name)
     xy = camera.project(seen(camera))
-    k = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
     steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-15)
     if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
-        expected = cv2.undistortPointsIter(xy[:, None], camera.K, k, np.eye(3), np.eye(3), steps)[:, 0]
+        expected = cv2.undistortPointsIter(xy[:, None], *lens(camera), np.eye(3), np.eye(3), steps)[:, 0]
     else:
-        expected = cv2.undistortPoints(xy[:, None], camera.K, k, None, np.eye(3), np.eye(3), steps)[:, 0]
+        expected = cv2.undistortPoints(xy[:, None], *lens(camera), None, np.eye(3), np.eye(3), steps)[:, 0]
     np.testing.assert_allclose(camera.rays(xy)[:, :2], expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", FISHEYES)
 def test_equidistant_projects_as_opencv(name):
     camera, points = fisheye(name), seen(fisheye(name))
-    k = np.array([camera.k1, camera.k2, camera.k3, camera.k4])
-    expected, slopes = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.K, k)
+    expected, slopes = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), *lens(camera))
     np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
     ours = camera.jacobian(points).reshape(-1, 3)
     # f, c, k, rotation (3), translation (3), skew.
@@ -88,8 +90,7 @@ def test_equidistant_undistorts_as_opencv(name):
         points[:, 2] > 0.35 * np.linalg.norm(points, axis=1)
     ]  # 70 degrees: OpenCV's ten steps get no farther
     xy = camera.project(points)
-    k = np.array([camera.k1, camera.k2, camera.k3, camera.k4])
-    expected = cv2.fisheye.undistortPoints(xy[:, None], camera.K, k)[:, 0]
+    expected = cv2.fisheye.undistortPoints(xy[:, None], *lens(camera))[:, 0]
     rays = camera.rays(xy)
     np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], expected, atol=1e-6)
 

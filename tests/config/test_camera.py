@@ -56,7 +56,7 @@ def test_the_keys_are_the_models():
     ],
 )
 def test_what_cannot_be(keys, said):
-    assert said in refusal(camera, **keys)
+    assert said in refusal(ConfigError, camera, **keys)
 
 
 # ---- calibrations ---------------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def test_calibrations_of_others_project_as_opencv_does(tmp_path, name, text, D, 
 )  # fmt: skip
 def test_what_a_calibration_says_is_never_dropped(tmp_path, text, said):
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
-    line = refusal(read_camchain, tmp_path / "c.yaml")
+    line = refusal(ConfigError, read_camchain, tmp_path / "c.yaml")
     assert said in line and "c.yaml" in line
 
 
@@ -255,7 +255,7 @@ def test_calibrations_that_cannot_be(tmp_path, change, keys, said):
     (tmp_path / "k.yaml").write_text(KALIBR.replace(*change), encoding="utf-8")
     tree = {"calibration": "k.yaml", **keys}
     (tmp_path / "run.yaml").write_text(f"camera: {tree}", encoding="utf-8")
-    assert said in refusal(load_run, tmp_path / "run.yaml")
+    assert said in refusal(ConfigError, load_run, tmp_path / "run.yaml")
 
 
 WHOLE = "binning_x: 0\nbinning_y: 1\nroi: {x_offset: 0, y_offset: 0, height: 90, width: 120, do_rectify: true}\n"

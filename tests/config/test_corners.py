@@ -133,7 +133,7 @@ MIXED = [
 
 @pytest.mark.parametrize("tree, message", MIXED)
 def test_mixed_corners_are_refused_when_the_file_is_read(tree, message):
-    assert refusal(lambda: RunTemplate(tree, None).check()).startswith(message)
+    assert refusal(ConfigError, lambda: RunTemplate(tree, None).check()).startswith(message)
 
 
 @pytest.mark.parametrize(

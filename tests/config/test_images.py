@@ -80,7 +80,7 @@ def read(tmp_path, **changes):
     ],
 )
 def test_what_cannot_be_is_one_line(tmp_path, images, said):
-    assert refusal(read, tmp_path, images=images).startswith(said)
+    assert refusal(ConfigError, read, tmp_path, images=images).startswith(said)
 
 
 @pytest.mark.parametrize("preset", ["plain", "interpolation"])

@@ -229,7 +229,7 @@ def test_every_error_of_every_key_is_plain(monkeypatch, third):
 )
 def test_messages(tmp_path, text, message):
     (tmp_path / "run.yaml").write_text(text)
-    assert refusal(load_run, tmp_path / "run.yaml").startswith(message)
+    assert refusal(ConfigError, load_run, tmp_path / "run.yaml").startswith(message)
 
 
 def test_numbers_that_python_will_not_print():

@@ -122,7 +122,7 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
     ],
 )
 def test_bad_recipes(tmp_path, changes, message):
-    assert message in refusal(lambda: Plan.of(load(tmp_path, {**TREE, **changes})))
+    assert message in refusal(ConfigError, lambda: Plan.of(load(tmp_path, {**TREE, **changes})))
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_bad_recipes(tmp_path, changes, message):
 )
 def test_pools_that_cannot_serve_the_split(tmp_path, scene, message):
     made = Plan.of(load(tmp_path, {**TREE, "scene": {"kind": "random", **scene}}))
-    assert message in refusal(check_assets, made)
+    assert message in refusal(ConfigError, check_assets, made)
 
 
 def test_shares_are_dealt_out():

@@ -20,7 +20,7 @@ def read(text: str) -> SequenceConfig:
 
 
 def refused(text: str) -> str:
-    return refusal(read, text)
+    return refusal(ConfigError, read, text)
 
 
 def test_a_sensor_has_what_the_top_says_and_what_it_says_itself():

@@ -147,4 +147,4 @@ def test_events_of_a_sequence_come_through_its_optics():
     ],
 )
 def test_optics_that_no_lens_has_are_one_line(tree, words):
-    assert words in refusal(optics_of, **tree)
+    assert words in refusal(ConfigError, optics_of, **tree)

@@ -160,5 +160,5 @@ def test_what_is_not_taken_is_named():
     ],
 )
 def test_what_is_refused(source, problem):
-    line = refusal(blinkgl.Scene.from_pyrender, source(), 32, 24)
+    line = refusal(ConfigError, blinkgl.Scene.from_pyrender, source(), 32, 24)
     assert line.startswith("Scene.from_pyrender.scene: " + problem)

@@ -26,7 +26,7 @@ from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.scene.worlds.from_file import dressed, from_document
 from blinkgl.scene.worlds.pool import object_pool
 from tests.scene.gltf_oracle import Oracle, Surface, cast
-from tests.scene.peer_models import MODELS, PLAYED, Models, cube
+from tests.scene.peer_models import MODELS, Models, cube
 
 W, H, FOCAL = 64, 48, 55.0
 CAMERA = PinHole.centred(W, H, FOCAL, near=0.05)
@@ -54,14 +54,12 @@ def scenes(path, play: AnimationConfig | None):
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_is_drawn_as_its_file_says(name, gl, tmp_path):
-    builder, T = Models(), pose()
-    MODELS[name](builder)
-    (tmp_path / "a.glb").write_bytes(builder.glb())
-    clip = PLAYED.get(name)
-    at, to = (clip["at"], clip["to"]) if clip else (0.3, 0.36)
-    play = None if clip is None else AnimationConfig(loop=clip["loop"], speed=clip["speed"], phase=clip["phase"])
-    oracle = Oracle(builder.tree, builder.data, None if clip is None else 0)
-    now, then = (oracle.surfaces(t) for t in (clip["true"] if clip else (at, to)))
+    builder, T, model = Models(), pose(), MODELS[name]
+    model.build(builder)
+    path = builder.write(tmp_path / "a.glb")
+    at, to, play = model.at, model.to, model.play
+    oracle = Oracle(builder.tree, builder.data, None if play is None else 0)
+    now, then = (oracle.surfaces(t) for t in model.true or (at, to))
     y, x = np.mgrid[0:H, 0:W]
     rays = np.stack([(x - (W - 1) / 2) / FOCAL, (y - (H - 1) / 2) / FOCAL, np.ones((H, W))], axis=-1).reshape(-1, 3)
     seen = cast(oracle, now, T, rays @ T[:3, :3].T, CAMERA.near, culls=True)
@@ -82,7 +80,7 @@ def test_a_model_is_drawn_as_its_file_says(name, gl, tmp_path):
     colour = seen.colour.reshape(H, W, 3)
     spread = ndimage.maximum_filter(colour, (5, 5, 1)) - ndimage.minimum_filter(colour, (5, 5, 1))
     even = inner & (spread.max(axis=2) < 0.02)
-    for door, scene in zip(("scene", "mesh"), scenes(tmp_path / "a.glb", play), strict=True):
+    for door, scene in zip(("scene", "mesh"), scenes(path, play), strict=True):
         with Renderer(
             gl, replace(dressed(scene, unlit=True), background=0.0), RenderConfig(image_antialiasing="none")
         ) as r:

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,13 +32,19 @@ class GltfBuilder:
         self.data += raw
         return len(self.tree["bufferViews"]) - 1
 
-    def array(self, values, kind: str) -> int:
+    def array(self, values, kind: str, **more) -> int:
         values = np.ascontiguousarray(values)
         component = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}[values.dtype.str[1:]]
-        self.tree["accessors"].append(
-            {"bufferView": self.view(values.tobytes()), "componentType": component, "count": len(values), "type": kind}
-        )
+        accessor = {"bufferView": self.view(values.tobytes()), "componentType": component, "count": len(values)}
+        self.tree["accessors"].append({**accessor, "type": kind, **more})
         return len(self.tree["accessors"]) - 1
+
+    def strided(self, rows, *parts: dict) -> None:
+        """Accessors of three numbers each to one view of rows."""
+        view = self.view(rows.tobytes())
+        self.tree["bufferViews"][view]["byteStride"] = rows.strides[0]
+        for part in parts:
+            self.tree["accessors"].append({"bufferView": view, "count": len(rows), "type": "VEC3", **part})
 
     def mesh(self, vertices, faces, normals=None, uvs=None, material=None) -> int:
         attributes = {"POSITION": self.array(np.asarray(vertices, "f4"), "VEC3")}
@@ -48,7 +55,11 @@ class GltfBuilder:
         primitive = {"attributes": attributes, "indices": self.array(np.asarray(faces, "u4").ravel(), "SCALAR")}
         if material is not None:
             primitive["material"] = material
-        self.tree["meshes"].append({"primitives": [primitive]})
+        return self.primitive(**primitive)
+
+    def primitive(self, attributes: dict, **more) -> int:
+        """A mesh of one primitive."""
+        self.tree["meshes"].append({"primitives": [{"attributes": attributes, **more}]})
         return len(self.tree["meshes"]) - 1
 
     def node(self, root: bool = True, **fields) -> int:
@@ -57,6 +68,19 @@ class GltfBuilder:
             self.tree["scenes"][0]["nodes"].append(len(self.tree["nodes"]) - 1)
         return len(self.tree["nodes"]) - 1
 
+    def clip(self, node: int, path: str, times, values, kind: str | None = "LINEAR") -> int:
+        """One more channel of the animation.   times : or the number of the accessor that has them; it is returned."""
+        widths = {"rotation": "VEC4", "weights": "SCALAR"}
+        values = np.asarray(values, "f4")
+        values = values.reshape(-1, 1) if path == "weights" else values.reshape(-1, values.shape[-1])
+        clock = times if isinstance(times, int) else self.array(np.asarray(times, "f4"), "SCALAR")
+        sampler = {"input": clock, "output": self.array(values, widths.get(path, "VEC3"))}
+        (animation,) = self.tree.setdefault("animations", [{"channels": [], "samplers": []}])
+        animation["samplers"].append({**sampler, "interpolation": kind} if kind else sampler)
+        target = {"node": node, "path": path}
+        animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
+        return clock
+
     def glb(self) -> bytes:
         tree = {**self.tree, "buffers": [{"byteLength": len(self.data)}]} if self.data else self.tree
         text = json.dumps(tree).encode()
@@ -64,6 +88,11 @@ class GltfBuilder:
         binary = self.data + b"\0" * (-len(self.data) % 4)
         body = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
         return struct.pack("<III", 0x46546C67, 2, 12 + len(body)) + body
+
+    def write(self, path: Path) -> Path:
+        """Write a GLB, and return where."""
+        path.write_bytes(self.glb())
+        return path
 
     def gltf(self, folder, name="scene.gltf", uri="scene.bin"):
         (folder / uri).write_bytes(self.data) if ".." not in uri and not uri.startswith("/") else None
@@ -76,6 +105,21 @@ def triangle(builder: GltfBuilder, **options) -> int:
     return builder.mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], **options)
 
 
+def triangle_file(builder: GltfBuilder | None = None, tree: dict | None = None, **options) -> GltfBuilder:
+    """A file with a triangle at a node of its own.   tree : entries of its JSON."""
+    builder = builder or GltfBuilder()
+    builder.tree.update(tree or {})
+    builder.node(mesh=triangle(builder, **options))
+    return builder
+
+
+def textured_file(uri: str) -> GltfBuilder:
+    """A triangle whose colour is an image beside the file."""
+    surface = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    tree = {"materials": [surface], "images": [{"uri": uri}], "textures": [{"source": 0}]}
+    return triangle_file(tree=tree, uvs=[(0, 0), (1, 0), (0, 1)], material=0)
+
+
 def arm_file(kind="LINEAR", normalised=False, morphs=False, change=None) -> GltfBuilder:
     """A bar along y on two joints, the upper one of which turns about z and back in a second; its weights may be bytes,
     and a morph target may swell it."""
@@ -86,11 +130,11 @@ def arm_file(kind="LINEAR", normalised=False, morphs=False, change=None) -> Gltf
     mesh = builder.mesh(bar.vertices, bar.faces, normals=bar.normals)
     attributes = builder.tree["meshes"][mesh]["primitives"][0]["attributes"]
     attributes["JOINTS_0"] = builder.array(np.tile(np.array([0, 1, 0, 0], "u1"), (len(up), 1)), "VEC4")
-    attributes["WEIGHTS_0"] = builder.array(
-        np.round(weights * 255).astype("u1") if normalised else weights.astype("f4"), "VEC4"
+    attributes["WEIGHTS_0"] = (
+        builder.array(np.round(weights * 255).astype("u1"), "VEC4", normalized=True)
+        if normalised
+        else builder.array(weights.astype("f4"), "VEC4")
     )
-    if normalised:
-        builder.tree["accessors"][attributes["WEIGHTS_0"]]["normalized"] = True
     if morphs:
         swell = builder.array((bar.vertices * [0.5, 0, 0]).astype("f4"), "VEC3")
         builder.tree["meshes"][mesh]["primitives"][0]["targets"] = [{"POSITION": swell}]
@@ -102,17 +146,13 @@ def arm_file(kind="LINEAR", normalised=False, morphs=False, change=None) -> Gltf
         {"joints": [lower, upper], "inverseBindMatrices": builder.array(bind.reshape(2, 16), "MAT4")}
     ]
     node = builder.node(name="bar", mesh=mesh, skin=0, translation=[9, 9, 9])  # which a skin ignores
-    times, turns = np.array([0, 0.5, 1], "f4"), np.array(TURNS, "f4")
+    turns = np.array(TURNS)
     if kind == "CUBICSPLINE":
-        turns = np.stack([0 * turns, turns, 0 * turns], axis=1).reshape(-1, 4)
-    samplers = [
-        {"input": builder.array(times, "SCALAR"), "output": builder.array(turns, "VEC4"), "interpolation": kind},
-    ]
-    channels = [{"sampler": 0, "target": {"node": upper, "path": "rotation"}}]
+        turns = np.stack([0 * turns, turns, 0 * turns], axis=1)
+    times = builder.clip(upper, "rotation", [0, 0.5, 1], turns, kind)
     if morphs:
-        samplers.append({"input": samplers[0]["input"], "output": builder.array(np.array([0, 1, 0], "f4"), "SCALAR")})
-        channels.append({"sampler": 1, "target": {"node": node, "path": "weights"}})
-    builder.tree["animations"] = [{"name": "wave", "samplers": samplers, "channels": channels}]
+        builder.clip(node, "weights", times, [0, 1, 0], None)
+    builder.tree["animations"][0]["name"] = "wave"
     if change is not None:
         change(builder)
     return builder

@@ -16,7 +16,8 @@ from blinkgl.scene.importing import gltf, gltf_schema as schema
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.worlds.from_file import from_document
 from blinkgl.scene.worlds.pool import object_pool
-from tests.scene.gltf_files import GltfBuilder, triangle
+from tests.refusals import refusal
+from tests.scene.gltf_files import GltfBuilder, triangle, triangle_file
 
 CAMERA = CameraConfig(width=64, height=48).model
 MATT = {"metallicFactor": 0}
@@ -34,25 +35,21 @@ def said(path, **options) -> list[str]:
     return lines[0].partition(": ")[2].split("; ") if lines else []
 
 
-def glb(tmp_path, material=None, *, change=None, uvs=((0, 0), (1, 0), (0, 1)), image=False, **arrays):
+def glb(tmp_path, material=None, *, change=None, uvs=((0, 0), (1, 0), (0, 1)), image=False, samplers=None, **arrays):
     """A triangle of this material (its texture, if ``image``, in a buffer), written to a.glb."""
     builder = GltfBuilder()
     if material is not None:
         builder.tree["materials"] = [material]
     if image:
         builder.tree["images"] = [{"bufferView": builder.view(png(tmp_path))}]
-        builder.tree["textures"] = [
-            {"source": 0, **({"sampler": 0} if "samplers" in (image if isinstance(image, dict) else {}) else {})}
-        ]
-        if isinstance(image, dict):
-            builder.tree.update(image)
+        builder.tree["textures"] = [{"source": 0, **({"sampler": 0} if samplers else {})}]
+        builder.tree.update({"samplers": samplers} if samplers else {})
     builder.node(mesh=triangle(builder, uvs=uvs, material=None if material is None else 0))
     for name, (values, kind) in arrays.items():
         builder.tree["meshes"][0]["primitives"][0]["attributes"][name] = builder.array(values, kind)
     if change:
         change(builder.tree)
-    (tmp_path / "a.glb").write_bytes(builder.glb())
-    return tmp_path / "a.glb"
+    return builder.write(tmp_path / "a.glb")
 
 
 TEXTURED = {"pbrMetallicRoughness": {**MATT, "baseColorTexture": {"index": 0}}}
@@ -92,7 +89,7 @@ def test_materials(tmp_path, material, expected):
     ],
 )
 def test_samplers(tmp_path, sampler, uvs, expected):
-    assert said(glb(tmp_path, TEXTURED, image={"samplers": [sampler]}, uvs=uvs)) == expected
+    assert said(glb(tmp_path, TEXTURED, image=True, samplers=[sampler], uvs=uvs)) == expected
 
 
 def test_vertex_colours(tmp_path):
@@ -178,9 +175,7 @@ def test_extensions_that_are_used(tmp_path):
 )
 def test_an_extension_that_makes_another_scene_is_refused_when_required(tmp_path, extension):
     path = glb(tmp_path, change=lambda t: t.update(extensionsUsed=[extension], extensionsRequired=[extension]))
-    with pytest.raises(AssetError) as error:
-        load_asset(path)
-    assert str(error.value).startswith(
+    assert refusal(AssetError, load_asset, path).startswith(
         f"{path}: the file needs the extension {extension}, which BlinkGL does not draw; expected a glTF 2.0 export"
     )
 
@@ -198,10 +193,9 @@ def test_a_scene_names_the_cameras_and_clips_that_it_does_not_use(tmp_path):
     ]
     for k in range(2):
         builder.node(camera=k)
-    builder.node(mesh=triangle(builder))
-    builder.tree["animations"] = [{"name": name, "channels": [], "samplers": []} for name in ("walk", "run")]
-    (tmp_path / "s.glb").write_bytes(builder.glb())
-    read = lambda **chosen: from_document(gltf.read(tmp_path / "s.glb"), CAMERA, 0, 10**9, **chosen).omissions
+    clips = [{"name": name, "channels": [], "samplers": []} for name in ("walk", "run")]
+    path = triangle_file(builder, {"animations": clips}).write(tmp_path / "s.glb")
+    read = lambda **chosen: from_document(gltf.read(path), CAMERA, 0, 10**9, **chosen).omissions
     (line,) = read()
     assert "animations beside 'walk' (scene.animation chooses one of: walk, run)" in line
     assert (
@@ -249,19 +243,16 @@ def test_draco_beside_plain_geometry_is_ignored(tmp_path):
             t["accessors"][0].pop("bufferView"),
         ),
     )
-    with pytest.raises(AssetError, match="needs the extension KHR_draco_mesh_compression"):
-        load_asset(path)
+    refusal(AssetError, load_asset, path, match="needs the extension KHR_draco_mesh_compression")
 
 
 def test_meshopt_without_a_fallback_is_named(tmp_path):
-    builder = GltfBuilder()
-    builder.node(mesh=triangle(builder))
+    builder = triangle_file()
     builder.tree["buffers"] = [
         {"byteLength": len(builder.data), "extensions": {"EXT_meshopt_compression": {"fallback": True}}}
     ]
     (tmp_path / "a.gltf").write_text(json.dumps(builder.tree))
-    with pytest.raises(AssetError, match="needs the extension EXT_meshopt_compression"):
-        load_asset(tmp_path / "a.gltf")
+    refusal(AssetError, load_asset, tmp_path / "a.gltf", match="needs the extension EXT_meshopt_compression")
 
 
 # --- What a glTF file leaves out is as the specification says, and what it may say has an end.

@@ -22,6 +22,7 @@ from blinkgl.config.run import load_run
 from blinkgl.front.runs import configured
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.motion.paths import smoothed
+from tests.refusals import refusal
 
 EPOCH = 1_403_636_579_758_555_392
 RNG = np.random.default_rng
@@ -79,11 +80,23 @@ def table(titles: str, rows, separator: str) -> str:
     return titles + "\n" * bool(titles) + "\n".join(separator.join(f"{v:.9f}" for v in row) for row in rows) + "\n"
 
 
+def read_of(folder, name: str, text: str, **options):
+    """Times, poses and notes of a file with this text."""
+    (folder / name).write_text(text)
+    notes = []
+    return (*read_trajectory(folder / name, notes=notes, **options), notes)
+
+
 def poses_of(T: np.ndarray, order: str) -> np.ndarray:
     """(N, 7): the columns that ``order`` names."""
     by = dict(zip(("x", "y", "z"), T[:, :3, 3].T))
     by |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(T[:, :3, :3]).as_quat().T))
     return np.stack([by[name] for name in order.split()], axis=1)
+
+
+def named(T: np.ndarray) -> str:
+    """Poses in seconds, with a heading."""
+    return table("#t[s] x y z qx qy qz qw", np.column_stack([T_S, poses_of(T, "x y z qx qy qz qw")]), " ")
 
 
 @pytest.mark.parametrize("separator", [" ", ", ", ",", "\t", ";"])
@@ -103,19 +116,18 @@ def poses_of(T: np.ndarray, order: str) -> np.ndarray:
     ],
 )  # fmt: skip
 def test_a_heading_says_order_and_unit_whatever_separates(tmp_path, titles, order, unit, scale, separator):
-    T, notes = circle(T_S), []
+    T = circle(T_S)
     rows = np.column_stack([T_S * scale, poses_of(T, order)])
-    (tmp_path / "t.txt").write_text(table(titles.format(f" [{unit}]"), rows, separator))
-    t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
+    t_ns, read, notes = read_of(tmp_path, "t.txt", table(titles.format(f" [{unit}]"), rows, separator))
     assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7) and notes == []
     # Without a unit: asked for, and what is declared counts.
     times = np.round(T_S * 1e9).astype(np.int64) * int(scale) // 10**9 if unit != "s" else np.round(T_S, 2)
     text = "\n".join(separator.join([f"{t}", *(f"{v:.9f}" for v in row)]) for t, row in zip(times, rows[:, 1:]))
-    (tmp_path / "t.txt").write_text(f"{titles.format('')}\n{text}\n")
+    text = f"{titles.format('')}\n{text}\n"
     if "p_RS_R_x" not in titles and "# timestamp{}, x" not in titles:
         with pytest.raises(AssetError, match=r"no unit of the times is stated .*; try time_unit: (s|us) if"):
-            read_trajectory(tmp_path / "t.txt")
-    t_ns, read = read_trajectory(tmp_path / "t.txt", time_unit=unit, notes=notes)
+            read_of(tmp_path, "t.txt", text)
+    t_ns, read, notes = read_of(tmp_path, "t.txt", text, time_unit=unit)
     assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7) and notes == []
 
 
@@ -141,18 +153,17 @@ EUROC = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x
 )
 def test_layouts_that_are_known_by_name(tmp_path, heading, times, order, said):
     """All others are asked for, with what to paste, which reads the very file."""
-    T, notes = np.tile(np.eye(4), (40, 1, 1)), []
+    T = np.tile(np.eye(4), (40, 1, 1))
     T[:, 0, 3], T[:, :3, :3] = T_S, Rotation.from_rotvec(np.outer(T_S, (0, 0, 1))).as_matrix()
     stamps = [f"{round(t * 1e9)}" if times == "ns" else times.format(t * (1e6 if ".0f" in times else 1)) for t in T_S]
     rows = [" ".join([stamp, *map("{:.9f}".format, row)]) for stamp, row in zip(stamps, poses_of(T, order))]
-    (tmp_path / "t.txt").write_text("\n".join([heading, *rows]) + "\n")
+    text = "\n".join([heading, *rows]) + "\n"
     if said is None:
-        with pytest.raises(AssetError, match="no heading names|no unit of the times"):
-            read_trajectory(tmp_path / "t.txt")
+        refusal(AssetError, read_of, tmp_path, "t.txt", text, match="no heading names|no unit of the times")
         unit = "ns" if times == "ns" else "us" if ".0f" in times else "s"
-        t_ns, read = read_trajectory(tmp_path / "t.txt", columns=f"t {order}", time_unit=unit)
+        t_ns, read, _ = read_of(tmp_path, "t.txt", text, columns=f"t {order}", time_unit=unit)
     else:
-        t_ns, read = read_trajectory(tmp_path / "t.txt", notes=notes)
+        t_ns, read, notes = read_of(tmp_path, "t.txt", text)
         assert len(notes) == 1 and said in notes[0]
     assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-7)
 
@@ -173,32 +184,25 @@ def test_other_programs_files(tmp_path):
     for k in reversed(range(len(T))):
         numbers = " ".join(f"{v:.9f}" for v in poses_of(inverse[k : k + 1], "qw qx qy qz x y z")[0])
         lines += [f"{k + 1} {numbers} 1 frame_{k}.png", "1.0 2.0 -1"]
-    (tmp_path / "images.txt").write_text("\n".join(lines))
-    assert np.allclose(read_trajectory(tmp_path / "images.txt", rate=50)[1], T, atol=1e-6)
+    assert np.allclose(read_of(tmp_path, "images.txt", "\n".join(lines), rate=50)[1], T, atol=1e-6)
     opengl = T @ np.diag([1, -1, -1, 1.0])
     frames = [{"file_path": f"./r_{k}", "time": t, "transform_matrix": one.tolist()} for k, (t, one) in
               enumerate(zip(T_S.tolist(), opengl))]  # fmt: skip
-    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
-    notes = []
-    t_ns, read = read_trajectory(tmp_path / "transforms.json", notes=notes)
+    tree = {"camera_angle_x": 0.7, "frames": frames}
+    t_ns, read, notes = read_of(tmp_path, "transforms.json", json.dumps(tree))
     assert np.allclose(t_ns, T_S * 1e9, atol=2) and np.allclose(read, T, atol=1e-9) and "opengl" in notes[0]
     # x forwards, y right, z down: OpenCV's z, x, y.
     ned = T.copy()
     ned[:, :3, :3] = T[:, :3, :3] @ np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
     rows = poses_of(ned, "x y z qx qy qz qw")
-    (tmp_path / "pose_left.txt").write_text(table("", rows, " "))
-    assert np.allclose(read_trajectory(tmp_path / "pose_left.txt", rate=50)[1], T, atol=1e-6)
-    (tmp_path / "w2c.txt").write_text(table("#t[s] x y z qx qy qz qw", np.column_stack(
-        [T_S, poses_of(inverse, "x y z qx qy qz qw")]), " "))  # fmt: skip
-    assert np.allclose(read_trajectory(tmp_path / "w2c.txt", maps_from="world")[1], T, atol=1e-6)
+    assert np.allclose(read_of(tmp_path, "pose_left.txt", table("", rows, " "), rate=50)[1], T, atol=1e-6)
+    assert np.allclose(read_of(tmp_path, "w2c.txt", named(inverse), maps_from="world")[1], T, atol=1e-6)
 
 
 def test_a_camera_at_three_hundred_metres_a_second_is_said(tmp_path):
-    T, notes = np.tile(np.eye(4), (40, 1, 1)), []
+    T = np.tile(np.eye(4), (40, 1, 1))
     T[:, 0, 3] = T_S * 300
-    (tmp_path / "t.txt").write_text(table("#t[s] x y z qx qy qz qw", np.column_stack(
-        [T_S, poses_of(T, "x y z qx qy qz qw")]), " "))  # fmt: skip
-    read_trajectory(tmp_path / "t.txt", notes=notes)
+    *_, notes = read_of(tmp_path, "t.txt", named(T))
     assert notes == ["t.txt: the body moves at 300 units/s: another unit of time or length? (time_unit)"]
 
 
@@ -232,8 +236,7 @@ def test_an_object_flies_it_and_from_yaml(flight):
     made = sequence_scene(config, 0, flight)
     assert np.allclose(made.objects[0].path.pose(123_000_000), circle(np.array([0.123]))[0], atol=1e-6)
     (flight / "tum.txt").unlink()
-    with pytest.raises(ConfigError, match=r"scene\.objects\.0\.trajectory\.file: no such file"):
-        check_assets(config.scene, flight)
+    refusal(ConfigError, check_assets, config.scene, flight, match=r"scene\.objects\.0\.trajectory\.file: no such file")
 
 
 def test_smoothing_takes_noise_away_and_no_line_off_its_way():
@@ -283,30 +286,24 @@ GOOD = "0.000000 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 0 1\n0.3 1 2 3 
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
-    (tmp_path / "t.txt").write_text(text)
-    with pytest.raises(AssetError) as error:
-        read_trajectory(tmp_path / "t.txt")
-    assert said in str(error.value) and "\n" not in str(error.value) and "t.txt" in str(error.value)
+    message = refusal(AssetError, read_of, tmp_path, "t.txt", text)
+    assert said in message and "t.txt" in message
 
 
 def test_what_a_sequence_cannot_have(flight, tmp_path):
     with pytest.raises(ConfigError, match="does not cover the sequence"):
         record(scene(Trajectory(flight / "tum.txt", start=EPOCH * 1e-9 + 1.4)))
-    with pytest.raises(ConfigError, match="no such file"):
-        record(scene(Trajectory(flight / "missing.txt")))
-    with pytest.raises(ConfigError, match=r"Trajectory\.form"):
-        Trajectory("x", form="vins")
+    refusal(ConfigError, Trajectory, flight / "missing.txt", match="no such file")
+    refusal(ConfigError, Trajectory, "x", form="vins", match=r"Trajectory\.form")
     for wrong in ({"form": "vins"}, {"axes": "enu"}, {"maps_from": "here"}, {"time_unit": "h"}, {"columns": "t x y z"}):
-        with pytest.raises(ConfigError, match=next(iter(wrong))):
-            read_trajectory(flight / "tum.txt", **wrong)
+        refusal(ConfigError, read_trajectory, flight / "tum.txt", match=next(iter(wrong)), **wrong)
     with pytest.raises(ConfigError, match="times do not increase"):
         write_trajectory(tmp_path / "x.txt", np.array([2, 1]), circle(np.zeros(2)))
     (flight / "c.yaml").write_text(
         "scene: {kind: explicit, meshes: {ball: {primitive: sphere}}, objects: [{mesh: ball}],"
         " camera: {position: [-5, 0, 0], trajectory: {file: tum.txt}}}\n"
     )
-    with pytest.raises(ConfigError, match="give a trajectory, a fixed pose or keyframes"):
-        load_run(flight / "c.yaml")
+    refusal(ConfigError, load_run, flight / "c.yaml", match="give a trajectory, a fixed pose or keyframes")
 
 
 SENSOR = """# General sensor definitions.
@@ -387,17 +384,12 @@ def test_a_place_on_the_body_that_is_none():
 
 def test_what_goes_faster_than_anything_flies_is_refused(tmp_path):
     t_ns, T = EPOCH + np.arange(151) * 10_000_000, circle(np.arange(151) * 0.01)
-    flip = np.diag([-1.0, 1, -1, 1])
-    for name, changed in (("mm", T.copy()), ("jump", T.copy()), ("turned", T.copy()), ("later", T.copy())):
-        if name == "mm":
-            changed[:, :3, 3] *= 1000
-        elif name == "jump":
-            changed[20:, 2, 3] += 1.5
-        elif name == "turned":
-            changed[20:] = changed[20:] @ flip
-        else:
-            changed[100:, 2, 3] += 1.5  # which the sequence does not see
-        write_trajectory(tmp_path / name, t_ns, changed)
+    after = lambda k, factor: np.where(np.arange(151)[:, None, None] < k, np.eye(4), factor)
+    up = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]])
+    write_trajectory(tmp_path / "mm", t_ns, T * np.array([[1, 1, 1, 1000]] * 3 + [[1] * 4]))
+    write_trajectory(tmp_path / "jump", t_ns, after(20, up) @ T)
+    write_trajectory(tmp_path / "turned", t_ns, T @ after(20, np.diag([-1.0, 1, -1, 1])))
+    write_trajectory(tmp_path / "later", t_ns, after(100, up) @ T)  # which the sequence does not see
     for name, key, value in (
         ("mm", "speed_limit", "2000 units/s"),
         ("jump", "speed_limit", "150 units/s at 0.19 s"),
@@ -422,18 +414,16 @@ def test_a_heading_states_the_unit_of_positions(tmp_path, unit, metres):
     x, y, z, w = Rotation.from_matrix(T[:, :3, :3]).as_quat().T
     rows = [f"t [s],x{unit},y{unit},z{unit},qw,qx,qy,qz,vx,fov"]
     rows += [f"{k / 10},{T[k, 0, 3]},{T[k, 1, 3]},0,{w[k]},{x[k]},{y[k]},{z[k]},1,60" for k in range(5)]
-    (tmp_path / "p.csv").write_text("\n".join(rows))
-    notes = []
-    _, poses = read_trajectory(tmp_path / "p.csv", notes=notes)
+    _, poses, notes = read_of(tmp_path, "p.csv", "\n".join(rows))
     assert np.abs(poses[:, :3, 3] - T[:, :3, 3] * metres).max() < 1e-9
     assert "p.csv: left out: columns that are no pose: vx, fov" in notes
 
 
 @pytest.mark.parametrize("axes", ["x[ft],y[ft],z[ft]", "x[m],y[mm],z[m]", "x[m],y,z"])
 def test_other_units_of_positions_are_refused(tmp_path, axes):
-    (tmp_path / "p.csv").write_text(f"t[s],{axes},qw,qx,qy,qz\n" + "".join(f"{k},0,0,0,1,0,0,0\n" for k in range(3)))
+    text = f"t[s],{axes},qw,qx,qy,qz\n" + "".join(f"{k},0,0,0,1,0,0,0\n" for k in range(3))
     with pytest.raises(AssetError, match="no such unit of positions.*m, cm, mm or km of all three"):
-        read_trajectory(tmp_path / "p.csv")
+        read_of(tmp_path, "p.csv", text)
 
 
 def test_frames_without_times_follow_their_names(tmp_path):
@@ -444,9 +434,7 @@ def test_frames_without_times_follow_their_names(tmp_path):
     ]
     order = RNG(0).permutation(12)
     tree = {"frames": [frames[k] for k in order], "applied_scale": 0.5, "scale": 1}
-    (tmp_path / "transforms.json").write_text(json.dumps(tree))
-    notes = []
-    _, poses = read_trajectory(tmp_path / "transforms.json", rate=10, notes=notes)
+    _, poses, notes = read_of(tmp_path, "transforms.json", json.dumps(tree), rate=10)
     assert np.abs(poses - T).max() < 1e-9
     assert "transforms.json: applied_scale, scale: not applied, poses are as in the file" in notes
     assert "transforms.json: frames in the order of their names" in notes
@@ -456,9 +444,7 @@ def test_poses_of_several_cameras_are_said(tmp_path):
     rows = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for k in range(4):
         rows += [f"{k} 1 0 0 0 {k} 0 0 {k % 2} cam{k % 2}_{k}.png", "0 0 -1"]
-    (tmp_path / "images.txt").write_text("\n".join(rows) + "\n")
-    notes = []
-    read_trajectory(tmp_path / "images.txt", rate=10, notes=notes)
+    *_, notes = read_of(tmp_path, "images.txt", "\n".join(rows) + "\n", rate=10)
     assert "images.txt: poses of 2 cameras, read as one path" in notes
 
 
@@ -466,8 +452,7 @@ def test_poses_of_several_cameras_are_said(tmp_path):
 def test_frames_of_nerf_by_any_spelling_of_their_names(tmp_path, start):
     T = circle(np.arange(11) * 0.1) @ np.diag([1, -1, -1, 1])
     frames = [{"file_path": f"{start}train/r_{k}", "transform_matrix": T[k].tolist()} for k in range(11)]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames[::-1]}))
-    _, poses = read_trajectory(tmp_path / "transforms.json", rate=10)
+    _, poses, _ = read_of(tmp_path, "transforms.json", json.dumps({"frames": frames[::-1]}), rate=10)
     assert np.abs(poses - circle(np.arange(11) * 0.1)).max() < 1e-9
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{**frame, "file_path": "a"} for frame in frames]}))
-    assert len(read_trajectory(tmp_path / "transforms.json", rate=10)[1]) == 11
+    alike = json.dumps({"frames": [{**frame, "file_path": "a"} for frame in frames]})
+    assert len(read_of(tmp_path, "transforms.json", alike, rate=10)[1]) == 11

@@ -17,6 +17,7 @@ from blinkgl.gl import create_context
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
 from blinkgl.sequence import SequenceRequest, simulate_sequence
+from tests.refusals import refusal
 
 C, EPS = 0.2, 1e-3
 WALL = {"mesh": "wall", "position": [4, 0, 0], "scale": 20.0}
@@ -149,18 +150,20 @@ def test_four_blinking_leds_are_told_apart_by_their_frequencies():
     assert sequence.lights()["names"].tolist() == [f"led {f}" for f in rates]
 
 
+NOISELESS = {
+    "rate": 20,
+    "response": "linear",
+    "bits": 16,
+    "white": 0.4,
+    "black": 0,
+    "photon_noise": False,
+    "read_noise": 0,
+}
+
+
 def test_an_exposure_has_the_integral_of_the_light():
     """One instant suffices for a still picture, however often the light jumps in it."""
-    images = {
-        "rate": 20,
-        "exposure_us": 7300,
-        "noisy": False,
-        "response": "linear",
-        "bits": 16,
-        "white": 0.4,
-        "black": 0,
-    }
-    images = {k: v for k, v in images.items() if k != "noisy"} | {"photon_noise": False, "read_noise": 0}
+    images = {**NOISELESS, "exposure_us": 7300}
     config = config_of({"light": {"sky": 0.4, "over_time": PWM}}, images=images, labels={"flow": [], "images": False})
     sequence = simulate_sequence(SequenceRequest(config, 0, events=False)).alone
     taken = [item for item in sequence if type(item).__name__ == "CameraImage"]
@@ -172,8 +175,7 @@ def test_an_exposure_has_the_integral_of_the_light():
 
 
 def test_rows_of_a_rolling_shutter_see_the_light_of_their_own_time():
-    images = {"rate": 20, "exposure_us": 400, "row_us": 100, "response": "linear", "bits": 16, "white": 0.4, "black": 0}
-    images |= {"photon_noise": False, "read_noise": 0}
+    images = {**NOISELESS, "exposure_us": 400, "row_us": 100}
     slow = {"kind": "pwm", "frequency": 500, "duty": 0.5}
     scene = {"light": {"sky": 0.4, "over_time": slow}}
     config = config_of(scene, images=images, camera={"width": 8, "height": 48}, labels={"flow": [], "images": False})
@@ -201,8 +203,7 @@ def test_a_scene_in_python_has_the_same_limit():
     scene = Scene(
         Camera(16, 12, pose=Pose((-3, 0, 0))), light=Light(0, 0.3, over_time=wave), duration=0.1, label_rate=20
     )
-    with pytest.raises(ConfigError, match="the light changes too often"):
-        record(scene + Primitive("cuboid"), labels=[])
+    refusal(ConfigError, record, scene + Primitive("cuboid"), labels=[], match="the light changes too often")
 
 
 def test_many_changes_are_said_before_anything_is_drawn(tmp_path):
@@ -225,6 +226,4 @@ def test_many_changes_are_said_before_anything_is_drawn(tmp_path):
     ],
 )
 def test_what_no_light_can_do_is_one_line(scene, words):
-    with pytest.raises(ConfigError) as caught:
-        sequence_scene(config_of(scene), 0)
-    assert words in str(caught.value) and "\n" not in str(caught.value)
+    assert words in refusal(ConfigError, lambda: sequence_scene(config_of(scene), 0))

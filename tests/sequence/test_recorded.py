@@ -13,6 +13,7 @@ from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.sequence import GroundTruth, simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
+from tests.refusals import refusal
 
 H, W, N, FPS = 6, 8, 5, 20
 
@@ -107,8 +108,7 @@ def test_times_of_frames_do_not_drift(clip, fps):
 
 @pytest.mark.parametrize("given", [{"window_ns": (0, 1)}, {"scene": object()}, {"renderer": object()}])
 def test_nothing_is_drawn_of_them(clip, given):
-    with pytest.raises(ConfigError, match="frames: recorded frames are not drawn"):
-        opened(clip, **given)
+    refusal(ConfigError, opened, clip, match="frames: recorded frames are not drawn", **given)
 
 
 @pytest.mark.parametrize(
@@ -129,8 +129,7 @@ def test_nothing_is_drawn_of_them(clip, given):
 def test_a_flow_file_for_every_pair_that_is_used(clip, gone, frames, said):
     (clip / f"flow/{gone}.npy").unlink()
     if said:
-        with pytest.raises(AssetError, match=said):
-            opened(clip, frames=frames)
+        refusal(AssetError, opened, clip, frames=frames, match=said)
     else:
         number = frames.get("first", 0) + 1
         assert truths(opened(clip, frames=frames))[0].frame.forward.flow[0, 0, 0] == number
@@ -148,8 +147,7 @@ def test_frames_too_far_apart_are_refused(clip):
 @pytest.mark.parametrize("what, shape", [("flow", (H, W + 1, 2)), ("flow", (W, H, 2)), ("mask", (H + 1, W))])
 def test_labels_of_another_size_are_named(clip, what, shape):
     np.save(clip / f"flow/2_{what}.npy", np.zeros(shape, np.float32 if what == "flow" else np.uint8))
-    with pytest.raises(AssetError, match=rf"2_{what}.npy: {what} and image differ in size"):
-        list(opened(clip))
+    refusal(AssetError, list, opened(clip), match=rf"2_{what}.npy: {what} and image differ in size")
 
 
 def test_one_folder_serves_every_sequence_and_several_one_each(clip):
@@ -163,9 +161,7 @@ def test_one_folder_serves_every_sequence_and_several_one_each(clip):
     assert [opened(clip, k, **both).folder.name for k in (0, 1)] == ["clip", "other"]
     assert opened(clip, 1, **both).config.frames.folders == ("other",), "its own configuration names its own folder"
     assert opened(clip, 1, **both).height == 4
-    with pytest.raises(ConfigError, match="2 folders are too few for sequence 2"):
-        opened(clip, 2, **both)
+    refusal(ConfigError, opened, clip, 2, match="2 folders are too few for sequence 2", **both)
     with pytest.raises(ConfigError, match=r"frames.folders.1: no such folder \(got 'no\*'\)"):
         opened(clip, 0, folders=("clip", "no*"))
-    with pytest.raises(ConfigError, match="no folders of frames"):
-        opened(clip, 0, folders=())
+    refusal(ConfigError, opened, clip, 0, folders=(), match="no folders of frames")

@@ -104,19 +104,14 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
     for name in ("luminance", "colour", "labels", "velocity", "velocity_of_movers"):
         spy(name, getattr(Renderer, name))
     made = {}
-    for name, wanted in (
-        ("everything", {"pictures_hz": 40}),
-        ("events", {"labels": False}),
-        ("labels", {"events": False}),
+    for name, wanted, expected in (
+        ("everything", {"pictures_hz": 40}, {"luminance", "colour", "labels"}),
+        ("events", {"labels": False}, {"luminance"}),
+        ("labels", {"events": False}, {"colour", "labels"}),
     ):
         drawn.clear()
         made[name] = list(simulate_sequence(SequenceRequest(config, 0, **wanted), gl))
-        expected = {
-            "everything": {"luminance", "colour", "labels"},
-            "events": {"luminance"},
-            "labels": {"colour", "labels"},
-        }
-        assert set(drawn) == expected[name], "the timeline draws nothing"
+        assert set(drawn) == expected, "the timeline draws nothing"
     assert_same(events_of(made["everything"]), events_of(made["events"]))
     assert not events_of(made["labels"]).t.size
     for a, b in zip((i for i in made["everything"] if isinstance(i, GroundTruth)), made["labels"], strict=True):

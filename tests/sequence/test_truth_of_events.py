@@ -25,6 +25,7 @@ from blinkgl.front.runs import configured
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.request import SequenceRequest
 from blinkgl.types.events import Cause, Events
+from tests.refusals import refusal
 
 SQUARES = np.where(((np.indices((64, 64)) // 8).sum(0) % 2)[..., None], (230, 200, 60), (40, 60, 110)).astype(np.uint8)
 CAMERA = Camera(72, 48, fov=60, pose=look_at((-3, 0, 0), (0, 0, 0)))
@@ -108,8 +109,7 @@ def test_the_events_are_those_that_come_without_it():
 
 def test_what_has_no_place_for_it_says_so(tmp_path):
     scene = apart()
-    with pytest.raises(ConfigError, match="a label of events has no value at a time"):
-        render_frame(scene, 0.0, labels=["events"])
+    refusal(ConfigError, render_frame, scene, 0.0, labels=["events"], match="a label of events has no value at a time")
     events = record(scene, labels=["events"]).events
     with pytest.raises(OutputError, match="event files cannot store what caused the events"):
         write_events(tmp_path / "e.h5", events, 48, 72)

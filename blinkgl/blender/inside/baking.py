@@ -262,6 +262,7 @@ def bake(clock: Clock, owners: set[str], room: float) -> tuple[list[Track], dict
         room += track.size
         track.add(frame, matrix, points, form)
         room -= track.size
+        # The largest gives way first, so that the many small ones stay as they are.
         while room < 0 and not (largest := max(tracks.values(), key=lambda track: track.size)).over:
             room += largest.size
             largest.thin()

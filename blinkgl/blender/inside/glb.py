@@ -25,6 +25,7 @@ def write(path: Path, tree: dict, binary: bytearray) -> None:
     if binary:
         tree.setdefault("buffers", [{}])[0]["byteLength"] = len(binary)
     text = json.dumps(tree, separators=(",", ":")).encode()
+    # By the standard, chunks are of whole words, and text is filled up with spaces.
     text += b" " * (-len(text) % 4)
     parts = [struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), bytes(binary)]
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + sum(map(len, parts))) + b"".join(parts))
@@ -50,6 +51,7 @@ def add_keys(
     animation = tree.setdefault("animations", [{"name": "Scene", "channels": [], "samplers": []}])[0]
     shape = {"rotation": "VEC4", "weights": "SCALAR"}.get(path, "VEC3")
     accessors = [add_values(tree, binary, *one) for one in ((np.array(times), "SCALAR"), (values, shape))]
+    # The standard asks for the ends of a sampler's times, as the float32 that they have become.
     tree["accessors"][accessors[0]] |= {"min": [float(np.float32(times[0]))], "max": [float(np.float32(times[-1]))]}
     animation["samplers"].append({"input": accessors[0], "output": accessors[1], "interpolation": kind})
     aim = {"sampler": len(animation["samplers"]) - 1, "target": {"node": node, "path": path}}

@@ -92,8 +92,7 @@ def _values(distance: Callable[[np.ndarray], np.ndarray], grid: np.ndarray, step
     # Each block of four points per side is tested at its middle.
     shape, middles = grid.shape[:3], [np.minimum(np.arange(2, n + 4, 4), n - 1) for n in grid.shape[:3]]
     coarse = distance(grid[np.ix_(*middles)].reshape(-1, 3)).reshape([len(m) for m in middles])
-    blocks = [np.arange(n) // 4 for n in shape]
-    values = coarse[np.ix_(*blocks)]
+    values = coarse[np.ix_(*(np.arange(n) // 4 for n in shape))]
     # Values change by at most 1.2 per unit: farther than 1.2 diagonals of a block the sign is certain.
     near = np.abs(values) < 1.2 * 4 * math.sqrt(3) * step
     values[near] = distance(grid[near])
@@ -101,8 +100,7 @@ def _values(distance: Callable[[np.ndarray], np.ndarray], grid: np.ndarray, step
 
 
 def _gradient(distance: Callable[[np.ndarray], np.ndarray], points: np.ndarray, h: float) -> np.ndarray:
-    steps = np.eye(3) * h
-    return np.stack([(distance(points + e) - distance(points - e)) / (2 * h) for e in steps], axis=1)
+    return np.stack([(distance(points + e) - distance(points - e)) / (2 * h) for e in h * np.eye(3)], axis=1)
 
 
 ATLAS = 1.5
@@ -172,6 +170,9 @@ class _Piece(NamedTuple):
         radius = self.radii[0] + (self.radii[1] - self.radii[0]) * t
         # At most the distance in space that is not scaled.
         return (np.linalg.norm(p - t[:, None] * along, axis=1) - radius) * min(*self.flat, 1.0)
+
+
+_ROUND = (1.0, 1.0)
 
 
 @lru_cache(maxsize=64)
@@ -279,40 +280,41 @@ def _bind(body: Proportions) -> np.ndarray:
 
 def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
     """Return the capsules of an average body's bones. Positions are m in the joint's frame."""
+    sole = body.ankle
+    # Joint, both ends, both radii, flatness.
+    middle = (
+        ("pelvis", (-0.005, 0, -0.055), (0, 0, 0.04), (0.118, 0.112), (0.92, 1.30)),
+        ("pelvis", (-0.045, 0.06, -0.06), (-0.045, -0.06, -0.06), (0.083, 0.083), _ROUND),
+        ("spine", (0.0, 0, 0), (0.002, 0, 0.12), (0.106, 0.112), (0.88, 1.22)),
+        ("chest", (0.0, 0, 0.02), (-0.005, 0, 0.15), (0.120, 0.108), (0.90, 1.40)),
+        ("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), (0.056, 0.052), _ROUND),
+        ("head", (0.012, 0, 0.085), (0.002, 0, 0.115), (0.082, 0.095), (1.08, 0.84)),
+        ("head", (0.035, 0, 0.012), (0.03, 0, 0.07), (0.048, 0.062), (1.0, 0.92)),
+        ("head", (0.10, 0, 0.055), (0.09, 0, 0.085), (0.014, 0.008), _ROUND),  # the nose
+    )
+    left = (
+        ("head", (0.0, 0.078, 0.06), (-0.006, 0.082, 0.085), (0.016, 0.018), (1, 0.6)),
+        ("clavicle", (-0.005, 0, -0.035), (-0.005, 0.12, -0.02), (0.066, 0.060), _ROUND),
+        ("arm", (-0.004, 0, -0.005), (0, 0, -0.27), (0.060, 0.043), _ROUND),
+        ("forearm", (0, 0, -0.005), (0, 0, -0.23), (0.042, 0.029), _ROUND),
+        ("hand", (0, 0, -0.02), (0.004, 0, -0.085), (0.029, 0.033), (1.25, 0.62)),
+        ("hand", (0.006, 0, -0.09), (0.002, 0, -0.155), (0.030, 0.022), (1.2, 0.5)),
+        ("hand", (0.02, 0, -0.03), (0.05, 0, -0.085), (0.015, 0.012), _ROUND),  # the thumb
+        ("thigh", (0.0, 0, -0.02), (0.004, 0, -0.40), (0.089, 0.057), _ROUND),
+        ("shank", (0.002, 0, 0), (0, 0, -0.38), (0.055, 0.037), _ROUND),
+        ("shank", (-0.018, 0, -0.09), (-0.014, 0, -0.18), (0.047, 0.040), _ROUND),  # the calf
+        ("foot", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), (0.042, 0.043), (1, 0.92)),
+        ("foot", (0, 0, -0.01), (0.03, 0, 0.042 - sole), (0.040, 0.043), (1, 0.92)),
+        ("foot", (0.04, 0, 0.037 - sole), (0.125, 0, 0.028 - sole), (0.041, 0.034), (1, 1.15)),
+        ("toes", (0.005, 0, 0.008), (0.045, 0, 0.004), (0.032, 0.027), (1, 1.35)),
+    )
     made = []
-
-    def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
-        T = bind[J[joint]]
-        start, end = (T[:3, :3] @ np.array(p) + T[:3, 3] for p in (a, b))
-        made.append(_Piece(J[joint], start, end, (r0, r1), flat))
-
-    add("pelvis", (-0.005, 0, -0.055), (0, 0, 0.04), 0.118, 0.112, (0.92, 1.30))
-    add("pelvis", (-0.045, 0.06, -0.06), (-0.045, -0.06, -0.06), 0.083, 0.083)
-    add("spine", (0.0, 0, 0), (0.002, 0, 0.12), 0.106, 0.112, (0.88, 1.22))
-    add("chest", (0.0, 0, 0.02), (-0.005, 0, 0.15), 0.120, 0.108, (0.90, 1.40))
-    add("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), 0.056, 0.052)
-    add("head", (0.012, 0, 0.085), (0.002, 0, 0.115), 0.082, 0.095, (1.08, 0.84))
-    add("head", (0.035, 0, 0.012), (0.03, 0, 0.07), 0.048, 0.062, (1.0, 0.92))
-    # The nose.
-    add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008)
-    for side, sign in (("l", 1.0), ("r", -1.0)):
-        sole = body.ankle
-        add("head", (0.0, sign * 0.078, 0.06), (-0.006, sign * 0.082, 0.085), 0.016, 0.018, (1, 0.6))
-        add(f"clavicle_{side}", (-0.005, 0, -0.035), (-0.005, sign * 0.12, -0.02), 0.066, 0.060)
-        add(f"arm_{side}", (-0.004, 0, -0.005), (0, 0, -0.27), 0.060, 0.043)
-        add(f"forearm_{side}", (0, 0, -0.005), (0, 0, -0.23), 0.042, 0.029)
-        add(f"hand_{side}", (0, 0, -0.02), (0.004, 0, -0.085), 0.029, 0.033, (1.25, 0.62))
-        add(f"hand_{side}", (0.006, 0, -0.09), (0.002, 0, -0.155), 0.030, 0.022, (1.2, 0.5))
-        # The thumb.
-        add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012)
-        add(f"thigh_{side}", (0.0, 0, -0.02), (0.004, 0, -0.40), 0.089, 0.057)
-        add(f"shank_{side}", (0.002, 0, 0), (0, 0, -0.38), 0.055, 0.037)
-        # The calf.
-        add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040)
-        add(f"foot_{side}", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), 0.042, 0.043, (1, 0.92))
-        add(f"foot_{side}", (0, 0, -0.01), (0.03, 0, 0.042 - sole), 0.040, 0.043, (1, 0.92))
-        add(f"foot_{side}", (0.04, 0, 0.037 - sole), (0.125, 0, 0.028 - sole), 0.041, 0.034, (1, 1.15))
-        add(f"toes_{side}", (0.005, 0, 0.008), (0.045, 0, 0.004), 0.032, 0.027, (1, 1.35))
+    for side, sign, capsules in (("", 1.0, middle), ("_l", 1.0, left), ("_r", -1.0, left)):
+        for name, a, b, radii, flat in capsules:
+            joint = J[name if name in J else name + side]
+            T = bind[joint]
+            start, end = (T[:3, :3] @ (np.array(p) * [1, sign, 1]) + T[:3, 3] for p in (a, b))
+            made.append(_Piece(joint, start, end, radii, flat))
     return made
 
 

@@ -12,6 +12,7 @@ from blinkgl.config.deform import DeformConfig, FlagConfig
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.figure import body_of
 from blinkgl.scene.geometry.meshes import bounds, subdivided, weld
+from blinkgl.scene.geometry.polygons import face_cross
 from blinkgl.scene.geometry.primitives import Surface, join, lattice, primitive, square
 from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
 from blinkgl.scene.shapes.gait import PARENTS, Proportions, clip_of
@@ -112,8 +113,7 @@ def fish(
     faces = lattice(segments, rings)[:, ::-1]
     flat = positions.reshape(-1, 3)
     # Triangles that collapse there are removed.
-    corners = flat[faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = face_cross(flat, faces)
     faces, area = (a[np.linalg.norm(area, axis=1) > 1e-12 * length**2] for a in (faces, area))
     uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), s[:, None]), axis=2).reshape(-1, 2)
     # A wave that runs down the body, a little longer than it.

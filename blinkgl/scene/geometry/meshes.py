@@ -11,8 +11,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.polygons import face_cross
 from blinkgl.scene.shapes.sweep import filled
-from blinkgl.scene.types import Deformer, Mesh, Scene
+from blinkgl.scene.types import Deformer, Mesh, Scene, SceneObject
 from blinkgl.types.poses import pose_of
 
 CREASE_DEGREES = 40.0
@@ -167,37 +168,24 @@ def faces_in_float32(mesh: Mesh) -> np.ndarray:
 def without_collapsed_faces(scene: Scene) -> Scene:
     """Return the scene without the faces that are lines in float32 (:func:`faces_in_float32`), with a line in its log
     that counts them; the scene itself when there are none."""
-    made: dict[int, Mesh | None] = {}  # id of a mesh -> the mesh without them; None: nothing is left
-    objects, dropped = [], 0
-    for obj in scene.objects:
-        parts = []
-        for part in obj.parts:
-            if id(part.mesh) not in made:
-                kept = faces_in_float32(part.mesh)
-                faces = part.mesh.faces[kept]
-                made[id(part.mesh)] = (
-                    part.mesh if kept.all() else replace(part.mesh, faces=faces) if len(faces) else None
-                )
-            mesh = made[id(part.mesh)]
-            dropped += len(part.mesh.faces) - (0 if mesh is None else len(mesh.faces))
-            if mesh is not None:
-                parts.append(part if mesh is part.mesh else replace(part, mesh=mesh))
-        objects.append(
-            obj
-            if len(parts) == len(obj.parts) and all(a is b for a, b in zip(parts, obj.parts))
-            else replace(obj, parts=tuple(parts))
-        )
+    # By identity, so that parts that share a mesh share what is left of it.
+    meshes = {id(part.mesh): part.mesh for obj in scene.objects for part in obj.parts}
+    kept = {key: faces_in_float32(mesh) for key, mesh in meshes.items()}
+    made = {
+        key: mesh if kept[key].all() else replace(mesh, faces=mesh.faces[kept[key]]) for key, mesh in meshes.items()
+    }
+    dropped = sum(int((~kept[id(part.mesh)]).sum()) for obj in scene.objects for part in obj.parts)
     if not dropped:
         return scene
-    return replace(
-        scene, objects=tuple(objects), log=(*scene.log, f"{dropped} triangles without width in float32 are not drawn")
-    )
 
+    def drawn(obj: SceneObject) -> SceneObject:
+        if all(kept[id(part.mesh)].all() for part in obj.parts):
+            return obj
+        parts = (replace(part, mesh=made[id(part.mesh)]) for part in obj.parts if kept[id(part.mesh)].any())
+        return replace(obj, parts=tuple(parts))
 
-def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (F, 3) outward vectors of twice the area."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
+    log = (*scene.log, f"{dropped} triangles without width in float32 are not drawn")
+    return replace(scene, objects=tuple(map(drawn, scene.objects)), log=log)
 
 
 def _usable_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> bool:
@@ -266,7 +254,7 @@ def crease_normals(
     """Return (F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point
     that are joined by edges bent less than ``crease_degrees``; with (F,) ``groups`` instead by edges between two faces
     of one smoothing group, 0: of none."""
-    unit = _face_cross(vertices, faces)
+    unit = face_cross(vertices, faces)
     unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-300)
     fan = _fans(welded, unit, crease_degrees, groups)
     angle = corner_angles(vertices[faces])
@@ -323,7 +311,7 @@ def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None =
     low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
     size = float((high - low).max()) if uv_size is None else float(uv_size)
     centred = (vertices[faces] - (low + high) / 2) / max(size, 1e-300)
-    normal = _face_cross(vertices, faces)
+    normal = face_cross(vertices, faces)
     axis = np.abs(normal).argmax(axis=1)
     sign = np.where(np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0, -1, 1)
     uvs = np.empty((len(faces), 3, 2))
@@ -340,7 +328,7 @@ def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> 
     a, b, c = (uvs[faces[:, i]] for i in range(3))
     # Twice the area of each triangle in the texture.
     uv_area = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
-    area = np.linalg.norm(_face_cross(vertices, faces), axis=1)
+    area = np.linalg.norm(face_cross(vertices, faces), axis=1)
     return bool(area[uv_area < 1e-10].sum() > 0.5 * area.sum())
 
 

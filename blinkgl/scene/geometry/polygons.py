@@ -54,6 +54,12 @@ def _fans(points: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.stack([first, rows[:, 1:-1], rows[:, 2:]], axis=2), fits
 
 
+def face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return (F, 3) vectors of twice the area of (F, 3) faces, outwards as they are wound."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
 def _ears(points: np.ndarray) -> np.ndarray:
     """Return (T, 3) indices of the triangles of one polygon, (n, 3), seen along the axis that is nearest its normal."""
     import mapbox_earcut
@@ -63,8 +69,7 @@ def _ears(points: np.ndarray) -> np.ndarray:
     axis = int(np.abs(normal).argmax())
     seen = np.delete(flat, axis, axis=1) / (np.abs(flat).max() or 1.0)
     ears = mapbox_earcut.triangulate_float64(seen, np.array([len(seen)], np.uint32)).reshape(-1, 3).astype(np.int64)
-    a, b, c = (flat[ears[:, k]] for k in range(3))
     # Triangles have the winding that is seen along the axis, which may be opposite to the polygon's.
-    behind = (np.cross(b - a, c - a) @ normal) < 0
+    behind = (face_cross(flat, ears) @ normal) < 0
     ears[behind] = ears[behind, ::-1]
     return ears

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from blinkgl.config.primitives import PRIMITIVES, PrimitiveKind
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import closedness, make_mesh, quartered, weld
+from blinkgl.scene.geometry.polygons import face_cross
 from blinkgl.scene.shapes.gait import CLIPS
 from blinkgl.scene.types import Deformer, Mesh
 
@@ -69,7 +70,8 @@ class Builder(Protocol):
     checked: Callable[..., inspect.BoundArguments]
     at_level: Callable[..., Mesh] | None
 
-    def __call__(self, **parameters: object) -> Mesh: ...
+    def __call__(self, **parameters: object) -> Mesh:
+        """Return the mesh with these parameters."""
 
 
 BUILDERS: dict[str, Builder] = {}
@@ -323,8 +325,7 @@ def point() -> Surface:
     at a distance of d focal lengths, in px, it adds emission / d² to the sum of its pixels."""
     ball = _ball(1.0, 2)
     # Cauchy: the mean silhouette of a convex body is a quarter of its surface.
-    corners = ball[0][ball[3]]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 8
+    area = np.linalg.norm(face_cross(ball[0], ball[3]), axis=1).sum() / 8
     return ball[0] * math.sqrt(POINT_AREA / area), *ball[1:]
 
 

@@ -64,12 +64,9 @@ def _fish(dice: _Dice) -> Mesh:
     return living.fish(deep=deep, tempo=tempo, phase=dice.phase(), coat=dice.index)
 
 
-def _cuboid(dice: _Dice) -> Mesh:
-    return solids.cuboid(extents=[dice.between(0.25, 1) for _ in range(3)], subdivisions=2)
-
-
+# A kind draws its numbers in this order: another one would be other bodies under the same hashes.
 RANDOM: dict[str, Callable[[_Dice], Mesh]] = {
-    "cuboid": _cuboid,
+    "cuboid": lambda dice: solids.cuboid(extents=[dice.between(0.25, 1) for _ in range(3)], subdivisions=2),
     "cylinder": lambda dice: solids.cylinder(radius=0.5, height=dice.between(0.3, 3)),
     "sphere": lambda dice: _flattened(solids.sphere(), dice),
     "icosphere": lambda dice: _flattened(solids.icosphere(subdivisions=dice.whole(1, 4)), dice),

@@ -25,11 +25,11 @@ Motion = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
 class Animation:
-    """A clip of a file with its timing. document : whose nodes move.   skeleton : all of its nodes, in the file's
-    world."""
+    """A clip of a file, ``tracks``, with its timing, ``playing``. document : whose nodes move.   skeleton : all of its
+    nodes, in the file's world."""
 
     def __init__(self, document: gltf.Document, tracks: list[Track], playing: Playing):
-        self.document, self.tracks, self._playing, self._places = document, tracks, playing, document.places
+        self.document, self.tracks, self.playing, self._places = document, tracks, playing, document.places
         self._tries: dict[tuple[int, int], list[np.ndarray]] = {}
         self.skeleton: Skeleton = document.skeleton(Clip(document.rest(), tracks, playing))
         self._moved: dict[int, list[Track]] = {}
@@ -38,19 +38,11 @@ class Animation:
 
     def moves(self, node: int) -> bool:
         """Return whether a node or one of its ancestors is moved."""
-        return any(self._places[step] in self._moved for step in self._chain(node))
-
-    def _chain(self, node: int) -> list[int]:
-        """Return a node and its ancestors."""
-        chain, step = [], node
-        while step is not None:
-            chain.append(step)
-            step = self.document.nodes[step].parent
-        return chain
+        return any(self._places[step] in self._moved for step in self.document.chain(node))
 
     def tracks_of(self, node: int) -> list[Track]:
         """Return the tracks that move a node or one of its ancestors."""
-        return [track for step in self._chain(node) for track in self._moved.get(self._places[step], ())]
+        return [track for step in self.document.chain(node) for track in self._moved.get(self._places[step], ())]
 
     def motion(self, node: int, turn: np.ndarray, before: np.ndarray) -> Motion:
         """Return the function that gives (turn @ T @ before, its rate), ((4, 4), (4, 4) 1/s), of a node's transform T
@@ -70,20 +62,6 @@ class Animation:
             times = (t0_ns + round((0.618033988749895 * k % 1) * (t1_ns - t0_ns)) for k in range(32))
             self._tries[t0_ns, t1_ns] = [self.skeleton.at(t)[0] for t in times]
         return [world[self._places[node]] for world in self._tries[t0_ns, t1_ns]]
-
-    @property
-    def span_ns(self) -> int:
-        """Return the time after which the clip repeats itself, or does not change any more."""
-        return self._playing.span_ns
-
-    @property
-    def timescale_ns(self) -> int:
-        """Return the time in which no velocity changes much: half of that between the closest key frames."""
-        return self._playing.timescale_ns(self.tracks)
-
-    def jumps(self, t0_ns: int, t1_ns: int) -> list[int]:
-        """Return the times in (t0, t1), ns, after which a track jumps."""
-        return self._playing.jumps(self.tracks, t0_ns, t1_ns)
 
     def deformer(
         self,
@@ -130,7 +108,7 @@ class Animation:
         if raw.targets is None:
             return None
         positions, normals = raw.targets
-        place, playing = self._places[node], self._playing
+        place, playing = self._places[node], self.playing
         mine = [t for t in self.tracks if t.joint == place and t.path == "weights"]
         whole = self.document.morph_weights(node, max(len(positions), 1))
         # Entry 1 of a cubic key is its value; 0 and 2 are tangents.
@@ -163,7 +141,9 @@ class Animation:
 def play(document: gltf.Document, config: AnimationConfig, base: Path, where: str) -> Animation:
     """Return a file's animation as configured. where : key of the configuration.
     Raises ConfigError (a missing clip or file) and AssetError (an invalid clip)."""
-    theirs = _source(document, config.file, base, f"{where}.file")
+    theirs = document
+    if config.file is not None:
+        theirs = gltf.read(existing(config.file, base, f"{where}.file", "a gltf or glb file"), materials=False)
     names = clip_names(theirs)
     index = names.index(config.clip) if config.clip in names else config.clip
     if not isinstance(index, int) or not 0 <= index < len(names):
@@ -179,13 +159,6 @@ def play(document: gltf.Document, config: AnimationConfig, base: Path, where: st
     first = float(min(0.0, *(t[0] for t in times))) if times else 0.0
     last = float(max(first, *(t[-1] for t in times))) if times else 0.0
     return Animation(document, tracks, Playing(first, last, config.speed, config.phase - first, config.loop))
-
-
-def _source(document: gltf.Document, file: str | None, base: Path, where: str) -> gltf.Document:
-    """Return the document with the clips: ``document``, or another file."""
-    if file is None:
-        return document
-    return gltf.read(existing(file, base, where, "a gltf or glb file"), materials=False)
 
 
 def meshes_at_rest(document: gltf.Document, node: int) -> tuple[list[RawMesh], np.ndarray]:

@@ -10,6 +10,7 @@ are collected in :attr:`Document.omissions`.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -82,29 +83,30 @@ class Document:
         defaults filled in."""
         extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
         table = gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights).lights
-        lights: dict[int, Tree] = {}
-        for index in (index for index, node in self.nodes.items() if node.visible):
-            if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
-                number = index_of(reference.get("light"), len(table), "lights", self.where)
-                lights[index] = table[number].model_dump()
-        return lights
+        extensions = {i: self.tree["nodes"][i].get("extensions", {}) for i, node in self.nodes.items() if node.visible}
+        lights = {i: own[_LIGHTS].get("light") for i, own in extensions.items() if own.get(_LIGHTS) is not None}
+        return {i: table[index_of(n, len(table), "lights", self.where)].model_dump() for i, n in lights.items()}
 
     # ---- geometry
     def world(self, node: int) -> np.ndarray:
         """Return the rest transform of a node to the file's world, (4, 4)."""
         T = np.eye(4)
+        for step in self.chain(node):
+            T = self.nodes[step].local() @ T
+        return T
+
+    def chain(self, node: int) -> Iterator[int]:
+        """Yield a node and its ancestors."""
         step: int | None = node
         while step is not None:
-            T = self.nodes[step].local() @ T
+            yield step
             step = self.nodes[step].parent
-        return T
 
     def raw_meshes(self, mesh: int) -> list[RawMesh]:
         """Return the triangles of a mesh in its own coordinates, one entry per primitive, with bindings to joints and
         morph targets; points and lines are left out."""
         primitives = item(self.tree, "meshes", mesh, self.where)["primitives"]
-        made = [self._primitive(primitive, mesh) for primitive in primitives]
-        return [raw for raw in made if raw is not None]
+        return [raw for one in primitives if (raw := self._primitive(one, mesh)) is not None]
 
     def _primitive(self, primitive: dict, mesh: int) -> RawMesh | None:
         """Return one primitive of a mesh; None: it has no visible surface."""
@@ -208,15 +210,7 @@ class Document:
         """Return the displacements of a morph target, (count, 3); 0 without them."""
         if name not in target:
             return np.zeros((count, 3))
-        a = item(self.tree, "accessors", target[name], self.where)
-        if a["count"] != count or a["type"] != "VEC3":
-            raise AssetError(
-                f"a morph target has another size than its mesh ({name})",
-                where=self.where,
-                value=f"{a['count']} {a['type']}",
-                accepted=f"{count} VEC3",
-            )
-        values = self.accessor(target[name]).astype(np.float64)
+        values = self._sized(target[name], count, 3, f"a morph target has another size than its mesh ({name})")
         if not (np.abs(values) <= 1e12).all():  # NaN compares false
             raise AssetError(f"a morph target is not a number, or beyond 1e12 ({name})", where=self.where)
         return values
@@ -286,18 +280,18 @@ class Document:
         return np.array(weights, np.float64)
 
     def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
-        """Return an attribute, (count, width) float64, None without it. Its length is checked before it is read."""
-        if name not in primitive["attributes"]:
-            return None
-        index = primitive["attributes"][name]
+        """Return an attribute, (count, width) float64, None without it."""
+        index = primitive["attributes"].get(name)
+        problem = f"the file is no valid glTF ({name} does not fit the positions)"
+        return None if index is None else self._sized(index, count, width, problem)
+
+    def _sized(self, index: int, count: int, width: int, problem: str) -> np.ndarray:
+        """Return an accessor's values, (count, width) float64. Raises AssetError with this ``problem`` where it has
+        another size, before it is read: a file may declare any."""
         a = item(self.tree, "accessors", index, self.where)
         if a["count"] != count or _WIDTHS[a["type"]] != width:
-            raise AssetError(
-                f"the file is no valid glTF ({name} does not fit the positions)",
-                where=self.where,
-                value=f"{a['count']} {a['type']}",
-                accepted=f"{count} VEC{width}",
-            )
+            has, accepted = f"{a['count']} {a['type']}", f"{count} VEC{width}"
+            raise AssetError(problem, where=self.where, value=has, accepted=accepted)
         return self.accessor(index).astype(np.float64)
 
     def _coloured(
@@ -455,8 +449,7 @@ def read(
         near.omissions.unknown("properties", unknown)
         buffers = buffers_of(tree, binary, near)
         made = Materials(tree, buffers, near, max_texture, materials)
-        document = Document(path, tree, buffers, made, near.omissions, log=near.log)
-        document.nodes = nodes_of(tree, where)
+        document = Document(path, tree, buffers, made, near.omissions, nodes_of(tree, where), near.log)
         _check_faces(document, max_faces)
         for name in dict.fromkeys([*tree.get("extensionsUsed", []), *_extensions(tree)]):
             # Extensions of materials and textures are reported where one is used, and lights by kind.
@@ -482,19 +475,13 @@ def _extensions(tree: Any) -> Iterator[str]:
 def _check_faces(document: Document, max_faces: int) -> None:
     """Check the number of triangles of the scene, from the accessors' counts (for every node that shows a mesh)."""
     tree, where = document.tree, document.where
-    per_mesh = {}
-    for node in document.nodes.values():
-        if not node.shows:
-            continue
-        if node.mesh not in per_mesh:
-            total = 0
-            for primitive in item(tree, "meshes", node.mesh, where)["primitives"]:
-                position = primitive["attributes"].get("POSITION")
-                vertices = item(tree, "accessors", position, where)["count"] if position is not None else 0
-                corners = vertices
-                if "indices" in primitive:
-                    corners = item(tree, "accessors", primitive["indices"], where)["count"]
-                # A strip or a fan has a triangle for every corner after the second.
-                total += max(corners, vertices) // (3 if primitive.get("mode", 4) == 4 else 1)
-            per_mesh[node.mesh] = total
-    limit_faces(sum(per_mesh[n.mesh] for n in document.nodes.values() if n.shows), max_faces, where)
+
+    def triangles(primitive: dict) -> int:
+        references = primitive["attributes"].get("POSITION"), primitive.get("indices")
+        counts = [item(tree, "accessors", one, where)["count"] for one in references if one is not None]
+        # A strip or a fan has a triangle for every corner after the second.
+        return max(counts, default=0) // (3 if primitive.get("mode", 4) == 4 else 1)
+
+    meshes = Counter(node.mesh for node in document.nodes.values() if node.shows)
+    primitives = {mesh: item(tree, "meshes", mesh, where)["primitives"] for mesh in meshes}
+    limit_faces(sum(times * sum(map(triangles, primitives[mesh])) for mesh, times in meshes.items()), max_faces, where)

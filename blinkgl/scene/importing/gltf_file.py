@@ -69,6 +69,7 @@ def parse(data: bytes, where: str) -> tuple[dict, bytes, list[str]]:
 def _number(text: str) -> float:
     """Return a number of JSON, in which 36.0 is a whole one."""
     number = float(text)
+    # Up to 2^53 every whole number is one float; beyond, a float stands for several.
     return int(number) if abs(number) < 2**53 and number == int(number) else number
 
 

@@ -104,9 +104,8 @@ class Materials:
             base = _Place.of(next((one for one in (rough, bumps, emissive) if one), {}))
         strength = m.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         red, green, blue = (float(c * strength) for c in m.get("emissiveFactor", (0, 0, 0)))
-        emission = red, green, blue
-        if any(emission):
-            material = replace(material, emission=emission, emission_map=self._map(emissive, base, "colour"))
+        if red or green or blue:
+            material = replace(material, emission=(red, green, blue), emission_map=self._map(emissive, base, "colour"))
         # The standard's defaults are a rough metal: metallic is 1 unless given.
         metallic, roughness = (min(float(pbr.get(f"{key}Factor", 1)), 1.0) for key in ("metallic", "roughness"))
         if metallic > 0 or roughness < 1 or rough:
@@ -150,13 +149,9 @@ class Materials:
         if place.coordinates != base.coordinates:
             self.omissions.add("maps on a second set of texture coordinates (left out)")
             return None
-        whole = np.eye(3)
-        own, first = (whole if one.matrix is None else one.matrix for one in (place, base))
-        if abs(np.linalg.det(first)) < 1e-12:
-            at = own
-        else:
-            # The mesh's coordinates already include the first texture's transform, which is undone here.
-            at = own @ np.linalg.inv(first)
+        own, first = (np.eye(3) if one.matrix is None else one.matrix for one in (place, base))
+        # The mesh's coordinates already include the first texture's transform, which is undone here.
+        at = own if abs(np.linalg.det(first)) < 1e-12 else own @ np.linalg.inv(first)
         a, b, c, d, e, f = (float(v) for v in np.round(at[:2], 12).ravel())
         return Map(texture, (a, b, c, d, e, f), self._wraps(info["index"]))
 

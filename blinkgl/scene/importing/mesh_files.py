@@ -215,6 +215,7 @@ def identity_of(path: Path, data: bytes, border: Path | None = None, materials: 
         files[name] = content_hash(shape[-1])
     for name, file in kind.beside(data, near) if kind and materials else ():
         key = name if file is None else Path(os.path.relpath(file, path.parent)).as_posix()
+        # An image that several materials wear is read once.
         looks[key] = "missing" if file is None else looks.get(key) or content_hash(contents(file, "file"))
     rows = [f"{name} {digest}".encode() for name, digest in looks.items()]
     return Identity(files | looks, content_hash(*shape), content_hash(*shape, *rows))
@@ -300,5 +301,6 @@ def bytes_of(asset: Asset) -> int:
     """Return the bytes of an asset's meshes and textures."""
     meshes = [part.mesh for part in asset.parts]
     own = sum(a.nbytes for m in meshes for a in (m.vertices, m.faces, m.normals, m.uvs))
+    # Parts share textures, which count once.
     worn = {id(part.material.texture): part.material.texture for part in asset.parts}
     return own + sum(texture.image.nbytes for texture in worn.values() if texture is not None)

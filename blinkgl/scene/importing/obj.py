@@ -113,10 +113,6 @@ def _polygons(data: bytes, near: Neighbours, max_texture: int | None) -> tuple[P
         if (have >= 6).any():
             codes = np.where((have >= 6)[:, None], vertices[:-1, 3:6], np.nan)
             colours = linear_colours(codes, near, None, vertices[:-1][have >= 7, 6])[at]
-    surfaces, groups = (
-        (surfaces if max_texture is not None else surfaces * 0),
-        smoothing if statements.grouped else None,
-    )
     polygons = Polygons(
         points=vertices[:-1, :3],
         places=at,
@@ -124,8 +120,8 @@ def _polygons(data: bytes, near: Neighbours, max_texture: int | None) -> tuple[P
         uvs=uvs,
         normals=normals,
         colours=colours,
-        surfaces=surfaces,
-        smoothing=groups,
+        surfaces=surfaces if max_texture is not None else surfaces * 0,
+        smoothing=smoothing if statements.grouped else None,
         lines=lines,
     )
     return polygons, materials
@@ -323,11 +319,11 @@ def _surface(
             unknown[key[:20]] = None
         elif _MTL.get(key):
             near.omissions.add(_MTL[key])
-    numbers = {}
-    for key in (key for key in ("d", "tr") if key in entries):
-        rest, file, line = entries[key]
-        # With -halo the opacity depends on the viewing angle; its factor is taken as a plain opacity.
-        numbers[key] = _numbers(rest.removeprefix("-halo"), 1, file, line)[0]
+    # With -halo the opacity depends on the viewing angle; its factor is taken as a plain opacity.
+    stated = {key: entries[key] for key in ("d", "tr") if key in entries}
+    numbers = {
+        key: _numbers(rest.removeprefix("-halo"), 1, file, line)[0] for key, (rest, file, line) in stated.items()
+    }
     # Tr is 1 - d by some exporters and d by others: it hides nothing.
     opacity, scale, offset = numbers.get("d", 0.5 if 0 < numbers.get("tr", 1) < 1 else 1), np.ones(2), np.zeros(2)
     if opacity < 1:

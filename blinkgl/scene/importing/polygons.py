@@ -11,7 +11,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import MAX_COORDINATE, crease_normals, weld
-from blinkgl.scene.geometry.polygons import triangulate
+from blinkgl.scene.geometry.polygons import face_cross, triangulate
 from blinkgl.scene.importing.neighbours import Neighbours
 from blinkgl.scene.importing.parts import INVISIBLE, RawMesh, tinted
 from blinkgl.scene.reading import Omissions, contents, limit_faces
@@ -73,8 +73,7 @@ def raw_meshes(
         del inner, welded, points, made
     assert normals is not None
     # Both sides are drawn; which one is the front, for light, the normals say where they contradict the winding.
-    a, b, c = (given.points[at[:, k]] for k in range(3))
-    behind = (np.cross(b - a, c - a) * normals.sum(axis=1)).sum(axis=1) < 0
+    behind = (face_cross(given.points, at) * normals.sum(axis=1)).sum(axis=1) < 0
     for array in (triangles, at, normals):
         array[behind] = array[behind, ::-1]
     # v upwards becomes v downwards.
@@ -82,7 +81,6 @@ def raw_meshes(
     surfaces = np.zeros(len(at), np.int64) if given.surfaces is None else given.surfaces[owner]
     mapped = 0 if uvs is None else np.isfinite(uvs[triangles]).all(axis=(1, 2))
     kind = np.asarray(2 * surfaces + 1 - mapped)  # odd: without coordinates
-    # The sort puts the triangles of a mesh together; it is stable, so they keep the file's order.
     # One raw mesh for each material and for each of the two kinds of coordinates; faces keep the file's order.
     order, raws = np.argsort(kind, kind="stable"), []
     for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():

@@ -162,11 +162,8 @@ def _off_colours(specs: Sequence[Sequence[str]], near: Neighbours) -> np.ndarray
 
 def check_kind(data: bytes, max_faces: int, where: str) -> None:
     """Check what an stl, off or 3mf file says about its size. Raises AssetError: truncated, or too many faces."""
-    {"stl": _check_stl, "3mf": _check_3mf, "off": _check_off}[where.lower()[-3:]](data, max_faces, where)
-
-
-def _check_off(data: bytes, max_faces: int, where: str) -> None:
-    limit_faces(off_counts(data, where)[2], max_faces, where)
+    of_off = lambda data, max_faces, where: limit_faces(off_counts(data, where)[2], max_faces, where)
+    {"stl": _check_stl, "3mf": _check_3mf, "off": of_off}[where.lower()[-3:]](data, max_faces, where)
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import fcl
 import numpy as np
@@ -175,15 +176,19 @@ class _Body:
             )
             if self.planes is not None:
                 self.planes[:, 3] += self.pad
-        self._shape = None
 
-    def shape(self) -> fcl.CollisionObject:
-        if self._shape is None:
-            model = fcl.BVHModel()
-            model.beginModel(len(self.vertices), len(self.faces))
-            model.addSubModel(self.vertices, self.faces)
-            model.endModel()
-            self._shape = fcl.CollisionObject(model)
+    @cached_property
+    def _shape(self) -> fcl.CollisionObject:
+        # Made when it is first needed: most pairs never come so near.
+        model = fcl.BVHModel()
+        model.beginModel(len(self.vertices), len(self.faces))
+        model.addSubModel(self.vertices, self.faces)
+        model.endModel()
+        return fcl.CollisionObject(model)
+
+    def shape(self, T: np.ndarray) -> fcl.CollisionObject:
+        """Return its triangles at a pose, (4, 4)."""
+        self._shape.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
         return self._shape
 
 
@@ -327,21 +332,16 @@ class _Search:
         ca, cb = Ta[:3, :3] @ a.centre + Ta[:3, 3], Tb[:3, :3] @ b.centre + Tb[:3, 3]
         # The balls' distance; a static convex body's faces often say more.
         gap = float(np.linalg.norm(ca - cb)) - a.radius - b.radius
-        if b.planes is not None:
-            gap = max(gap, float((b.planes[:, :3] @ ca - b.planes[:, 3]).max()) - a.radius)
-        if a.planes is not None:
-            gap = max(gap, float((a.planes[:, :3] @ cb - a.planes[:, 3]).max()) - b.radius)
+        for planes, centre, radius in ((b.planes, ca, a.radius), (a.planes, cb, b.radius)):
+            if planes is not None:
+                gap = max(gap, float((planes[:, :3] @ centre - planes[:, 3]).max()) - radius)
         return gap
 
     def _distance(self, a, b, Ta, Tb) -> float:
         self.distance_queries += 1
-        shapes = []
-        for body, T in ((a, Ta), (b, Tb)):
-            shape = body.shape()
-            shape.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
-            shapes.append(shape)
+        apart = fcl.distance(a.shape(Ta), b.shape(Tb), _REQUEST, fcl.DistanceResult())
         # fcl gives a negative number for bodies that overlap.
-        return max(fcl.distance(*shapes, _REQUEST, fcl.DistanceResult()), 0.0) - a.pad - b.pad
+        return max(apart, 0.0) - a.pad - b.pad
 
 
 def _body_speed(body: _Body, ta: int, tb: int) -> float:

@@ -85,12 +85,8 @@ def engine() -> ModuleType:
         else:
             os.environ["MUJOCO_GL"] = wanted
     # Its own handler writes a file into the working folder; the checks here replace it.
-    mujoco.set_mju_user_warning(_silent)  # type: ignore[missing-attribute]
+    mujoco.set_mju_user_warning(lambda message: None)  # type: ignore[missing-attribute]
     return mujoco
-
-
-def _silent(_: str) -> None:
-    pass
 
 
 def engine_version() -> str:
@@ -113,8 +109,7 @@ def simulate(
     bodies : by name of the object. Objects without an entry: ``IN_THE_WAY``; sky: ignored.
     camera : its path and the radius of the sphere around it that nothing enters.   sides : invisible barriers. Raises
     ConfigError: no MuJoCo, bodies inside each other at t0, a simulation that diverges."""
-    world = _World(engine(), objects, bodies, settings, camera, sides, int(t0_ns), int(t1_ns))
-    return world.run()
+    return _World(engine(), objects, bodies, settings, camera, sides, int(t0_ns), int(t1_ns)).run()
 
 
 @dataclass(eq=False)
@@ -352,16 +347,12 @@ class _World:
             deep = [pair for pair in self._touching() if pair[2] > _SINK * min(pair[0].radius, pair[1].radius)]
             if not deep:
                 return
+            if any(depth > _LIFT * min(body.radius, other.radius) for body, other, depth, _ in deep):
+                break  # too deep to be lifted
             for body, other, depth, away in deep:
-                if depth > _LIFT * min(body.radius, other.radius):
-                    # Too deep to be lifted. This break skips the ``else`` and so ends both loops.
-                    break
                 # If both can move, each moves half; a fixed body or a pusher cannot move.
                 share = 0.5 if other.role == "dynamic" else 1.0
                 self.data.qpos[7 * body.at : 7 * body.at + 3] += share * depth * away
-            else:
-                continue
-            break
         body, other, depth, _ = max(deep, key=lambda pair: pair[2])
         raise ConfigError(
             f"at the start {body.name} is {depth:.3g} m inside {other.name}, or inside its convex hull",

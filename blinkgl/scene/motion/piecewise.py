@@ -146,8 +146,7 @@ def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
 # The piece that contains t; the first and last extend beyond their ends.
 @kernel
 def _piece(t, knots):
-    i = np.searchsorted(knots, t, side="right") - 1
-    return min(max(i, 0), len(knots) - 2)
+    return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
 
 
 @kernel

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -188,14 +189,10 @@ def look_rotation(direction: ArrayLike) -> np.ndarray:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def _unit(rng: np.random.Generator, n: int | None = None) -> np.ndarray:
-    v = rng.normal(size=3 if n is None else (n, 3))
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
-
 def _turned(rng, config: MotionConfig, last: np.ndarray | None, flat: bool) -> np.ndarray:
     """Return the next direction: the last one and a random one, mixed by smoothness."""
-    v = _unit(rng)
+    v = rng.normal(size=3)
+    v /= np.linalg.norm(v)
     if last is not None:
         v = (1.0 - config.smoothness) * v + config.smoothness * last
     if flat:
@@ -357,10 +354,8 @@ def _camera_turns(rng, config, rate, times, R, aims) -> np.ndarray:
 
 
 def _chained(R: np.ndarray, turns: np.ndarray) -> Rotation:
-    out = [R]
-    for E in Rotation.from_rotvec(turns).as_matrix():
-        out.append(out[-1] @ E)
-    return Rotation.from_matrix(np.array(out))
+    steps = Rotation.from_rotvec(turns).as_matrix()
+    return Rotation.from_matrix(np.array([*accumulate(steps, np.matmul, initial=R)]))
 
 
 def _rotations(R, turns, times, t0_ns, t1_ns, rate) -> Rotation:

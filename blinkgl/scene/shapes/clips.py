@@ -174,8 +174,7 @@ class Clip:
         self._joint = np.array([track.joint for track in moving], np.int64)
         self._path = np.array([PATHS.index(track.path) for track in moving], np.int64)
         self._kind = np.array([KINDS.index(track.interpolation) for track in moving], np.int64)
-        counts = [len(track.times) for track in moving]
-        self._first = np.cumsum([0, *counts]).astype(np.int64)
+        self._first = np.cumsum([0, *(len(track.times) for track in moving)]).astype(np.int64)
         self._times = np.concatenate([np.zeros(0), *(np.asarray(track.times, np.float64) for track in moving)])
         self._values = np.zeros((len(self._times), 3, 4))
         for track, first in zip(moving, self._first):

@@ -105,15 +105,15 @@ class _Pose:
         round."""
         return np.cos(2 * math.pi * times * (self.phi - late))
 
-    def turn(self, joint: str, x=0.0, y=0.0, z=0.0) -> None:
-        """Add degrees, numbers or (N,), to a joint's angles."""
-        for axis, value in enumerate((x, y, z)):
-            self.angles[:, J[joint], axis] += np.radians(value)
-
-    def turn_both(self, joint: str, x=0.0, y=0.0) -> None:
-        """Add degrees on both sides, mirrored."""
-        self.turn(f"{joint}_l", x, y)
-        self.turn(f"{joint}_r", -np.asarray(x), y)
+    def turn(self, sides: str = "lr", /, **degrees: tuple[float | np.ndarray, ...]) -> None:
+        """Add degrees about x, y and z, numbers or (N,), to joints' angles. sides : of the limbs, "l" or "r"; or both,
+        the right one's mirrored."""
+        for joint, angles in degrees.items():
+            for name in [joint] if joint in J else [f"{joint}_{side}" for side in sides]:
+                # A mirror image reverses rotations about x and z; what is done on both sides has none about z.
+                mirrored = sides == "lr" and name.endswith("_r")
+                for axis, angle in enumerate(angles):
+                    self.angles[:, J[name], axis] += np.radians(-angle if mirrored and axis == 0 else angle)
 
     def plant(self, feet: dict[str, tuple[np.ndarray, ...]], reach: float = 0.985) -> None:
         """Turn legs and feet so that the ankles are at their positions, the knees in front, and lower the pelvis by the
@@ -236,17 +236,22 @@ def _walk(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     pose.pelvis[:, 1] += 0.018 * u * sway * pose.wave(1, 0.3)
     pose.pelvis[:, 2] -= 0.02 * u * pose.wave(2, 0.04)
     yaw = -6 * pose.wave()
-    pose.turn("pelvis", 3 * sway * pose.wave(1, 0.3), 0, yaw)
-    pose.turn("spine", -2 * sway * pose.wave(1, 0.3), 3 * lean, -0.8 * yaw)
-    pose.turn("chest", -2 * sway * pose.wave(1, 0.3), 1, -1.1 * yaw)
-    pose.turn("neck", 0, -1, 0.5 * yaw)
-    pose.turn("head", 0, -2.5 * lean + 0.8 * pose.wave(2, 0.1), 0.4 * yaw)
+    pose.turn(
+        pelvis=(3 * sway * pose.wave(1, 0.3), 0, yaw),
+        spine=(-2 * sway * pose.wave(1, 0.3), 3 * lean, -0.8 * yaw),
+        chest=(-2 * sway * pose.wave(1, 0.3), 1, -1.1 * yaw),
+        neck=(0, -1, 0.5 * yaw),
+        head=(0, -2.5 * lean + 0.8 * pose.wave(2, 0.1), 0.4 * yaw),
+    )
     for side, sign, late in _SIDES:
         back = pose.wave(1, late - 0.02)
-        pose.turn(f"clavicle_{side}", 0, 0, -sign * 3 * back)
-        pose.turn(f"arm_{side}", sign * 7, -2 + 24 * swing * back, 0)
-        pose.turn(f"forearm_{side}", 0, -20 * swing + 13 * swing * back, 0)
-        pose.turn(f"hand_{side}", 0, -6 + 4 * back)
+        pose.turn(
+            side,
+            clavicle=(0, 0, -sign * 3 * back),
+            arm=(sign * 7, -2 + 24 * swing * back, 0),
+            forearm=(0, -20 * swing + 13 * swing * back, 0),
+            hand=(0, -6 + 4 * back),
+        )
     pose.plant(_feet(pose, stride, 0.61, math.radians(18), math.radians(50), 0.045 * u, 0.05 * u), 0.996)
     # Cycle rounds its period to whole ns, and the speed fits the rounded one.
     return pose.cycle(period, phase, stride / (round(period * 1e9) * 1e-9))
@@ -263,16 +268,21 @@ def _run(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     # Lowest in the middle of each foot's time on the ground.
     pose.pelvis[:, 2] -= 0.035 * u * pose.wave(2, duty / 2)
     yaw = -9 * pose.wave(1, -0.05)
-    pose.turn("pelvis", 2 * pose.wave(1, duty / 2), 4, yaw)
-    pose.turn("spine", 0, 6 * lean, -0.9 * yaw)
-    pose.turn("chest", 0, 3, -1.3 * yaw)
-    pose.turn("neck", 0, -4, 0.6 * yaw)
-    pose.turn("head", 0, -6 * lean + 1.5 * pose.wave(2, 0.1), 0.6 * yaw)
+    pose.turn(
+        pelvis=(2 * pose.wave(1, duty / 2), 4, yaw),
+        spine=(0, 6 * lean, -0.9 * yaw),
+        chest=(0, 3, -1.3 * yaw),
+        neck=(0, -4, 0.6 * yaw),
+        head=(0, -6 * lean + 1.5 * pose.wave(2, 0.1), 0.6 * yaw),
+    )
     for side, sign, late in _SIDES:
         back = pose.wave(1, late - 0.06)
-        pose.turn(f"clavicle_{side}", 0, 0, -sign * 5 * back)
-        pose.turn(f"arm_{side}", sign * 12, 6 + 38 * swing * back, 0)
-        pose.turn(f"forearm_{side}", sign * 8, -88 + 18 * back, 0)
+        pose.turn(
+            side,
+            clavicle=(0, 0, -sign * 5 * back),
+            arm=(sign * 12, 6 + 38 * swing * back, 0),
+            forearm=(sign * 8, -88 + 18 * back, 0),
+        )
     feet = _feet(pose, stride, duty, math.radians(8), math.radians(48), 0.24 * u * high, 0.03 * u)
     pose.plant(feet, 0.985)
     return pose.cycle(period, phase, stride / (round(period * 1e9) * 1e-9))
@@ -284,13 +294,15 @@ def _stand(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     look, rest = rng.uniform(-14, 14, 2) if variant else np.zeros(2)
     pose.pelvis[:, 1] += 0.012 * u * pose.wave()
     pose.pelvis[:, 2] -= 0.004 * u * pose.wave(2)
-    pose.turn("pelvis", 0.8 * pose.wave(), 0, rest / 3)
-    pose.turn("spine", -0.8 * pose.wave(), 0.6 * pose.wave(3))
-    pose.turn("chest", 0, -0.8 * pose.wave(3), 1.5 * pose.wave(1, 0.2))
-    pose.turn("head", 0, 1.5 * pose.wave(2, 0.3), look + 4 * pose.wave(1, 0.4))
-    pose.turn_both("clavicle", -1.2 * pose.wave(3))
-    pose.turn_both("arm", 8 + 0.8 * pose.wave(3), 1 + 1.5 * pose.wave(1, 0.1))
-    pose.turn_both("forearm", 0, -12 + 1.5 * pose.wave(2))
+    pose.turn(
+        pelvis=(0.8 * pose.wave(), 0, rest / 3),
+        spine=(-0.8 * pose.wave(), 0.6 * pose.wave(3)),
+        chest=(0, -0.8 * pose.wave(3), 1.5 * pose.wave(1, 0.2)),
+        head=(0, 1.5 * pose.wave(2, 0.3), look + 4 * pose.wave(1, 0.4)),
+        clavicle=(-1.2 * pose.wave(3),),
+        arm=(8 + 0.8 * pose.wave(3), 1 + 1.5 * pose.wave(1, 0.1)),
+        forearm=(0, -12 + 1.5 * pose.wave(2)),
+    )
     pose.plant(_still_feet(pose, 0.1 * u))
     return pose.cycle(4.0 / tempo, phase)
 
@@ -306,16 +318,18 @@ def _wave(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
     # Four waves of the hand in a round; the trunk gives way to the arm's weight.
     to = pose.wave(4)
     pose.pelvis[:, 1] -= sign * (0.015 + 0.006 * pose.wave()) * u
-    pose.turn("pelvis", -1.5 * sign)
-    pose.turn("spine", -2 * sign + 0.6 * to)
-    pose.turn("chest", -2 * sign + 0.8 * to, 0, 4 * sign)
-    pose.turn("head", -4 * sign - 1.2 * to, 2 * pose.wave(1, 0.2), 4 * pose.wave(1, 0.6))
-    pose.turn(f"clavicle_{side}", 14 * sign + 1.5 * sign * to)
-    pose.turn(f"arm_{side}", sign * (100 * high + 5 * wide * to), -14)
-    pose.turn(f"forearm_{side}", sign * (58 - 26 * wide * pose.wave(4, 0.02)), -8)
-    pose.turn(f"hand_{side}", -sign * 16 * wide * pose.wave(4, 0.07))
-    pose.turn(f"arm_{other}", -sign * 9, 3 + 2 * pose.wave())
-    pose.turn(f"forearm_{other}", 0, -16)
+    pose.turn(
+        side,
+        pelvis=(-1.5 * sign,),
+        spine=(-2 * sign + 0.6 * to,),
+        chest=(-2 * sign + 0.8 * to, 0, 4 * sign),
+        head=(-4 * sign - 1.2 * to, 2 * pose.wave(1, 0.2), 4 * pose.wave(1, 0.6)),
+        clavicle=(14 * sign + 1.5 * sign * to,),
+        arm=(sign * (100 * high + 5 * wide * to), -14),
+        forearm=(sign * (58 - 26 * wide * pose.wave(4, 0.02)), -8),
+        hand=(-sign * 16 * wide * pose.wave(4, 0.07),),
+    )
+    pose.turn(other, arm=(-sign * 9, 3 + 2 * pose.wave()), forearm=(0, -16))
     # Feet stay where they are: the legs follow the pelvis by inverse kinematics.
     pose.plant(_still_feet(pose, 0.11 * u))
     return pose.cycle(3.0 / tempo, phase)
@@ -333,11 +347,13 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     apart = 0.15 * u
     pose.pelvis[:, 2] -= (0.045 + 0.022 * big * (1 + beat)) * u
     pose.pelvis[:, 1] += 0.045 * u * big * side
-    pose.turn("pelvis", -7 * loose * side, 3 * pose.wave(4, 0.1))
-    pose.turn("spine", 8 * loose * side, 4 + 2 * beat, 0)
-    pose.turn("chest", 5 * loose * pose.wave(2, 0.2 + late), -3 * pose.wave(4, 0.05))
-    pose.turn("neck", -3 * side, 3 * beat)
-    pose.turn("head", -5 * loose * pose.wave(2, 0.18), 5 * pose.wave(4, 0.03), 10 * pose.wave(1, 0.2))
+    pose.turn(
+        pelvis=(-7 * loose * side, 3 * pose.wave(4, 0.1)),
+        spine=(8 * loose * side, 4 + 2 * beat),
+        chest=(5 * loose * pose.wave(2, 0.2 + late), -3 * pose.wave(4, 0.05)),
+        neck=(-3 * side, 3 * beat),
+        head=(-5 * loose * pose.wave(2, 0.18), 5 * pose.wave(4, 0.03), 10 * pose.wave(1, 0.2)),
+    )
     feet = _still_feet(pose, apart, 0.25)
     _dance_step(pose, feet, step, big)
     _dance_arms(pose, arms, loose, side, beat)
@@ -363,10 +379,7 @@ def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
             feet[name] = ankle, pitch + 0.15 * moving, yaw, toes
     elif step == 2:  # the twist
         turn = 24 * big * pose.wave(2, 0.03)
-        pose.turn("pelvis", 0, 0, turn)
-        pose.turn("spine", 0, 0, -0.9 * turn)
-        pose.turn("chest", 0, 0, -0.7 * turn)
-        pose.turn("head", 0, 0, 0.6 * turn)
+        pose.turn(pelvis=(0, 0, turn), spine=(0, 0, -0.9 * turn), chest=(0, 0, -0.7 * turn), head=(0, 0, 0.6 * turn))
         _tap(pose, feet, pitch=14, per_round=2)
         for name in feet:
             ankle, pitch, yaw, toes = feet[name]
@@ -383,34 +396,34 @@ def _dance_step(pose: _Pose, feet: dict, step: int, big: float) -> None:
 def _dance_arms(pose: _Pose, arms: int, loose: float, side: np.ndarray, beat: np.ndarray) -> None:
     """Add one of five arm movements. loose : amplitude, 1 on average.   side, beat : (N,) waves."""
     if arms == 0:  # both up, swaying
-        pose.turn_both("clavicle", 16)
-        pose.turn("arm_l", 138 + 14 * side, -12)
-        pose.turn("arm_r", -138 + 14 * side, -12)
-        pose.turn("forearm_l", 18 + 14 * side, -18 + 10 * beat)
-        pose.turn("forearm_r", -18 + 14 * side, -18 + 10 * beat)
+        for name, sign, _ in _SIDES:
+            arm, forearm = (sign * 138 + 14 * side, -12), (sign * 18 + 14 * side, -18 + 10 * beat)
+            pose.turn(name, clavicle=(sign * 16,), arm=arm, forearm=forearm)
     elif arms == 1:  # pumping before the chest
         for name, sign, first in _SIDES:
             pump = pose.wave(2, 0.5 * first + 0.05)
-            pose.turn(f"arm_{name}", sign * 24, -26 - 26 * loose * pump)
-            pose.turn(f"forearm_{name}", sign * 14, -95 + 22 * pump)
+            pose.turn(name, arm=(sign * 24, -26 - 26 * loose * pump), forearm=(sign * 14, -95 + 22 * pump))
     elif arms == 2:  # one hand points up and down diagonally, the other on the hip
         up = 0.5 + 0.5 * np.tanh(2 * pose.wave(2, 0.1)) / np.tanh(2)
-        pose.turn("clavicle_r", -14 * up)
-        pose.turn("arm_r", -30 - 112 * up, -30 + 16 * up)
-        pose.turn("forearm_r", -4, -35 * (1 - up) - 8)
-        pose.turn("arm_l", 42, 22)
-        pose.turn("forearm_l", -48, -78)
+        pose.turn("r", clavicle=(-14 * up,), arm=(-30 - 112 * up, -30 + 16 * up), forearm=(-4, -35 * (1 - up) - 8))
+        pose.turn("l", arm=(42, 22), forearm=(-48, -78))
     elif arms == 3:  # rolling forearms
         for name, sign, first in _SIDES:
-            pose.turn(f"arm_{name}", sign * (18 + 8 * pose.wave(4, 0.5 * first)), -48 + 14 * pose.wave(4, 0.25 * first))
-            pose.turn(f"forearm_{name}", -sign * 30, -80 + 26 * pose.wave(4, 0.125 * first + 0.06), -sign * 10)
+            pose.turn(
+                name,
+                arm=(sign * (18 + 8 * pose.wave(4, 0.5 * first)), -48 + 14 * pose.wave(4, 0.25 * first)),
+                forearm=(-sign * 30, -80 + 26 * pose.wave(4, 0.125 * first + 0.06), -sign * 10),
+            )
     else:  # a wave from one hand to the other
         for name, sign, _ in _SIDES:
             run = 0.06 * sign
-            pose.turn(f"clavicle_{name}", sign * (6 + 6 * pose.wave(2, 0.02 - run)))
-            pose.turn(f"arm_{name}", sign * (78 + 22 * loose * pose.wave(2, -run)), -8)
-            pose.turn(f"forearm_{name}", sign * 24 * pose.wave(2, 0.06 - run), -14)
-            pose.turn(f"hand_{name}", sign * 30 * pose.wave(2, 0.12 - run))
+            pose.turn(
+                name,
+                clavicle=(sign * (6 + 6 * pose.wave(2, 0.02 - run)),),
+                arm=(sign * (78 + 22 * loose * pose.wave(2, -run)), -8),
+                forearm=(sign * 24 * pose.wave(2, 0.06 - run), -14),
+                hand=(sign * 30 * pose.wave(2, 0.12 - run),),
+            )
 
 
 def _tap(pose: _Pose, feet: dict, pitch: float, per_round: int) -> None:

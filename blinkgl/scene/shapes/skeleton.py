@@ -46,21 +46,24 @@ class Locals(NamedTuple):
 
 
 class Motion(Protocol):
-    """The motion of a skeleton's joints. period_ns : its period; None: not periodic.   span_ns : time from 0 after
-    which nothing changes.   timescale_ns : time in which no velocity changes much.   jumps : the times in (t0, t1), ns,
-    after which a transform jumps; a motion of somebody's own need not have it."""
+    """The motion of a skeleton's joints. jumps : the times in (t0, t1), ns, after which a transform jumps; a motion of
+    somebody's own need not have it."""
 
     @property
-    def period_ns(self) -> int | None: ...
+    def period_ns(self) -> int | None:
+        """Return its period; None: not periodic."""
 
     @property
-    def span_ns(self) -> int: ...
+    def span_ns(self) -> int:
+        """Return the time from 0 after which nothing changes."""
 
     @property
-    def timescale_ns(self) -> int: ...
+    def timescale_ns(self) -> int:
+        """Return the time in which no velocity changes much."""
 
     @property
-    def is_static(self) -> bool: ...
+    def is_static(self) -> bool:
+        """Return whether nothing ever changes."""
 
     def locals(self, t_ns: int) -> Locals:
         """Return the transforms at a time. The arrays may be reused; do not write to them."""

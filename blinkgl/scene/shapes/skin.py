@@ -315,22 +315,9 @@ def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where:
     """Return ((V, k) int64, (V, k) float64), the weights of each vertex in descending order with sum 1, exact in
     float32."""
     bad = ~(np.isfinite(weights) & (weights >= 0)).all(axis=1)
-    if bad.any():
-        vertex = int(np.flatnonzero(bad)[0])
-        raise AssetError(
-            f"vertex {vertex} of a skin has a weight that is negative or no number",
-            where=where,
-            value=weights[vertex].tolist(),
-        )
-    total = weights.sum(axis=1)
-    if not (total > 1e-12).all():
-        vertex = int(np.flatnonzero(~(total > 1e-12))[0])
-        raise AssetError(
-            f"the weights of vertex {vertex} of a skin sum to zero",
-            where=where,
-            value=weights[vertex].tolist(),
-            accepted="one joint or more",
-        )
+    _refuse(bad, "vertex {} of a skin has a weight that is negative or no number", weights, where)
+    empty = ~(weights.sum(axis=1) > 1e-12)
+    _refuse(empty, "the weights of vertex {} of a skin sum to zero", weights, where, "one joint or more")
     used = weights > 0
     outside = used & ~((joints >= 0) & (joints < bones))
     if outside.any():
@@ -352,21 +339,20 @@ def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where:
 
 
 def _check_bones(inverse_bind: np.ndarray, where: str) -> None:
-    if not np.isfinite(inverse_bind).all():
-        first = int(np.flatnonzero(~np.isfinite(inverse_bind).all(axis=(1, 2)))[0])
-        raise AssetError(
-            f"the inverse bind matrix of joint {first} of a skin is not finite",
-            where=where,
-            value=inverse_bind[first].tolist(),
-        )
+    broken = ~np.isfinite(inverse_bind).all(axis=(1, 2))
+    _refuse(broken, "the inverse bind matrix of joint {} of a skin is not finite", inverse_bind, where)
     # A singular matrix is not an inverse; the ranks are those of the linear parts.
-    if (flat := np.flatnonzero(np.linalg.matrix_rank(inverse_bind[:, :3, :3]) < 3)).size:
-        raise AssetError(
-            f"the inverse bind matrix of joint {flat[0]} of a skin is singular",
-            where=where,
-            value=inverse_bind[flat[0]].tolist(),
-            accepted="a matrix with an inverse",
-        )
+    flat, accepted = np.linalg.matrix_rank(inverse_bind[:, :3, :3]) < 3, "a matrix with an inverse"
+    _refuse(flat, "the inverse bind matrix of joint {} of a skin is singular", inverse_bind, where, accepted)
+
+
+def _refuse(
+    wrong: np.ndarray | np.bool, problem: str, values: np.ndarray, where: str, accepted: str | None = None
+) -> None:
+    """Raise AssetError for the first of ``values`` that is wrong, whose number goes into the text of the problem."""
+    if wrong.any():
+        first = int(wrong.argmax())
+        raise AssetError(problem.format(first), where=where, value=values[first].tolist(), accepted=accepted)
 
 
 def _streams(joints: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:

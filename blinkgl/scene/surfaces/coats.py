@@ -28,22 +28,20 @@ def _colour(rng: np.random.Generator, saturation: tuple[float, float], value: tu
 def _pattern(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, size: float) -> np.ndarray:
     """Return a cloth pattern over positions in m, (h, w, 3) sRGB; ``size``: of one repeat."""
     first, second = _colour(rng, (0.35, 0.9), (0.45, 0.95)), _colour(rng, (0.1, 0.9), (0.15, 1.0))
-    kind = int(rng.integers(6))
-    u, v = x / size, y / size
-    if kind == 0:
-        mark = np.zeros_like(x)
-    elif kind == 1:  # horizontal stripes
-        mark = (v % 1.0 < 0.5).astype(float)
-    elif kind == 2:  # vertical stripes
-        mark = (u % 1.0 < 0.4).astype(float)
-    elif kind == 3:  # checks of two shades
-        mark = 0.5 * (u % 1.0 < 0.5) + 0.5 * (v % 1.0 < 0.5)
-    elif kind == 4:  # dots
-        row = np.floor(v)
-        mark = (((u + 0.5 * row) % 1.0 - 0.5) ** 2 + (v % 1.0 - 0.5) ** 2 < 0.07).astype(float)
-    else:  # zigzag
-        mark = ((v + np.abs(u % 1.0 - 0.5)) % 1.0 < 0.5).astype(float)
-    return first + (second - first) * mark[..., None]
+    mark = _MARKS[int(rng.integers(len(_MARKS)))](x / size, y / size)
+    return first + (second - first) * np.asarray(mark, float)[..., None]
+
+
+# Where the second colour is, 0 to 1, at (h, w) places in repeats of the pattern.
+_MARKS: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...] = (
+    lambda u, v: np.zeros_like(u),
+    lambda u, v: v % 1.0 < 0.5,  # horizontal stripes
+    lambda u, v: u % 1.0 < 0.4,  # vertical stripes
+    lambda u, v: 0.5 * (u % 1.0 < 0.5) + 0.5 * (v % 1.0 < 0.5),  # checks of two shades
+    # Dots, every second row shifted by half a repeat.
+    lambda u, v: ((u + 0.5 * np.floor(v)) % 1.0 - 0.5) ** 2 + (v % 1.0 - 0.5) ** 2 < 0.07,
+    lambda u, v: (v + np.abs(u % 1.0 - 0.5)) % 1.0 < 0.5,  # zigzag
+)
 
 
 def clothes(seed: int) -> np.ndarray:
@@ -67,26 +65,24 @@ def clothes(seed: int) -> np.ndarray:
         high = chart.top + (bottom * chart.length if bottom < 1 else chart.length + 0.02)
         return (np.abs(x - chart.left - chart.around / 2) < chart.around / 2 + 0.03) & (y >= low) & (y < high)
 
-    def paint(mask: np.ndarray, colour: np.ndarray) -> None:
-        image[mask] = colour[mask] if colour.ndim == 3 else colour
-
-    paint(inside("torso"), shirt)
-    paint(inside("torso", 0.0, 0.09) & (np.abs(x - CHARTS["torso"].around / 2) < 0.07), skin)  # a neckline
-    paint(inside("upper_arm", 0.0, 1.0 if sleeves else 0.55), shirt)
-    if sleeves:
-        paint(inside("forearm"), shirt)
-    lower = shirt if dress else trousers
-    paint(inside("torso", 0.72), lower)
-    if not dress:
-        paint(inside("torso", 0.70, 0.74), 0.4 * trousers)  # a belt
-    paint(inside("thigh", 0.0, 0.75 if shorts or dress else 1.0), lower)
-    if not (shorts or dress):
-        paint(inside("shank"), lower)
-    else:
-        paint(inside("shank", 0.62), np.array([235.0, 235, 235]))  # socks
-    paint(inside("foot"), shoes)
-    foot = CHARTS["foot"]
-    paint(inside("foot") & (np.abs(x - foot.left - foot.around / 2) > 0.33 * foot.around), sole)
+    lower, short, foot = shirt if dress else trousers, shorts or dress, CHARTS["foot"]
+    neckline = np.abs(x - CHARTS["torso"].around / 2) < 0.07
+    # Later ones lie over earlier ones.
+    for worn, mask, colour in (
+        (True, inside("torso"), shirt),
+        (True, inside("torso", 0.0, 0.09) & neckline, skin),
+        (True, inside("upper_arm", 0.0, 1.0 if sleeves else 0.55), shirt),
+        (sleeves, inside("forearm"), shirt),
+        (True, inside("torso", 0.72), lower),
+        (not dress, inside("torso", 0.70, 0.74), 0.4 * trousers),  # a belt
+        (True, inside("thigh", 0.0, 0.75 if short else 1.0), lower),
+        (not short, inside("shank"), lower),
+        (short, inside("shank", 0.62), np.array([235.0, 235, 235])),  # socks
+        (True, inside("foot"), shoes),
+        (True, inside("foot") & (np.abs(x - foot.left - foot.around / 2) > 0.33 * foot.around), sole),
+    ):
+        if worn:
+            image[mask] = colour[mask] if colour.ndim == 3 else colour
     _face(image, x, y, skin, hair, rng)
     return np.clip(image + rng.normal(0, 3, image.shape[:2])[..., None], 0, 255).astype(np.uint8)
 
@@ -120,24 +116,16 @@ def bunting(seed: int) -> np.ndarray:
     b = b if rng.random() < 0.5 else np.array([245.0, 242, 235])
     u, v = np.meshgrid(*[(np.arange(_SIZE) + 0.5) / _SIZE] * 2)
     image = np.broadcast_to(a, (_SIZE, _SIZE, 3)).copy()
-    # 0, 1: three stripes; 2: a cross in a cross; 3: halves and a disc; 4: nine stripes and a triangle; 5: a chequer.
-    kind = int(rng.integers(6))
-    if kind == 0:
-        image[(v > 1 / 3) & (v < 2 / 3)], image[v >= 2 / 3] = b, c
-    elif kind == 1:
-        image[(u > 1 / 3) & (u < 2 / 3)], image[u >= 2 / 3] = b, c
-    elif kind == 2:
-        image[(np.abs(u - 0.36) < 0.09) | (np.abs(v - 0.5) < 0.13)] = b
-        image[(np.abs(u - 0.36) < 0.045) | (np.abs(v - 0.5) < 0.065)] = c
-    elif kind == 3:
-        image[v > 0.5] = b
-        # A circle on a flag whose sides are 3:2.
-        image[((u - 0.5) * 1.5) ** 2 + (v - 0.5) ** 2 < 0.08] = c
-    elif kind == 4:
-        image[(v * 9).astype(int) % 2 == 1] = b
-        image[u < 0.9 * np.minimum(v, 1 - v)] = c
-    else:
-        image[((u * 9).astype(int) + (v * 6).astype(int)) % 2 == 1] = b
+    # Where the second and the third colour are, one over the other.
+    second, third = (
+        ((v > 1 / 3) & (v < 2 / 3), v >= 2 / 3),  # three stripes
+        ((u > 1 / 3) & (u < 2 / 3), u >= 2 / 3),
+        tuple((np.abs(u - 0.36) < half) | (np.abs(v - 0.5) < over) for half, over in ((0.09, 0.13), (0.045, 0.065))),
+        (v > 0.5, ((u - 0.5) * 1.5) ** 2 + (v - 0.5) ** 2 < 0.08),  # halves and a circle on a flag whose sides are 3:2
+        ((v * 9).astype(int) % 2 == 1, u < 0.9 * np.minimum(v, 1 - v)),  # nine stripes and a triangle
+        (((u * 9).astype(int) + (v * 6).astype(int)) % 2 == 1, np.zeros_like(u, bool)),  # a chequer
+    )[int(rng.integers(6))]
+    image[second], image[third] = b, c
     weave = 4 * np.sin(2 * np.pi * 128 * u) * np.sin(2 * np.pi * 96 * v)
     return np.clip(image + weave[..., None], 0, 255).astype(np.uint8)
 

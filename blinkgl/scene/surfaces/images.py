@@ -28,8 +28,9 @@ from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, LUMA, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr", ".exr")
-# The first bytes of an OpenEXR file; those of a Radiance file are "#?".
+# The first bytes of an OpenEXR file, and of these and Radiance files.
 _EXR = b"v/1\x01"
+_HDR = (b"#?", _EXR)
 MAX_SIDE = 16_384  # the configuration's limit of max_size, and OpenGL implementations'
 MAX_PIXELS = MAX_SIDE**2
 MAX_HDR_PIXELS = MAX_PIXELS // 2  # 12 bytes each: a panorama of 16384x8192
@@ -88,7 +89,7 @@ def decode_image(data: bytes, max_size: int | None, where: str, gamma: bool = Tr
     """Return :func:`load_image` of bytes already read. gamma : whether the file's own gamma counts (PNG's gAMA); glTF
     says that it does not."""
     with reading("image", where):
-        image = _decode_hdr(data, where) if data[:2] == b"#?" or data[:4] == _EXR else _decode_ldr(data, where, gamma)
+        image = _decode_hdr(data, where) if data.startswith(_HDR) else _decode_ldr(data, where, gamma)
         return shrink(image, max_size)
 
 
@@ -96,7 +97,7 @@ def decode_numbers(data: bytes, max_size: int | None, where: str) -> np.ndarray:
     """Return (h, w, 3) uint8 of an image that stores three numbers per pixel, 255 for 1 (normals, roughness): as
     stored, reduced by their mean. Raises AssetError as :func:`load_image`, and for high dynamic range."""
     with reading("image", where):
-        if data[:2] == b"#?" or data[:4] == _EXR:
+        if data.startswith(_HDR):
             raise AssetError(
                 "a map of numbers is a high-dynamic-range image", where=where, accepted="8 or 16 bits a channel"
             )
@@ -106,7 +107,7 @@ def decode_numbers(data: bytes, max_size: int | None, where: str) -> np.ndarray:
 def decode_alpha(data: bytes, max_size: int | None, where: str) -> np.ndarray | None:
     """Return the opacity of an image's pixels, (h, w) uint8; None where all are opaque. Raises AssetError."""
     with reading("image", where):
-        if data[:2] == b"#?" or data[:4] == _EXR:
+        if data.startswith(_HDR):
             return None
         with _open(data, where) as image:
             _check_size(*image.size, where)
@@ -119,12 +120,16 @@ def decode_alpha(data: bytes, max_size: int | None, where: str) -> np.ndarray | 
 
 
 def _smaller(numbers: np.ndarray, max_size: int | None) -> np.ndarray:
-    height, width = numbers.shape[:2]
-    if max_size is None or max(height, width) <= max_size:
-        return numbers
-    factor = max_size / max(height, width)
-    size = max(1, round(width * factor)), max(1, round(height * factor))
-    return cv2.resize(numbers, size, interpolation=cv2.INTER_AREA)
+    width, height = _reduced(numbers, max_size)
+    same = (height, width) == numbers.shape[:2]
+    return numbers if same else cv2.resize(numbers, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _reduced(image: np.ndarray, max_size: int | None) -> tuple[int, int]:
+    """Return width and height of an image whose longer side is reduced to ``max_size`` px."""
+    height, width = image.shape[:2]
+    factor = 1.0 if max_size is None else min(max_size / max(height, width), 1.0)
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def _open(data: bytes, where: str) -> Image.Image:
@@ -226,7 +231,7 @@ def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, flo
     where = where or str(path)
     data = contents(Path(path), "image", where)
     with reading("image", where):
-        if data[:2] == b"#?" or data[:4] == _EXR:
+        if data.startswith(_HDR):
             image = _radiance(data, where)
             factor = exposure(image)
         else:
@@ -257,7 +262,7 @@ def exposure(image: np.ndarray) -> float:
 
 def _radiance(data: bytes, where: str) -> np.ndarray:
     """Return (h, w, 3) float32 of a Radiance or OpenEXR file."""
-    if data[:4] == _EXR:
+    if data.startswith(_EXR):
         from blinkgl.io.video import decode_exr
 
         # The attribute's name, its type, its length of 16 bytes, and four 32-bit numbers.
@@ -286,7 +291,7 @@ def _radiance(data: bytes, where: str) -> np.ndarray:
     _check_size(int(size[2]), int(size[1]), where, MAX_HDR_PIXELS)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or not np.isfinite(image).all():
-        raise AssetError("the image is corrupt or of an unknown format", where=where)
+        raise AssetError(UNKNOWN_FORMAT, where=where)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
@@ -309,11 +314,9 @@ def _most(pixels: int) -> str:
 def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
     """Return the area average in linear light, the longer side reduced to ``max_size`` px; smaller images are returned
     unchanged."""
-    height, width = image.shape[:2]
-    if max_size is None or max(height, width) <= max_size:
+    (height, width), (new_width, new_height) = image.shape[:2], _reduced(image, max_size)
+    if (height, width) == (new_height, new_width):
         return image
-    factor = max_size / max(height, width)
-    new_width, new_height = max(1, round(width * factor)), max(1, round(height * factor))
     made = np.empty((new_height, new_width, 3), image.dtype)
     # A block of the result at a time, across and then down: at once, linear light would take four times the image.
     for rows in _blocks(new_height, math.ceil(width * height / new_height)):

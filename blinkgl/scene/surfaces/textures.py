@@ -25,11 +25,7 @@ def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
     """Return the ``index``-th texture of a kind, (size, size, 3) uint8 sRGB; the same on every run."""
     # By the kind's index in the list, which data sets depend on: add new kinds only at the end.
     rng = np.random.default_rng([_ALL_KINDS.index(kind), index])
-    if kind == "pips":
-        image = _pips(rng, size)
-        return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
-    field = _FIELDS[kind](rng, size)
-    image = _grade(field, _palette(rng))
+    image = _pips(rng, size) if kind == "pips" else _grade(_FIELDS[kind](rng, size), _palette(rng))
     return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
 
 
@@ -59,9 +55,8 @@ def _stretch(field: np.ndarray) -> np.ndarray:
     return ((field - low) / max(high - low, 1e-9)).astype(np.float32)
 
 
-def _coordinates(size: int) -> tuple[np.ndarray, np.ndarray]:
-    s = (np.arange(size) + 0.5) / size
-    return np.meshgrid(s, s)
+def _coordinates(size: int) -> tuple[np.ndarray, ...]:
+    return np.meshgrid(*[(np.arange(size) + 0.5) / size] * 2)
 
 
 def _smooth(t: np.ndarray) -> np.ndarray:
@@ -103,14 +98,6 @@ def _perlin_noise(rng, size: int, cells: int) -> np.ndarray:
     return total
 
 
-def _value(rng, size):
-    return _stretch(_value_noise(rng, size, int(rng.integers(6, 40))))
-
-
-def _perlin(rng, size):
-    return _stretch(_perlin_noise(rng, size, int(rng.integers(4, 24))))
-
-
 def _fbm(rng, size):
     cells, gain = int(rng.integers(2, 7)), rng.uniform(0.45, 0.75)
     # Each octave has twice the frequency of the one before and ``gain`` of its amplitude.
@@ -136,8 +123,7 @@ def _checks(rng, size):
     n, m = 2 * int(rng.integers(1, 10)), 2 * int(rng.integers(1, 10))
     if rng.random() < 0.5:
         return (np.floor(n * x) + np.floor(m * y)).astype(np.int64)
-    cells = rng.integers(0, 5, (m, n))
-    return cells[np.floor(m * y).astype(int), np.floor(n * x).astype(int)]
+    return rng.integers(0, 5, (m, n))[np.floor(m * y).astype(int), np.floor(n * x).astype(int)]
 
 
 def _glyphs(rng, size):
@@ -243,8 +229,8 @@ def _pips(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 _FIELDS = {
-    "value": _value,
-    "perlin": _perlin,
+    "value": lambda rng, size: _stretch(_value_noise(rng, size, int(rng.integers(6, 40)))),
+    "perlin": lambda rng, size: _stretch(_perlin_noise(rng, size, int(rng.integers(4, 24)))),
     "fbm": _fbm,
     "stripes": _stripes,
     "checks": _checks,

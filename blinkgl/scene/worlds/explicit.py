@@ -131,6 +131,7 @@ def _objects(
         where = f"scene.objects.{k}"
         own, animation = item.material is None, animation_of(item.animation)
         key = item.mesh, own, animation
+        # Read once, and shared by all objects that play and wear the same.
         if key not in assets:
             arguments = config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
             assets[key] = _asset(*arguments, animation, f"{where}.animation")

@@ -229,8 +229,9 @@ def _motion(
     if animation is None or not animation.moves(node):
         return StaticPath(rest @ local, t0_ns, t1_ns), baked
     motion, baked = _rigid(animation, node, t0_ns)
-    path = AffinePath(motion, t0_ns, t1_ns, local, animation.span_ns, animation.timescale_ns, animation.jumps)
-    return path, baked
+    clip, tracks = animation.playing, animation.tracks
+    timing = clip.span_ns, clip.timescale_ns(tracks), partial(clip.jumps, tracks)
+    return AffinePath(motion, t0_ns, t1_ns, local, *timing), baked
 
 
 def _with_lights(
@@ -245,6 +246,7 @@ def _with_lights(
     kept = sorted(lights, key=lambda node: -lights[node]["intensity"] * max(lights[node]["color"]))[:room]
     if len(lights) > room:
         document.omissions.add(f"{len(lights) - room} of {len(lights)} lights (the weakest; at most {room} shine)")
+    # In the order of the file again, so that the numbers of lamps do not depend on their brightness.
     lamps = [
         lamp_of_gltf(lights[node], _motion(document, node, animation, t0_ns, t1_ns)[0], gain) for node in sorted(kept)
     ]

@@ -151,13 +151,11 @@ def object_pool(config: PoolConfig, base: Path, max_texture: int = 1024) -> Pool
     """Return the pool of primitives and mesh folders. It loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
     objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for a folder that is
     missing or has no mesh."""
-    entries = []
-    for kind in kinds("pool") if config.primitives == "all" else config.primitives:
-        for index in range(config.variants):
-            entries.append(
-                Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index)
-            )
-    folders = [(resolve(folder, base), f"scene.pool.folders.{i}", folder) for i, folder in enumerate(config.folders)]
+    entries = [
+        Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index)
+        for kind in (kinds("pool") if config.primitives == "all" else config.primitives)
+        for index in range(config.variants)
+    ]
     limit = int(config.max_file_mb * 1e6)
     notes: list[str] = []
     dressed = config.keep_materials is not False
@@ -167,8 +165,9 @@ def object_pool(config: PoolConfig, base: Path, max_texture: int = 1024) -> Pool
         check_header(file, data, config.max_faces)
         return identity_of(file, data, border, dressed)
 
-    for folder, at, name in folders:
-        entries += _folder_entries(folder, at, name, MESH_SUFFIXES, "meshes", config.bad_assets, identity, notes)
+    for i, folder in enumerate(config.folders):
+        listed = resolve(folder, base), f"scene.pool.folders.{i}", folder, MESH_SUFFIXES, "meshes"
+        entries += _folder_entries(*listed, config.bad_assets, identity, notes)
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
@@ -180,6 +179,7 @@ def object_pool(config: PoolConfig, base: Path, max_texture: int = 1024) -> Pool
         limits = {"max_faces": config.max_faces, "max_bytes": limit, "max_texture": max_texture, "up": config.up}
         known = {"source_hash": entry.source_hash, "border": entry.border}
         asset = load_asset(entry.file, keep_materials=dressed, **limits, **known)
+        # Whether a file chose its looks is known only once it is read with them.
         if config.keep_materials == "auto" and not asset.has_looks:
             asset = load_asset(entry.file, keep_materials=False, **limits, **known)
         if config.keep_materials == "auto":
@@ -294,6 +294,7 @@ def _walk(folder: Path, hidden: list[str]) -> Iterator[Path]:
     seen, waiting = set(), [folder]
     while waiting:
         for here, folders, names in os.walk(waiting.pop(0), onerror=_raise):
+            # Links may lead round in circles, and to one folder by many names: device and inode are its identity.
             if (number := (os.stat(here).st_dev, os.stat(here).st_ino)) in seen:
                 folders.clear()
                 continue

@@ -220,7 +220,7 @@ def _light(config: RandomSceneConfig, panorama: Panorama | None, path_of: LampPa
             )
     light = make_light(config.light, path_of, rng, lamps)
     if config.sky is not None and config.sky.lights and panorama is not None:
-        light = panorama_light(panorama.file, panorama.angle, panorama.brightness, light, panorama.where)
+        light = panorama_light(panorama.file, panorama.angle, panorama.brightness, light, str(panorama.file))
     return light
 
 
@@ -238,6 +238,7 @@ def forget_pools() -> None:
     _texture_pool.cache_clear()
 
 
+# Listing a folder reads and hashes every file of it: once for all sequences of a run.
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
 _texture_pool = lru_cache(maxsize=4)(texture_pool)
 

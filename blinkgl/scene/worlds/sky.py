@@ -90,8 +90,7 @@ def with_environment(
         return light, objects
     where = "scene.light.environment.map"
     file = existing(config.map, base, where, "an equirectangular image")
-    angle = np.radians(config.heading)
-    light = panorama_light(file, angle, config.strength, light, f"{where}: {config.map}")
+    light = panorama_light(file, np.radians(config.heading), config.strength, light, f"{where}: {config.map}")
     if config.visible:
         image = shrink(load_image(file), 4096)
         # A panorama's columns are azimuth, so turning it about z moves them; it decreases to the right.
@@ -107,7 +106,6 @@ class Panorama(NamedTuple):
     """The panorama of a sky. sides : of its box.   angle : rotation, rad, from +x towards +y."""
 
     file: Path
-    where: str
     sides: list[Texture]
     angle: float
     brightness: float
@@ -139,6 +137,7 @@ def drawn_panorama(
         )
     digest, file = mine[int(rng.integers(len(mine)))]
     image = shrink(load_image(file), 4096)
+    # Turned by whole columns, so that no pixel is interpolated.
     columns = int(rng.integers(image.shape[1]))
     sides = panorama_textures(np.roll(image, columns, axis=1), file.stem, digest)
-    return Panorama(file, str(file), sides, -2 * math.pi * columns / image.shape[1], brightness)
+    return Panorama(file, sides, -2 * math.pi * columns / image.shape[1], brightness)

@@ -10,6 +10,7 @@ from blinkgl.scene.geometry.figure import ATLAS, CHARTS, isosurface
 from blinkgl.scene.geometry.living import figure, fish, flag
 from blinkgl.scene.geometry.meshes import closedness, uvs_degenerate, weld
 from blinkgl.scene.shapes.gait import CLIPS
+from tests.scene.faces import outwards, uv_turns, vectors
 
 MS = 1_000_000
 PEOPLE = [
@@ -20,22 +21,16 @@ PEOPLE = [
 LIVING = [*((figure, keys) for keys in PEOPLE), (flag, {}), (fish, {}), (fish, {"deep": 0.7, "length": 2.0})]
 
 
-def volume(points, faces):
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return (a * np.cross(b, c)).sum() / 6
-
-
 @pytest.mark.parametrize(("build", "keys"), LIVING)
 def test_a_skin_is_watertight_and_its_normals_face_out(build, keys):
     mesh = build(**keys)
     assert mesh.closed and closedness(*weld(mesh.vertices, mesh.faces))
     for t in (0, 130 * MS, 700 * MS):
         at, n = mesh.deformer.positions(mesh, t), mesh.deformer.normals(mesh, t)
-        a, b, c = (at[mesh.faces[:, k]] for k in range(3))
-        outward, size = np.cross(b - a, c - a), np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        agree = (n[mesh.faces].mean(axis=1) * outward).sum(axis=1)
+        outward = vectors(at, mesh.faces)
+        size, agree = np.linalg.norm(outward, axis=1), (n[mesh.faces].mean(axis=1) * outward).sum(axis=1)
         assert size[agree <= 0].sum() < 0.01 * size.sum()
-        assert volume(at, mesh.faces) > 0
+        assert outwards(at, mesh.faces).sum() > 0
         np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
 
 
@@ -58,11 +53,7 @@ def test_proportions_are_those_asked_for(keys):
 def test_texture_coordinates_are_an_atlas_in_one_scale():
     mesh = figure()
     assert not uvs_degenerate(mesh.vertices, mesh.faces, mesh.uvs)
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    u, v, w = (mesh.uvs[mesh.faces[:, k]].astype(float) * ATLAS for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    drawn = np.abs((v - u)[:, 0] * (w - u)[:, 1] - (v - u)[:, 1] * (w - u)[:, 0]) / 2
-    ratio = drawn / area
+    ratio = ATLAS**2 * np.abs(uv_turns(mesh)) / np.linalg.norm(vectors(mesh.vertices, mesh.faces), axis=1)
     assert 0.4 < np.median(ratio) < 1.4
     assert np.quantile(ratio, 0.1) > 0.15 and np.quantile(ratio, 0.9) < 3
     # No face is drawn over more than a part of the body: no seam runs through one. (At the crown all of them meet.)
@@ -109,7 +100,7 @@ def test_a_surface_lies_where_the_function_is_zero():
     assert np.abs(distance(points)).max() < 1e-6
     assert closedness(points, faces.astype(np.int64))
     true = 2 * np.pi**2 * 0.4**2 + 4 / 3 * np.pi * 0.3**3
-    assert volume(points, faces) == pytest.approx(true, rel=0.02)
+    assert outwards(points, faces).sum() / 6 == pytest.approx(true, rel=0.02)
     ring = points[:, 2] < 0.6
     ahead = points * [1, 1, 0] / np.linalg.norm(points[:, :2], axis=1)[:, None].clip(1e-9)
     outward = points - ahead

@@ -10,6 +10,8 @@ from blinkgl.scene.geometry import meshes as M, primitives as P
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject
+from tests.refusals import refusal
+from tests.scene.faces import uv_turns, vectors, volume
 
 CUBE = trimesh.creation.box()
 
@@ -17,8 +19,7 @@ CUBE = trimesh.creation.box()
 def test_a_cuboid_without_normals_stays_flat():
     mesh = M.make_mesh(CUBE.vertices, CUBE.faces)
     assert len(mesh.vertices) == 24
-    v = mesh.vertices[mesh.faces]
-    flat = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
+    flat = vectors(mesh.vertices, mesh.faces)
     np.testing.assert_allclose(
         mesh.normals[mesh.faces],
         np.repeat(flat[:, None], 3, axis=1) / np.linalg.norm(flat, axis=1)[:, None, None],
@@ -50,8 +51,7 @@ def test_box_projection_is_isometric_and_upright():
         np.testing.assert_allclose(
             np.linalg.norm(uv[:, a] - uv[:, b], axis=1), np.linalg.norm(v[:, a] - v[:, b], axis=1) / 0.5, rtol=1e-5
         )
-    e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    assert (e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0).all()  # not mirrored (v down)
+    assert (uv_turns(mesh) < 0).all()  # not mirrored
     side = np.abs(mesh.normals[:, 2]) < 0.5
     top = mesh.vertices[side][:, 2] > 0
     assert mesh.uvs[side][top, 1].max() < mesh.uvs[side][~top, 1].min()  # the picture's top is up
@@ -83,7 +83,7 @@ def test_no_face_is_turned_round():
         log: list[str] = []
         mesh = M.make_mesh(CUBE.vertices, faces, log=log)
         np.testing.assert_array_equal(mesh.vertices[mesh.faces], CUBE.vertices[faces])
-        flat = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+        flat = vectors(mesh.vertices, mesh.faces)
         assert (np.einsum("fk,fck->fc", flat, mesh.normals[mesh.faces]) > 0.99).all() and not log and not mesh.closed
 
 
@@ -113,10 +113,8 @@ def test_mirroring_keeps_faces_and_normals_outward():
     ball = P.sphere()
     for matrix in (np.diag([-1.0, 2, 1]), np.diag([1.0, 1, 1, 1]) + np.eye(4, k=1) * 0.3):
         moved = M.transform_mesh(ball, matrix)
-        v = moved.vertices[moved.faces]
-        out = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
-        assert ((moved.normals[moved.faces].mean(axis=1) * out).sum(axis=1) > 0).all()
-        assert np.einsum("ij,ij->i", v[:, 0], np.cross(v[:, 1], v[:, 2])).sum() > 0
+        out = vectors(moved.vertices, moved.faces)
+        assert ((moved.normals[moved.faces].mean(axis=1) * out).sum(axis=1) > 0).all() and volume(moved) > 0
 
 
 def test_normalise_centres_the_box_and_scales_the_sphere():
@@ -143,9 +141,8 @@ def test_normalise_centres_the_box_and_scales_the_sphere():
     ],
 )
 def test_refused(vertices, faces, message):
-    with pytest.raises(AssetError) as error:
-        M.make_mesh(vertices, faces, where="broken.obj")
-    assert str(error.value).startswith("broken.obj: ") and message in str(error.value) and "\n" not in str(error.value)
+    line = refusal(AssetError, M.make_mesh, vertices, faces, where="broken.obj")
+    assert line.startswith("broken.obj: ") and message in line
 
 
 # --- at the edges -----------------------------------------------------------------------------------------------------
@@ -264,14 +261,12 @@ def test_joining_moving_and_scaling():
     np.testing.assert_allclose(moved.vertices, box.vertices * [2, 3, 4] + [5, 6, 7])
     assert moved.faces is box.faces and np.array_equal(M.scale_mesh(box, 3.0).vertices, box.vertices * 3)
     for matrix in (np.diag([1.0, 0, 1]), np.full((3, 3), np.nan)):
-        with pytest.raises(AssetError, match="cuboid: a transform flattens the mesh"):
-            M.transform_mesh(box, matrix)
+        refusal(AssetError, M.transform_mesh, box, matrix, match="cuboid: a transform flattens the mesh")
     two = M.normalise((M.transform_mesh(box, np.eye(4) + np.eye(4, k=3)), box))
     low, high = M.bounds(two)
     np.testing.assert_allclose([low, high], [[-v for v in high], high])
     assert max(np.linalg.norm(m.vertices, axis=1).max() for m in two) == pytest.approx(1)
-    with pytest.raises(AssetError, match="here: the mesh has size zero"):
-        M.normalise((M.scale_mesh(box, 0.0),), where="here")
+    refusal(AssetError, M.normalise, (M.scale_mesh(box, 0.0),), where="here", match="here: the mesh has size zero")
 
 
 def test_rows_of_one_hash_stay_apart():

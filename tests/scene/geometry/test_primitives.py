@@ -11,20 +11,8 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.geometry import primitives as P
 from blinkgl.scene.geometry.meshes import make_mesh
 from blinkgl.scene.geometry.random_primitives import RANDOM, random_primitive
-
-
-def face_vectors(mesh):
-    v, f = mesh.vertices, mesh.faces
-    return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]) / 2
-
-
-def area(mesh):
-    return np.linalg.norm(face_vectors(mesh), axis=1).sum()
-
-
-def volume(mesh):
-    v, f = mesh.vertices, mesh.faces
-    return np.einsum("ij,ij->i", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])).sum() / 6
+from tests.refusals import refusal
+from tests.scene.faces import area, outwards, uv_turns, vectors, volume
 
 
 @pytest.mark.parametrize("kind", kinds("pool"))
@@ -33,7 +21,7 @@ def test_closed_outward_unit_normals(kind):
     assert mesh.closed and volume(mesh) > 0
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
     # each corner's normal is on its face's outer side, within the facet's own curvature
-    faces = face_vectors(mesh)
+    faces = vectors(mesh.vertices, mesh.faces)
     unit = faces / np.linalg.norm(faces, axis=1, keepdims=True)
     assert np.einsum("fkj,fj->fk", mesh.normals[mesh.faces].astype(float), unit).min() > 0.8
     assert np.isfinite(mesh.uvs).all() and mesh.uvs.min() >= -1e-6 and mesh.uvs.max() <= 1.05
@@ -106,11 +94,7 @@ def test_analytic_normals_against_angle_weighted_ones(kind):
 def test_textures_are_not_mirrored():
     """Seen from outside, u x (-v) points at the viewer: a map with positive determinant everywhere."""
     for kind in kinds("pool"):
-        mesh = P.BUILDERS[kind]()
-        uv = mesh.uvs[mesh.faces].astype(float)
-        e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-        signed = -(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0])  # v grows downwards
-        assert (signed > -1e-9).all(), kind
+        assert (uv_turns(P.BUILDERS[kind]()) < 1e-9).all(), kind
 
 
 @pytest.mark.parametrize(
@@ -141,9 +125,7 @@ def test_textures_are_not_mirrored():
     ],
 )
 def test_bad_parameters(kind, parameters, message):
-    with pytest.raises(AssetError) as error:
-        P.BUILDERS[kind](**parameters)
-    assert str(error.value) == message
+    assert refusal(AssetError, P.BUILDERS[kind], **parameters) == message
 
 
 def test_hash_is_of_the_parameters():
@@ -164,9 +146,7 @@ def test_a_die_is_a_rounded_cube_with_a_face_in_each_sixth_of_its_texture(roundi
     core = np.clip(mesh.vertices, -(h - r), h - r)
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices - core, axis=1), r, rtol=1e-9)
     np.testing.assert_allclose(mesh.vertices - core, r * mesh.normals, atol=1e-8)
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("ij,ij->i", across, corners.mean(axis=1)) > 0).all()
+    assert (outwards(mesh.vertices, mesh.faces) > 0).all()
     # Opposite faces are 7 together; not mirrored.
     numbers = {}
     for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1), (2, -1)):
@@ -175,14 +155,11 @@ def test_a_die_is_a_rounded_cube_with_a_face_in_each_sixth_of_its_texture(roundi
         numbers[axis, sign] = 1 + int(v * 2) * 3 + int(u * 3)
     assert sorted(numbers.values()) == [1, 2, 3, 4, 5, 6]
     assert all(numbers[axis, 1] + numbers[axis, -1] == 7 for axis in range(3))
-    uv = mesh.uvs[mesh.faces].astype(float)
-    e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    assert (-(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) > -1e-9).all()
+    assert (uv_turns(mesh) < 1e-9).all()
 
 
 def test_a_die_cannot_be_rounder_than_a_ball():
-    with pytest.raises(AssetError, match=r"die.rounding: bad parameter \(got 0.6\); expected at most 0.5"):
-        P.die(rounding=0.6)
+    refusal(AssetError, P.die, rounding=0.6, match=r"die.rounding: bad parameter \(got 0.6\); expected at most 0.5")
 
 
 # --- where the texture lies, and how large bodies are -----------------------------------------------------------------

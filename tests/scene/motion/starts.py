@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.scene.motion import trajectories
 from blinkgl.scene.motion.trajectories import look_rotation
+from blinkgl.types.poses import pose_of
 
 
 def free_place(rng, space, radius):
@@ -16,17 +17,13 @@ def free_place(rng, space, radius):
 
 def random_path(rng, t0, t1, config, space, radius, start=None, **keys):
     if start is None:
-        start = np.eye(4)
-        start[:3, 3] = free_place(rng, space, radius)
-        start[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        start = pose_of(free_place(rng, space, radius), Rotation.random(rng=rng).as_matrix())
     return trajectories.random_path(rng, t0, t1, config, space, radius, start, **keys)
 
 
 def random_camera_path(rng, t0, t1, config, space, radius, target, start=None):
     if start is None:
-        start = np.eye(4)
-        start[:3, 3] = free_place(rng, space, radius)
-        roll = math.radians(rng.uniform(-0.5, 0.5) * config.roll)
+        place, roll = free_place(rng, space, radius), math.radians(rng.uniform(-0.5, 0.5) * config.roll)
         turn = Rotation.from_rotvec([0, 0, roll]).as_matrix()
-        start[:3, :3] = look_rotation(np.asarray(target) - start[:3, 3]) @ turn
+        start = pose_of(place, look_rotation(np.asarray(target) - place) @ turn)
     return trajectories.random_camera_path(rng, t0, t1, config, space, radius, target, start)

@@ -14,6 +14,7 @@ from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.paths import CutPath, KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace
 from blinkgl.scene.types import Material, Mesh, Part, SceneObject
+from blinkgl.types.poses import pose_of
 from tests.scene.motion.starts import free_place, random_camera_path, random_path
 
 SECOND = 1_000_000_000
@@ -21,30 +22,14 @@ FAR = StaticPath(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1e4], [0, 0, 
 BOX = trimesh.creation.box((1, 1, 1))
 
 
-def body(name, shape, path, category="object", closed=None):
-    shapes = shape if isinstance(shape, list) else [shape]
-    parts = []
-    for s in shapes:
-        v, f = np.array(s.vertices, dtype=np.float64), np.array(s.faces, dtype=np.int32)
-        parts.append(
-            Part(
-                Mesh(
-                    v,
-                    f,
-                    np.zeros((len(v), 3), np.float32),
-                    np.zeros((len(v), 2), np.float32),
-                    s.is_watertight if closed is None else closed,
-                ),
-                Material(),
-            )
-        )
-    return SceneObject(name, 1, tuple(parts), path, category)
+def body(name, shape, path, category="object"):
+    v, f = np.array(shape.vertices, dtype=np.float64), np.array(shape.faces, dtype=np.int32)
+    normals, uvs = np.zeros((len(v), 3), np.float32), np.zeros((len(v), 2), np.float32)
+    return SceneObject(name, 1, (Part(Mesh(v, f, normals, uvs, shape.is_watertight), Material()),), path, category)
 
 
 def at(x=0.0, y=0.0, z=0.0, rotvec=(0, 0, 0)):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotvec).as_matrix(), [x, y, z]
-    return T
+    return pose_of((x, y, z), Rotation.from_rotvec(rotvec).as_matrix())
 
 
 def line(start, velocity, duration=1.0, spin=(0, 0, 0)):
@@ -241,8 +226,8 @@ def random_scene(seed, count=7):
         shape = shapes[k % len(shapes)].copy()
         shape.apply_scale(rng.uniform(0.25, 0.6))
         r = float(np.linalg.norm(shape.vertices, axis=1).max())
-        start = at(rotvec=rng.normal(size=3))
-        start[:3, 3] = free_place(rng, FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii), r)
+        turn = rng.normal(size=3)
+        start = at(*free_place(rng, FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii), r), turn)
         path = random_path(
             rng,
             0,

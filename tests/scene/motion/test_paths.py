@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import CutPath, KeyframePath, OffsetPath, StaticPath, rigid
 from blinkgl.scene.motion.pose_path import PosePath
+from blinkgl.types.poses import pose_of
+from tests.refusals import refusal
 from tests.scene.motion.rates import body_rate
 
 SECOND = 1_000_000_000
@@ -28,8 +30,7 @@ def random_keys(seed, count=7, start_ns=0, turn=None):
 
 def every_kind():
     spline = KeyframePath(*random_keys(0))
-    offset = np.eye(4)
-    offset[:3, :3], offset[:3, 3] = Rotation.from_rotvec([0.3, -1, 0.2]).as_matrix(), [0.5, 0.1, -2]
+    offset = pose_of((0.5, 0.1, -2), Rotation.from_rotvec([0.3, -1, 0.2]).as_matrix())
     middle = (spline.t0_ns + spline.t1_ns) // 2
     return {
         "static": StaticPath(offset, 0, SECOND),
@@ -99,19 +100,11 @@ def test_derivative_is_the_limit_of_differences_at_second_order(kind):
     knots = getattr(path, "key_times_ns", every_kind()["spline"].key_times_ns)
     middles = (knots[:-1] + knots[1:]) // 2 + 1234
     steps = np.array([16, 8, 4, 2]) * 1_000_000
-    errors = []
-    for h in steps:
-        numeric = (path.poses(middles + h) - path.poses(middles - h)) / (2e-9 * h)
-        errors.append(np.abs(numeric - np.stack([path.derivative(t) for t in middles])).max())
     if kind == "cut":  # one of the middles may be the cut; the others still have to converge
-        inside = middles[middles < path.t_cut_ns - 2 * steps[0]]
-        errors = [
-            np.abs(
-                (path.poses(inside + h) - path.poses(inside - h)) / (2e-9 * h)
-                - np.stack([path.derivative(t) for t in inside])
-            ).max()
-            for h in steps
-        ]
+        middles = middles[middles < path.t_cut_ns - 2 * steps[0]]
+    exact = np.stack([path.derivative(t) for t in middles])
+    numeric = [(path.poses(middles + h) - path.poses(middles - h)) / (2e-9 * h) for h in steps]
+    errors = [np.abs(one - exact).max() for one in numeric]
     order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert 1.7 < order < 2.3, errors
 
@@ -120,12 +113,8 @@ def test_derivative_is_the_limit_of_differences_at_second_order(kind):
 def test_second_derivative_is_continuous_at_the_keys_of_a_spline_only(interpolation, order):
     path = KeyframePath(*random_keys(5, turn=0.5), interpolation)
     steps = np.array([8, 4, 2, 1]) * 500_000
-    jumps = []
-    for h in steps:
-        jump = [
-            path.derivative(k + h) - 2 * path.derivative(k) + path.derivative(k - h) for k in path.key_times_ns[1:-1]
-        ]
-        jumps.append(np.abs(jump).max() / (h * 1e-9))
+    rates = lambda dt: np.array([path.derivative(k + dt) for k in path.key_times_ns[1:-1]])
+    jumps = [np.abs(rates(h) - 2 * rates(0) + rates(-h)).max() / (h * 1e-9) for h in steps]
     fitted = np.polyfit(np.log(steps), np.log(jumps), 1)[0]
     assert abs(fitted - order) < 0.3, jumps  # continuous: O(h); a jump in velocity: O(1/h)
 
@@ -201,8 +190,7 @@ def test_a_cut_path_stays_and_says_so():
 def test_an_offset_path_derivative_has_the_lever_arm():
     # Pure spin of 2 rad/s about z, arm 3 along x: the offset origin moves at 6 units/s.
     spin = KeyframePath([0, SECOND], np.zeros((2, 3)), Rotation.from_rotvec([[0, 0, 0], [0, 0, 2]]), "linear")
-    T = np.eye(4)
-    T[0, 3] = 3
+    T = pose_of((3, 0, 0))
     assert np.allclose(OffsetPath(spin, T).derivative(0)[:3, 3], [0, 6, 0], atol=1e-12)
     assert np.isclose(OffsetPath(spin, T).speed_bound(0, SECOND)[0], 6)
 
@@ -225,5 +213,4 @@ def test_bad_keys_are_refused(times, positions, turns):
 
 def test_a_pose_that_is_not_rigid_is_refused():
     for bad in (np.diag([2.0, 2, 2, 1]), np.diag([-1.0, 1, 1, 1]), np.full((4, 4), np.nan), np.eye(3)):
-        with pytest.raises(ConfigError, match="not rigid"):
-            rigid(bad)
+        refusal(ConfigError, rigid, bad, match="not rigid")

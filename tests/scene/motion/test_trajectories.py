@@ -11,6 +11,8 @@ from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import PausedPath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation
+from blinkgl.types.poses import pose_of
+from tests.refusals import refusal
 from tests.scene.motion.rates import statistics
 from tests.scene.motion.starts import random_camera_path, random_path
 
@@ -24,9 +26,7 @@ def rng(seed=0):
 
 
 def placed(x, y, z):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", [0.4, 0.2, 1.0]).as_matrix(), [x, y, z]
-    return T
+    return pose_of((x, y, z), Rotation.from_euler("xyz", [0.4, 0.2, 1.0]).as_matrix())
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,7 @@ def test_look_rotation_is_a_rotation_with_a_level_horizon():
     ],
 )
 def test_bad_settings_are_named(data, message):
-    with pytest.raises(ConfigError, match=message):
-        validate(ObjectMotion, data, where="scene.object_motion")
+    refusal(ConfigError, validate, ObjectMotion, data, where="scene.object_motion", match=message)
 
 
 # --- free space, by hand ----------------------------------------------------------------------------------------------

@@ -24,6 +24,8 @@ from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.sweep import Sweep, filled, sweep
 from blinkgl.scene.shapes.table import DEFORMERS, deformer_of, register
 from blinkgl.scene.types import Deformer
+from tests.refusals import refusal
+from tests.scene.faces import outwards
 
 MS = 1_000_000
 KINDS = {
@@ -85,24 +87,17 @@ def test_bounds_hold_every_shape(kind):
     rest = np.ptp(mesh.vertices, axis=0).max()
     assert (high - low).max() < 2.2 * rest  # and hold little else
     vertices, faces = sweep(mesh, 0, 900 * MS).hull
-    corners = vertices[faces] - vertices.mean(axis=0)
-    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(
-        axis=1
-    ).min() > 0
+    assert outwards(vertices - vertices.mean(axis=0), faces).min() > 0
 
 
 def test_a_configuration_is_refused_in_words():
-    from blinkgl.config.problems import validate
-    from blinkgl.config.scene import ObjectConfig
-
     for data, said in (
         ({"kind": "wobble"}, "wobble"),
         ({"kind": "wave", "towards": "x"}, "must be another axis than along"),
         ({"kind": "breathe", "amount": [1, 0, 0]}, "amount"),
         ({"kind": "bend", "wavelength": 1}, "wavelength"),
     ):
-        with pytest.raises(ConfigError, match=said):
-            validate(ObjectConfig, {"mesh": "a", "deform": data})
+        refusal(ConfigError, validate, ObjectConfig, {"mesh": "a", "deform": data}, match=said)
 
 
 # --- What a shape sweeps: looked at at some times, held at all.
@@ -277,8 +272,7 @@ def test_one_from_outside_is_generated_and_judged(tmp_path, capsys):
         assert reports["flow_forward"]["off_silhouettes"]["pixels"] > 100
     finally:
         del DEFORMERS["Shear"], DeformConfig.members["shear"]
-    with pytest.raises(ConfigError, match="shear"):
-        validate(ObjectConfig, {"mesh": "a", "deform": {"kind": "shear"}})
+    refusal(ConfigError, validate, ObjectConfig, {"mesh": "a", "deform": {"kind": "shear"}}, match="shear")
 
 
 @pytest.mark.parametrize(

@@ -13,18 +13,13 @@ from blinkgl.config.run import load_run
 from blinkgl.config.scene import ExplicitSceneConfig, RandomSceneConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.build import build_scene, sequence_scene
+from tests.refusals import refusal
+from tests.scene.faces import points_at
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 NAMES = ("dancers", "crossing", "flags", "aquarium", "falling_dice")
 CAMERA = CameraConfig(width=64, height=48)
 SECOND = 10**9
-
-
-def points_at(obj, t_ns):
-    """(V, 3) of all parts, world."""
-    T = obj.path.pose(t_ns)
-    at = [p.mesh.vertices if p.mesh.deformer is None else p.mesh.deformer.positions(p.mesh, t_ns) for p in obj.parts]
-    return np.concatenate(at) @ T[:3, :3].T + T[:3, 3]
 
 
 # ---- configs/scenes --------------------------------------------------------------------------------------------------
@@ -102,9 +97,7 @@ def test_a_way_begins_where_it_is_told_and_closes():
     ({"way": 3}, "way: not a table"),
 ])  # fmt: skip
 def test_a_way_that_is_none_is_refused_in_one_line(keys, said):
-    with pytest.raises(ConfigError, match=said) as error:
-        explicit(mesh="ann", **keys)
-    assert "\n" not in str(error.value)
+    refusal(ConfigError, explicit, match=said, mesh="ann", **keys)
 
 
 # ---- random worlds ---------------------------------------------------------------------------------------------------

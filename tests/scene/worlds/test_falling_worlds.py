@@ -13,6 +13,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, ObjectsConfig, PoolConfig,
 from blinkgl.errors import ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.motion.paths import HermitePath
+from tests.refusals import refusal
 
 CAMERA = CameraConfig(width=96, height=72)
 T1 = 1_000_000_000
@@ -128,5 +129,4 @@ def test_collisions_leave_what_falls_to_the_engine():
     ],
 )
 def test_configurations_that_make_no_sense(changes, message):
-    with pytest.raises(ConfigError, match=message):
-        explicit(**changes)
+    refusal(ConfigError, explicit, match=message, **changes)

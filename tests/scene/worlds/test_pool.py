@@ -1,5 +1,6 @@
 """Pools: splits by content, order, caching, sources, and what is refused."""
 
+import json
 import shutil
 import struct
 from dataclasses import replace
@@ -13,7 +14,8 @@ from blinkgl.config.scene import PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.worlds.pool import Cache, object_pool, split_of, texture_pool
-from tests.scene.gltf_files import GltfBuilder, triangle
+from tests.refusals import refusal
+from tests.scene.gltf_files import GltfBuilder, triangle_file
 from tests.shared_data import shared
 
 NOTHING = dict(primitives=())
@@ -110,10 +112,7 @@ def test_all_real_models_load_both_ways():
 
 
 def config_error(make):
-    with pytest.raises((ConfigError, AssetError)) as error:
-        make()
-    assert "\n" not in str(error.value)
-    return str(error.value)
+    return refusal((ConfigError, AssetError), make)
 
 
 def test_missing_folders_and_empty_pools(tmp_path):
@@ -147,96 +146,57 @@ def test_missing_folders_and_empty_pools(tmp_path):
     )
 
 
-def write_nan(path):
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+BILLION_FACES = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1000000000\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n"
+)
+BILLION_VERTICES = BILLION_FACES.replace("vertex 3\n", "vertex 999999999\n").replace("face 1000000000", "face 1")
 
 
-def write_no_faces(path):
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+def stl_of(faces: int) -> bytes:
+    """A file that states so many faces, and ends after ten."""
+    return b"binary".ljust(80, b"\0") + struct.pack("<I", faces) + b"\0" * 500
 
 
-def write_billion_stl(path):
-    path.write_bytes(b"binary".ljust(80, b"\0") + struct.pack("<I", 1_000_000_000) + b"\0" * 500)
-
-
-def write_truncated_stl(path):
-    path.write_bytes(b"binary".ljust(80, b"\0") + struct.pack("<I", 100) + b"\0" * 500)
-
-
-def write_billion_ply(path):
-    path.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 1000000000\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n"
-    )
-
-
-def write_billion_vertices(path):
-    write_billion_ply(path)
-    path.write_text(path.read_text().replace("vertex 3\n", "vertex 999999999\n").replace("face 1000000000", "face 1"))
-
-
-def write_billion_glb(path, accessor=1, count=3_000_000_000):
-    builder = GltfBuilder()
-    builder.node(mesh=triangle(builder))
-    builder.tree["accessors"][accessor]["count"] = count
-    path.write_bytes(builder.glb())
-
-
-def write_billion_virtual(path):
-    """An accessor without a buffer view is all zeros by the specification: any count costs no byte."""
-    builder = GltfBuilder()
-    builder.node(mesh=triangle(builder))
-    for accessor in builder.tree["accessors"]:
-        accessor.pop("bufferView")
-        accessor["count"] = 3_000_000_000
-    path.write_bytes(builder.glb())
-
-
-def write_many_faces(path):
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 2001)
-
-
-def write_truncated_glb(path):
-    builder = GltfBuilder()
-    builder.node(mesh=triangle(builder))
-    path.write_bytes(builder.glb()[:-20])
-
-
-def write_short_accessor(path):
-    write_billion_glb(path, 0, 30)
-
-
-def write_bad_index(path):
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+def glb_of(*accessors: int, count: int = 3_000_000_000, virtual: bool = False) -> bytes:
+    """A triangle of which these accessors state another count; without a buffer view one is all zeros by the
+    specification, and any count costs no byte."""
+    builder = triangle_file()
+    for accessor in accessors:
+        builder.tree["accessors"][accessor]["count"] = count
+        if virtual:
+            builder.tree["accessors"][accessor].pop("bufferView")
+    return builder.glb()
 
 
 @pytest.mark.parametrize(
-    "suffix, write, problem",
+    "suffix, content, problem",
     [
-        ("obj", write_nan, "line 4: a face has a vertex that is NaN or infinite"),
-        ("obj", write_no_faces, "no faces"),
-        ("obj", write_many_faces, "too many faces (got 2001); expected at most 1000"),
-        ("obj", write_bad_index, ""),
-        ("stl", write_billion_stl, "too many faces (got 1000000000)"),
-        ("stl", write_truncated_stl, "truncated: 100 faces need 5084 bytes (got 584)"),
-        ("ply", write_billion_ply, "too many faces (got 1000000000)"),
-        ("ply", write_billion_vertices, "too many vertex elements (got 999999999)"),
-        ("glb", write_billion_glb, "too many faces (got 1000000000)"),
-        ("glb", write_billion_virtual, "too many faces (got 1000000000)"),
-        ("glb", write_truncated_glb, "truncated"),
-        ("glb", write_short_accessor, "reaches outside its buffer"),
-        ("ply", lambda p: p.write_bytes(b"ply nonsense"), "no PLY header"),
-        ("glb", lambda p: p.write_bytes(b"glTF"), "truncated"),
-        ("gltf", lambda p: p.write_text("{"), "JSON cannot be read"),
-        ("gltf", lambda p: p.write_text('{"asset": {"version": "1.0"}}'), "no glTF 2"),
-        ("gltf", lambda p: p.write_text('{"asset": {"version": "2.0"}, "nodes": 7}'), "no valid glTF"),
-        ("obj", lambda p: p.write_bytes(b""), ""),
-        ("stl", lambda p: p.write_bytes(b""), ""),
+        ("obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "line 4: a face has a vertex that is NaN or infinite"),
+        ("obj", TRIANGLE, "no faces"),
+        ("obj", TRIANGLE + "f 1 2 3\n" * 2001, "too many faces (got 2001); expected at most 1000"),
+        ("obj", TRIANGLE + "f 1 2 9\n", ""),
+        ("stl", stl_of(1_000_000_000), "too many faces (got 1000000000)"),
+        ("stl", stl_of(100), "truncated: 100 faces need 5084 bytes (got 584)"),
+        ("ply", BILLION_FACES, "too many faces (got 1000000000)"),
+        ("ply", BILLION_VERTICES, "too many vertex elements (got 999999999)"),
+        ("glb", glb_of(1), "too many faces (got 1000000000)"),
+        ("glb", glb_of(0, 1, virtual=True), "too many faces (got 1000000000)"),
+        ("glb", glb_of()[:-20], "truncated"),
+        ("glb", glb_of(0, count=30), "reaches outside its buffer"),
+        ("ply", "ply nonsense", "no PLY header"),
+        ("glb", "glTF", "truncated"),
+        ("gltf", "{", "JSON cannot be read"),
+        ("gltf", '{"asset": {"version": "1.0"}}', "no glTF 2"),
+        ("gltf", '{"asset": {"version": "2.0"}, "nodes": 7}', "no valid glTF"),
+        ("obj", "", ""),
+        ("stl", "", ""),
     ],
 )
-def test_bad_meshes_are_named(tmp_path, suffix, write, problem):
+def test_bad_meshes_are_named(tmp_path, suffix, content, problem):
     path = tmp_path / f"broken.{suffix}"
-    write(path)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
     def load():
         pool = object_pool(PoolConfig(folders=(str(tmp_path),), max_faces=1000, test_fraction=0, **NOTHING), ".")
@@ -270,12 +230,8 @@ def test_gltf_cannot_leave_its_folder(tmp_path, uri):
     (folder / "sub").mkdir(parents=True)
     (tmp_path / "secret.bin").write_bytes(b"\0" * 1000)
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
-    builder = GltfBuilder()
-    builder.node(mesh=triangle(builder))
-    builder.tree["buffers"] = [{"byteLength": 100, "uri": uri}]
-    import json
-
-    (folder / "a.gltf").write_text(json.dumps(builder.tree))
+    tree = triangle_file(tree={"buffers": [{"byteLength": 100, "uri": uri}]}).tree
+    (folder / "a.gltf").write_text(json.dumps(tree))
     message = config_error(lambda: object_pool(PoolConfig(folders=(str(folder),), **NOTHING), "."))
     assert message.startswith(str(folder / "a.gltf")) and ("outside the folder" in message or "on a network" in message)
 
@@ -318,28 +274,15 @@ def test_obj_materials(tmp_path):
 
 def test_corrupt_image_in_a_folder_is_named_or_skipped(tmp_path):
     (tmp_path / "bad.jpg").write_bytes(b"\xff\xd8\xff broken")
-    pool = texture_pool(
-        TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0), "."
-    )
-    assert config_error(lambda: pool.draw(np.random.default_rng(0), "train")).startswith(str(tmp_path / "bad.jpg"))
+    only = dict(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0)
+    pool, rng, log = texture_pool(TexturesConfig(**only), "."), np.random.default_rng(0), []
+    assert config_error(lambda: pool.draw(rng, "train")).startswith(str(tmp_path / "bad.jpg"))
     Image.new("RGB", (8, 8), (200, 100, 50)).save(tmp_path / "good.png")
-    pool = texture_pool(
-        TexturesConfig(
-            procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"
-        ),
-        ".",
-    )
-    log = []
-    rng = np.random.default_rng(0)
+    pool = texture_pool(TexturesConfig(**only, bad_assets="skip"), ".")
     assert {pool.draw(rng, "train", log).name for _ in range(10)} == {"good.png"}
     assert log and all("bad.jpg" in line for line in log)
     (tmp_path / "good.png").unlink()
-    pool = texture_pool(
-        TexturesConfig(
-            procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"
-        ),
-        ".",
-    )
+    pool = texture_pool(TexturesConfig(**only, bad_assets="skip"), ".")
     assert "50 textures drawn in a row are unusable" in config_error(lambda: pool.draw(rng, "train"))
 
 

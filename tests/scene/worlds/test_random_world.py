@@ -20,6 +20,8 @@ from blinkgl.config.scene import (
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
 from blinkgl.scene.worlds.random_world import pools
+from tests.refusals import refusal
+from tests.scene.faces import outwards, points_at
 from tests.shared_data import shared
 
 CAMERA = CameraConfig(width=96, height=72)
@@ -75,11 +77,6 @@ def worlds():
     return [build(config(), sequence=k) for k in range(8)]
 
 
-def world_vertices(o, t=0):
-    T = o.path.pose(t)
-    return np.concatenate([p.mesh.vertices @ T[:3, :3].T + T[:3, 3] for p in o.parts])
-
-
 def things(scene):
     return [o for o in scene.objects if o.category == "object"]
 
@@ -88,7 +85,7 @@ def test_resting_objects_touch_the_ground_and_nothing_is_below(worlds):
     resting = flying = 0
     for scene in worlds:
         for o in things(scene):
-            lowest = world_vertices(o)[:, 2].min()
+            lowest = points_at(o)[:, 2].min()
             assert lowest > -1e-9
             resting += abs(lowest) < 1e-9
             flying += lowest > 0.01
@@ -130,7 +127,7 @@ def test_structure(worlds):
         assert all(p.material.unlit for p in sky.parts) and len(sky.parts) == 6
         for p in sky.parts:  # faces look inwards, cells are small
             v = p.mesh.vertices[p.mesh.faces]
-            assert (np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]) * -v.mean(axis=1)).sum(axis=1).min() > 0
+            assert outwards(p.mesh.vertices, p.mesh.faces).max() < 0
             assert np.linalg.norm(v[:, 1] - v[:, 0], axis=1).max() < 1.5 * SkyConfig().size / SkyConfig().subdivisions
         assert np.ptp(sky.parts[0].mesh.vertices) == pytest.approx(100)
         for o in scene.objects:
@@ -150,7 +147,7 @@ def test_options():
     assert all(p.material.unlit for o in unlit.objects for p in o.parts)
     assert len(things(build(config(objects=ObjectsConfig(count=0))))) == 0
     standing = build(config())
-    assert min(world_vertices(o)[:, 2].min() for o in things(standing)) == pytest.approx(0, abs=1e-9)
+    assert min(points_at(o)[:, 2].min() for o in things(standing)) == pytest.approx(0, abs=1e-9)
     assert 1 <= standing.camera_path.pose(0)[2, 3] <= 3.5
 
 
@@ -195,11 +192,7 @@ def test_real_assets_with_their_materials_and_panorama_sky():
     assert fingerprint(build(settings, base=base)) == fingerprint(scene)
 
 
-def message(make):
-    with pytest.raises((ConfigError, AssetError)) as error:
-        make()
-    assert "\n" not in str(error.value)
-    return str(error.value)
+REFUSED = ConfigError, AssetError
 
 
 @pytest.mark.parametrize(
@@ -233,35 +226,26 @@ def message(make):
     ],
 )
 def test_configuration_errors(tree, expected):
-    assert message(lambda: validate(RandomSceneConfig, tree, where="scene")).startswith(expected)
+    assert refusal(REFUSED, validate, RandomSceneConfig, tree, where="scene").startswith(expected)
 
 
 def test_assets_are_checked_before_work_starts(tmp_path):
     check_assets(config(), tmp_path)
-    assert message(lambda: check_assets(config(pool=PoolConfig(folders=("gone",))), tmp_path)).startswith(
-        "scene.pool.folders.0: no such folder (got 'gone')"
-    )
-    assert message(lambda: check_assets(config(pool=PoolConfig(primitives=())), tmp_path)).startswith(
-        "scene.pool: the pool of meshes is empty"
-    )
-    assert message(lambda: check_assets(config(textures=TexturesConfig(folders=("gone",))), tmp_path)).startswith(
-        "scene.textures.folders.0: no such folder"
-    )
-    assert message(lambda: build(config(sky=SkyConfig(panoramas=("gone.hdr",))), base=tmp_path)).startswith(
-        "scene.sky.panoramas.0: no such file or folder"
-    )
     explicit = validate(
         ExplicitSceneConfig,
         {"kind": "explicit", "meshes": {"a": {"file": "gone.obj"}}, "objects": [{"mesh": "a"}], "camera": {}},
     )
-    assert (
-        message(lambda: check_assets(explicit, tmp_path))
-        == "scene.meshes.a.file: no such file (got 'gone.obj'); expected a mesh file"
-    )
-    assert (
-        message(lambda: build(config(), split="val"))
-        == "output.split: unknown split (got 'val'); expected train or test"
-    )
+    for settings, expected in (
+        (config(pool=PoolConfig(folders=("gone",))), "scene.pool.folders.0: no such folder (got 'gone')"),
+        (config(pool=PoolConfig(primitives=())), "scene.pool: the pool of meshes is empty"),
+        (config(textures=TexturesConfig(folders=("gone",))), "scene.textures.folders.0: no such folder"),
+        (explicit, "scene.meshes.a.file: no such file (got 'gone.obj'); expected a mesh file"),
+    ):
+        assert refusal(REFUSED, check_assets, settings, tmp_path).startswith(expected)
+    lost = config(sky=SkyConfig(panoramas=("gone.hdr",)))
+    assert refusal(REFUSED, build, lost, base=tmp_path).startswith("scene.sky.panoramas.0: no such file or folder")
+    unknown = refusal(REFUSED, build, config(), split="val")
+    assert unknown == "output.split: unknown split (got 'val'); expected train or test"
 
 
 def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_path):

@@ -11,7 +11,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.importing import gltf_materials, mesh_files, parts
 from blinkgl.scene.reading import RECENT
-from tests.scene.gltf_files import GltfBuilder, triangle
+from tests.scene.gltf_files import textured_file
 
 EYE = {"position": [-4, 0, 0], "look_at": [0, 0, 0]}
 
@@ -34,11 +34,7 @@ def work(monkeypatch):
 
 def write(folder, colour):
     Image.new("RGB", (4, 4), colour).save(folder / "t.png")
-    builder = GltfBuilder()
-    surface = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
-    builder.tree.update(materials=[surface], images=[{"uri": "t.png"}], textures=[{"source": 0}])
-    builder.node(mesh=triangle(builder, uvs=[(0, 0), (1, 0), (0, 1)], material=0))
-    (folder / "a.glb").write_bytes(builder.glb())
+    textured_file("t.png").write(folder / "a.glb")
     (folder / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
 
 
@@ -59,11 +55,7 @@ def test_meshes_are_read_once(tmp_path, work):
         assert {kind: work.count(kind) for kind in dict.fromkeys(work)} == first
         work.clear()
         # Another camera, as where key frames are drawn for each sequence.
-        moved = (
-            {"camera": {**EYE, "position": [-5, 1, 0]}}
-            if config is explicit
-            else {"pose": {**EYE, "position": [-5, 1, 0]}}
-        )
+        moved = {"camera" if config is explicit else "pose": {**EYE, "position": [-5, 1, 0]}}
         other = type(config).model_validate({**config.model_dump(exclude_unset=True), **moved})
         scenes += [built(config, tmp_path, 1), built(other, tmp_path, 2)]
         assert not work

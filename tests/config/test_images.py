@@ -5,6 +5,7 @@ import yaml
 
 from blinkgl.config.run import load_run
 from blinkgl.dataset.report import config_yaml
+from blinkgl.errors import ConfigError
 from tests.refusals import refusal
 
 

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from blinkgl.config.reader import MAX_DEPTH, MAX_VALUES, parse_yaml, read_yaml, to_yaml
+from blinkgl.errors import ConfigError
 from tests.refusals import refusal
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(

@@ -14,6 +14,7 @@ from blinkgl.config.optics import OpticsConfig
 from blinkgl.config.problems import validate
 from blinkgl.config.run import RunTemplate
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.errors import ConfigError
 from blinkgl.gl import create_context
 from blinkgl.imaging.optics import Optics, kernels_of, spread
 from blinkgl.render.renderer import Renderer

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 import blinkgl
 import pyrender_peer
+from blinkgl.errors import ConfigError
 from tests.refusals import refusal
 
 

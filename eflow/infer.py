@@ -147,7 +147,7 @@ def windows(
 JUMP = 10_000
 """Number of empty windows in a row from which the clock of a recording is considered to have jumped."""
 SHORTEST_PX = 2.0
-"""Displacement in a window below which both shipped networks leave 0.36 to 0.7 of zero flow's error."""
+"""Displacement in a window below which both shipped networks leave 0.25 to 0.65 of zero flow's error."""
 LIKELY_PX = 5.0
 """Displacement in a window that :func:`likely_span` aims at, px: networks are trained on 2 to 8 px."""
 

@@ -7,6 +7,8 @@ import pytest
 
 pytest.importorskip("torch")
 
+from shared_data import shared
+
 from blinkgl.errors import BlinkGLError
 from blinkgl.tools import real_recordings as rr
 from eflow.data.window import RawSample, Window
@@ -59,3 +61,13 @@ def test_a_set_without_labels_is_one_line(monkeypatch):
     monkeypatch.setattr(rr, "open_source", lambda path: [replace(sample(np.ones((6, 8, 2))), flow=None, valid=None)])
     with pytest.raises(BlinkGLError, match="nowhere: no labelled sample"):
         rr.of_set("nowhere", [], 2)
+
+
+def test_the_office_moves_in_its_pictures_as_in_its_events():
+    """Contrast maximisation, which sees no picture, finds the same shift in the windows between two of them."""
+    pairs = list(rr.of_office(shared(f"data/events/{rr.OFFICE}"), 3))
+    assert len(pairs) == 5
+    shifts = rr.answer_of("contrast-translation", 180, 190)
+    for pair, flow in pairs[::2]:
+        seen, true = shifts(pair)[90, 90], np.nanmedian(flow, axis=(0, 1))
+        assert np.hypot(*(seen - true)) < 0.15 * np.hypot(*true)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -179,7 +178,7 @@ def predict(
         typer.Argument(
             metavar="[NETWORK] EVENTS",
             help="A network or method, as of evaluate, and an event file. Without a network (or with auto): "
-            "real_small where the flow is nearly affine, else real_bodies.",
+            "real_bodies, or real_small where there is no window before another.",
         ),
     ],
     outputs: Outputs,
@@ -194,20 +193,20 @@ def predict(
     above 1 the flow helps."""
     from blinkgl.types.events import Events
     from eflow import infer
-    from eflow.choice import AUTO, BODIES, chosen
+    from eflow.choice import AUTO, chosen
     from eflow.flow_of_file import show_flows
 
     if len(names) > 2:
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
     name, events = [AUTO, *names][-2:]
     chooses = name == AUTO and not Path(AUTO).exists()
-    model = answerer(BODIES if chooses else name, replace(options, warm_start=options.warm_start and not chooses))
+    model = None if chooses else answerer(name, options)
     file = infer.open_sized(events, declared.reading())
     height, width = infer.sensor_of(file)
     for line in infer.doubts(next(iter(file.chunks()), Events.empty()), height, width):
         typer.echo(f"{events}: {line}", err=True)
-    if chooses:
-        name, why = chosen(file, asked, infer.Predictor(model, height, width))
+    if model is None:
+        name, why = chosen(file, asked)
         typer.echo(f"network: {why}")
         model = answerer(name, options)
     views = options.views or infer.default_views(name)

@@ -184,24 +184,24 @@ def test_ranges_of_frames(network, tmp_path, text, capsys):
 
 
 @pytest.mark.parametrize(
-    ("moving", "name"), [("camera", "real_small"), ("bodies", "real_bodies"), ("nothing before", "real_small")]
+    ("start_us", "arguments", "line"),
+    [
+        (0, ["FILE", "--window-ms", "90"], "network: real_bodies"),
+        (0, ["auto", "FILE", "--window-ms", "auto"], "network: real_bodies"),
+        (0, ["FILE", "--whole"], "network: real_bodies"),
+        (
+            100_000,
+            ["FILE", "--window-ms", "90"],
+            "network: real_small, since there is no pair of windows with events (real_bodies needs two)",
+        ),
+    ],
 )
-def test_a_network_is_chosen_by_what_moves(moving, name, tmp_path, capsys):
-    """A texture that slides by, or of which halves slide apart; of a file of one window there is no pair."""
-    late = 100_000 if moving == "nothing before" else 0
-    parts = [moving_events(128, 128, late, 4 * SPAN // 2, velocity=(60.0, 10.0), n=30_000)]
-    if moving == "bodies":
-        other = moving_events(128, 128, late, 4 * SPAN // 2, velocity=(-60.0, 30.0), n=30_000, seed=3)
-        band = lambda e: (e.x // 32) % 2 == 0
-        both = Events.concatenate([parts[0].part(band(parts[0])), other.part(~band(other))])
-        parts = [both.part(np.argsort(both.t, kind="stable"))]
-    path = tmp_path / "e.h5"
-    write_events(path, parts[0], 128, 128)
-    assert run(["predict", *([] if moving == "camera" else ["auto"]), str(path), "--window-ms", "90"]) == 0
-    first = capsys.readouterr().out.splitlines()[0]
-    assert first.startswith(f"network: {name}, since ")
-    why = {"camera": "off an affine field", "bodies": "depth shows, or bodies move", "nothing before": "no pair"}
-    assert why[moving] in first
+def test_the_network_of_two_windows_is_taken_where_there_are_two(start_us, arguments, line, tmp_path, capsys):
+    """The last file's events fill one window, which has none before it."""
+    file = str(tmp_path / "e.h5")
+    write_events(file, moving_events(128, 128, start_us, 2 * SPAN, velocity=(60.0, 10.0), n=30_000), 128, 128)
+    assert run(["predict", *(file if word == "FILE" else word for word in arguments)]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == line
 
 
 def test_flow_without_events_nearby_is_written_as_not_valid(network, tmp_path):

@@ -84,6 +84,8 @@ def _propose_longer(
     ends = infer.ends_of(file)
     longest = 0 if ends is None or whole else (ends[1] + 1 - ends[0]) // len(predictor.reads)
     fitting = min(round(span * infer.LIKELY_PX / max(float(np.median(speeds)), 1e-3)), longest)
+    # Three digits, rounded down: of a longer window than the recording there is none.
+    fitting -= fitting % 10 ** max(len(str(fitting)) - 3, 0)
     if fitting > 1.2 * span:
         say(f"{line}: try --window-ms {fitting / 1000:.3g}")
     else:

@@ -449,7 +449,15 @@ def read(
         near.omissions.unknown("properties", unknown)
         buffers = buffers_of(tree, binary, near)
         made = Materials(tree, buffers, near, max_texture, materials)
-        document = Document(path, tree, buffers, made, near.omissions, nodes_of(tree, where), near.log)
+        document = Document(
+            path=path,
+            tree=tree,
+            buffers=buffers,
+            materials=made,
+            omissions=near.omissions,
+            nodes=nodes_of(tree, where),
+            log=near.log,
+        )
         _check_faces(document, max_faces)
         for name in dict.fromkeys([*tree.get("extensionsUsed", []), *_extensions(tree)]):
             # Extensions of materials and textures are reported where one is used, and lights by kind.

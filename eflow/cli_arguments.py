@@ -61,10 +61,21 @@ WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
 Refine = Annotated[bool, typer.Option(help=_REFINE)]
+
+
+def _known_views(views: int | None) -> int | None:
+    if views is not None:
+        from eflow.infer import VIEWS
+
+        one_of("--views", str(views), tuple(map(str, VIEWS)))
+    return views
+
+
 Views = Annotated[
     int | None,
     typer.Option(
         metavar="N",
+        callback=_known_views,
         help="Mean flow of N views of the events: 1, 4 (mirrored, too) or 8 (with swapped polarities, too). Default: 4 "
         "where predict takes a shipped network, else 1.",
         show_default=False,

@@ -396,11 +396,13 @@ def main() -> None:
     parser.add_argument("--changed", action="store_true", help="with --bursts: fewer events, larger sensors")
     parser.add_argument("--sets", type=Path, nargs="*", default=[], help="data sets with labels, with --bursts")
     parser.add_argument("--pans", action="store_true", help=f"with --bursts: {PANNED}")
-    parser.add_argument("--office", action="store_true", help=f"with --bursts: {OFFICE}, windows of 1.4 and 4 px")
+    parser.add_argument("--office", action="store_true", help=f"with --bursts: {OFFICE}, windows of 1.5 and 4.5 px")
     parser.add_argument("--json", type=Path)
     a = parser.parse_args()
     if a.sets and not a.bursts:
         parser.error("--sets: needs --bursts")
+    if a.bursts and not (a.recordings / TEST).is_dir():
+        parser.error(f"--recordings: {a.recordings} has no folder {TEST}")
     console, results = plain_console(), {}
     if a.bursts:
         known = {folder.name: burst(folder, a.answers) for folder in sorted((a.recordings / TEST).iterdir())}
@@ -410,7 +412,7 @@ def main() -> None:
             for apart in (1, 3) if a.office else ():
                 title = f"office, {apart * APART_US / 1000:g} ms"
                 known[title] = of_pairs(of_office(a.recordings / OFFICE, apart), a.answers, title)
-        except BlinkGLError as error:
+        except (BlinkGLError, OSError) as error:
             parser.error(str(error))
         for title, rows in known.items():
             results[title] = rows

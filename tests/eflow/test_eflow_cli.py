@@ -177,6 +177,29 @@ def test_scoring_starts_warm_where_samples_follow(refined, network, tmp_path, ca
     assert "--warm-start: this network has no iterations (got 'ev_flownet')" in capsys.readouterr().err
 
 
+def test_views_in_scores_and_submissions(network, data, tmp_path, monkeypatch, capsys):
+    """One view unless more are asked for."""
+    score = lambda name: json.loads((tmp_path / name / "results.json").read_text())["methods"]["network"]
+    for name, options in (("none", []), ("1", ["--views", "1"]), ("4", ["--views", "4"])):
+        assert run(["evaluate", network, str(data), "--out", str(tmp_path / name), *options]) == 0
+    assert score("none") == score("1") != score("4")
+    monkeypatch.setitem(submit.BENCHMARKS, "dsec", replace(submit.BENCHMARKS["dsec"], sequences=("thun_01_a",)))
+    root, flows = dsec_set(tmp_path / "test", ("thun_01_a",), labels=1, test=True), []
+    for views in ("1", "4"):
+        out = tmp_path / f"{views}.zip"
+        assert run(["submit", network, str(root), "--out", str(out), "--views", views]) == 0
+        with zipfile.ZipFile(out) as archive:
+            flows.append(archive.read("thun_01_a/000002.png"))
+    assert flows[0] != flows[1]
+    for command in (
+        ["evaluate", network, str(data)],
+        ["submit", network, str(root), "--out", str(tmp_path / "no.zip")],
+    ):
+        assert run([*command, "--views", "2"]) == 2
+        assert "--views: unknown choice (got '2'); expected 1, 4, 8" in capsys.readouterr().err
+    assert not (tmp_path / "no.zip").exists()
+
+
 @pytest.mark.parametrize("text", ["5", "9-3", "a-b", "1-2-3", "-1-4"])
 def test_ranges_of_frames(network, tmp_path, text, capsys):
     assert run(["evaluate", network, str(tmp_path), f"--frames={text}"]) == 2
@@ -256,7 +279,7 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
         ),
         (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is not a network (got True)"),
         (["contrast-affine", "E", "--views", "4"], "error: --views: contrast-affine is not a network (got 4)"),
-        (["NETWORK", "E", "--views", "3"], "error: views: not a number of views (got 3); expected 1, 4 or 8"),
+        (["NETWORK", "E", "--views", "3"], "error: --views: unknown choice (got '3'); expected 1, 4, 8"),
         (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method uses it (got 200.0); expected contrast-"),
     ],
 )

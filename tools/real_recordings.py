@@ -79,7 +79,8 @@ def read(path: Path) -> tuple[Events, int, int]:
             return sized.read(), sized.height, sized.width
     from scipy.io import loadmat
 
-    table = {k: v.ravel() for k, v in loadmat(path).items() if k in ("ts", "x", "y", "pol")}
+    with open(path, "rb") as file:
+        table = {k: v.ravel() for k, v in loadmat(file).items() if k in ("ts", "x", "y", "pol")}
     t = table["ts"].astype(np.int64)
     columns = table["x"].astype(np.uint16), (179 - table["y"].astype(np.int64)).astype(np.uint16), t
     return Events(*columns, (1 - (table["pol"] > 0)).astype(np.uint8)), 180, 190

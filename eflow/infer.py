@@ -148,6 +148,8 @@ JUMP = 10_000
 """Number of empty windows in a row from which the clock of a recording is considered to have jumped."""
 SHORTEST_PX = 2.0
 """Displacement in a window below which both shipped networks leave 0.25 to 0.65 of zero flow's error."""
+FIRST_US = 30_000
+"""Length of the windows that :func:`likely_span` looks at first, µs."""
 LIKELY_PX = 5.0
 """Displacement in a window that :func:`likely_span` aims at, px: networks are trained on 2 to 8 px."""
 
@@ -167,7 +169,7 @@ def likely_span(
         raise EventDataError("holds no events", where=str(file.path))
     first, last = ends
     longest = max((last + 1 - first) // (2 if "old" in reads else 1), 1000)
-    span = min(30_000, longest)
+    span = min(FIRST_US, longest)
     before: tuple[int, float] | None = None
     for _ in range(4):
         speeds = []

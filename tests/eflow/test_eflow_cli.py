@@ -21,7 +21,9 @@ from blinkgl.io.flow import read_flow_png  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
 from blinkgl.types.events import Events  # noqa: E402
 from eflow import checkpoint as ckpt, infer, submit  # noqa: E402
+from eflow.choice import chosen  # noqa: E402
 from eflow.cli import run  # noqa: E402
+from eflow.cli_arguments import WindowsAsked  # noqa: E402
 from eflow.data.window import StreamWindow  # noqa: E402
 from eflow.metrics import frame_metrics  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
@@ -225,6 +227,18 @@ def test_the_network_of_two_windows_is_taken_where_there_are_two(start_us, argum
     write_events(file, moving_events(128, 128, start_us, 2 * SPAN, velocity=(60.0, 10.0), n=30_000), 128, 128)
     assert run(["predict", *(file if word == "FILE" else word for word in arguments)]) == 0
     assert capsys.readouterr().out.splitlines()[0] == line
+
+
+def test_the_choice_reads_short_windows_of_a_long_recording(tmp_path, monkeypatch):
+    """Where the length of windows is still to be found."""
+    write_events(tmp_path / "e.h5", moving_events(128, 128, 0, 4 * SPAN, n=30_000), 128, 128)
+    read, windows = [], infer.windows
+    monkeypatch.setattr(
+        infer, "windows", lambda file, span_us, **more: read.append(span_us) or windows(file, span_us, **more)
+    )
+    with infer.open_sized(tmp_path / "e.h5") as file:
+        assert chosen(file, WindowsAsked(window_ms="auto")) == ("real_bodies", "real_bodies")
+    assert set(read) == {30_000}
 
 
 def test_flow_without_events_nearby_is_written_as_not_valid(network, tmp_path):

@@ -232,6 +232,7 @@ def keep_best(run: Path, model: FlowModel, ema: dict[str, Tensor] | None, step: 
     """Write the weights, averaged if they are, to ``run/best.safetensors`` if ``score``, the mean over validation sets
     of the AEE as a share of zero flow's, is lower than that of the file there."""
     path = run / "best.safetensors"
+    # `not <` instead of `>=`: a score of NaN never replaces weights.
     if path.is_file() and not score < float(read_tensors(path)[1].get("score", "inf")):
         return
     with atomic_file(path) as temporary:
@@ -343,6 +344,7 @@ def resume_run(
     averaged = read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}
     load_weights(model, weights, str(folder / "weights.safetensors"))
     load_optimizer(folder / "optimizer.safetensors", model, optimizer)
+    # Copied in place: the run's averages are the tensors of this mapping.
     for k, average in (ema or {}).items():
         if k not in averaged or averaged[k].shape != average.shape:
             raise AssetError(f"lacks the tensor '{k}' of this model", where=str(folder / "ema.safetensors"))

@@ -82,6 +82,7 @@ def _write_onnx(flow: _Flow, windows: tuple[Tensor, ...], path: Path, where: str
         )
     except torch.onnx.errors.OnnxExporterError as error:
         cause: BaseException = error
+        # The first cause names the operator; the exceptions around it name stages of the exporter.
         while cause.__cause__ is not None:
             cause = cause.__cause__
         raise AssetError(

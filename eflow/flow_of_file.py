@@ -49,6 +49,8 @@ def show_flows(
                 f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
+            # Flow at a time within the window: the events until then, and the flow so far, for which the flow of the
+            # window before tells the velocity at the beginning.
             for share in asked.shares if writers else ():
                 end = window.new.t0 + round(share * (window.new.t1 - window.new.t0))
                 to_end = replace(window, new=replace(window.new, t1=end))
@@ -82,7 +84,9 @@ def _propose_longer(
     where = f"below {infer.SHORTEST_PX:g} px, where the networks of the package are wrong by a third or more"
     line = f"  {short} of {len(speeds)} flows are {where}"
     ends = infer.ends_of(file)
+    # A network of two windows needs both of them inside the recording.
     longest = 0 if ends is None or whole else (ends[1] + 1 - ends[0]) // len(predictor.reads)
+    # Longer in the ratio of the lengths: the motion is taken to go on.
     fitting = min(round(span * infer.LIKELY_PX / max(float(np.median(speeds)), 1e-3)), longest)
     # Three digits, rounded down: of a longer window than the recording there is none.
     fitting -= fitting % 10 ** max(len(str(fitting)) - 3, 0)
@@ -124,6 +128,7 @@ def _second_opinion(file: EventFile, predictor: Predictor, span: int, start: int
         say("  the flow makes the events in the middle no sharper: nothing moves there, or many things move at once")
     mine = np.median(flow[window.new.y, window.new.x], axis=0)
     none = window.new.take(np.zeros(len(window.new), bool))
+    # Contrast maximisation reads two windows; where the network reads one, the older is empty and as long.
     old = window.old if len(window.old) else replace(none, t0=window.new.t0 - span, t1=window.new.t0)
     try:
         other = ContrastMaximisation("translation")(old, window.new, *infer.sensor_of(file))[0, 0]

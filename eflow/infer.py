@@ -68,6 +68,7 @@ def predict(model: FlowModel, batch: Batch, *, precision: str = "fp32") -> FlowP
             out = model(padded)
     finally:
         model.train(was_training)
+    # Padding and bf16 stay in here: callers get float32 at the size of their batch.
     return FlowPrediction(
         [f[..., top : top + height, left : left + width].float() for f in out.flows],
         out.kind,

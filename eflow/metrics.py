@@ -44,6 +44,7 @@ def frame_metrics(predicted: Numbers, truth: Numbers, valid: Mask) -> dict[str, 
     epe = np.hypot(*(pr - gt).T)
     size = np.hypot(*gt.T)
     angle = angle_2d(pr, gt)
+    # NaN > 3 is false: without this a prediction of NaN would have no outliers.
     share = lambda mask: float(100 * np.mean(mask)) if np.isfinite(epe).all() else float("nan")
     return {
         "AEE": float(epe.mean()),
@@ -62,6 +63,7 @@ def angle_2d(a: Numbers, b: Numbers) -> Numbers:
     angle is 90 degrees; if both are, it is 0."""
     cross, dot = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1)
     angle = np.arctan2(np.abs(cross), dot)
+    # atan2(0, 0) is 0, but a flow of zero has no direction to agree with.
     zero_a, zero_b = (a == 0).all(-1), (b == 0).all(-1)
     return np.where(zero_a & zero_b, 0.0, np.where(zero_a | zero_b, np.pi / 2, angle))
 

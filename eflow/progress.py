@@ -75,6 +75,7 @@ class TrainProgress:
         call."""
         now = time.monotonic()
         speed = (step - self._step) * self.batch / max(now - self._time, 1e-9)
+        # Exponential means: single steps differ by what is logged or validated between them.
         self.rate = speed if self.rate == 0 else 0.9 * self.rate + 0.1 * speed
         for loss, epe in values:
             self._loss = loss if self._loss is None else 0.95 * self._loss + 0.05 * loss
@@ -85,6 +86,7 @@ class TrainProgress:
         text = f"loss {self._loss:.2f}  EPE {self._epe:.2f} px  {self.rate:.2f} samples/s  {self._left(now)}"
         if self._live is not None:
             self._live.update(self._task, completed=step, text=text)
+        # Without a terminal, a line every so often instead of a bar.
         elif now - self._printed >= _QUIET_S or step == self.steps:
             self._printed = now
             self._print(f"step {step}/{self.steps}  {text}")

@@ -102,6 +102,7 @@ def from_published(tensors: dict[str, Tensor], where: str) -> FlowModel:
             continue
         sources = published_names(name)
         parts = [_tensor(tensors, source, where) for source in sources]
+        # Two published gates are stacked along their output channels; a scalar has no axis to stack along.
         value = torch.cat(parts) if all(p.ndim for p in parts) else parts[0]
         if value.shape != wanted.shape or not value.is_floating_point():
             raise AssetError(

@@ -297,6 +297,7 @@ class Training:
         if self.done >= 1:
             return "finished"
         last = self.step == self.stop
+        # A signal or the clock may reach the ranks at different steps; they end together only where all of them ask.
         if self.world > 1 and not (looking or last):
             return None
         minutes = self.config.run.time_limit
@@ -325,6 +326,8 @@ class Training:
         size = -(-self.config.data.batch // self.world)
         scores = validate(self.model, self.ema, self.validation, self.config.run.precision, size)
         log.write(self.step, "validation", **scores)
+        # The best weights are those of the least mean share of zero flow's error, so that a set of fast motion does not
+        # outweigh the others.
         shares = [scores[f"{name}/AEE"] / max(scores[f"{name}/zero"], 1e-9) for name, *_ in self.validation]
         ckpt.keep_best(self.out, self.model, self.ema, self.step, sum(shares) / len(shares))
         progress.note(self.step, scores)
@@ -339,6 +342,7 @@ class Training:
 
 def _optimizer(model: FlowModel, optim: OptimConfig, device: torch.device) -> torch.optim.Optimizer:
     """Return AdamW without weight decay on biases and norms."""
+    # Biases and the factors of norms have one axis, weights have more.
     decay = [p for p in model.parameters() if p.ndim > 1]
     no_decay = [p for p in model.parameters() if p.ndim <= 1]
     return torch.optim.AdamW(
@@ -369,6 +373,7 @@ def _forward(net: torch.nn.Module, batch: dict, config: TrainConfig, count: Tens
     )
     with torch.no_grad():
         valid = batch["valid"]
+        # The truth may be NaN where it is not valid, and NaN times 0 is NaN: chosen, not multiplied.
         error = (prediction.flow - torch.where(valid[:, None], batch["flow"], 0)).square().sum(1).sqrt()
         total = torch.where(valid, error, 0).sum()
     return loss, total, prediction.flow.detach()
@@ -391,6 +396,7 @@ def _rendering(sources: list[Source]) -> dict[str, float]:
 @torch.no_grad()
 def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
     for k, v in model.state_dict().items():
+        # The counters of batch norm are integers, which have no average.
         ema[k].lerp_(v, 1 - decay) if v.is_floating_point() else ema[k].copy_(v)
 
 

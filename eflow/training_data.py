@@ -51,6 +51,8 @@ def training_sets(
 
 def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
     """Raise ConfigError, before anything is written, if the network cannot be trained on samples of this size."""
+    # A crop has one size whatever the source; of rendered samples the first is made here all the same, so that a bad
+    # recipe fails before anything is written.
     sources = [source for source in dataset.sources if crop is None or is_endless(source)]
     firsts = [source.first() if is_endless(source) else source[0] for source in sources]
     if crop is not None:

@@ -278,6 +278,7 @@ def _blender_uvs(uvs: np.ndarray, uv_scale: tuple[float, float]) -> np.ndarray:
     scaled = uvs.astype(np.float64) * uv_scale
     if len(scaled):
         scaled -= np.rint((scaled.min(axis=0) + scaled.max(axis=0)) / 2)
+    # v grows downwards here and upwards in Blender.
     return np.stack([scaled[:, 0], 1.0 - scaled[:, 1]], axis=1).astype(np.float32)
 
 

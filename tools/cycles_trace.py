@@ -70,6 +70,7 @@ def expose(scene: Blender, movers: list, poses: np.ndarray) -> None:
         last = None
         for i, pose in enumerate(its):
             place(body_part, pose)
+            # q and -q are one rotation; the linear way between two keys is the short one only for like signs.
             if last is not None and np.dot(last, body_part.rotation_quaternion) < 0:
                 body_part.rotation_quaternion = [-q for q in body_part.rotation_quaternion]
             last = np.array(body_part.rotation_quaternion)
@@ -98,6 +99,7 @@ def place(body_part: Blender, pose: np.ndarray) -> None:
 def quaternion(R: np.ndarray) -> np.ndarray:
     """(4,) w, x, y, z of a rotation matrix (Shepperd 1978: divides by the largest component)."""
     xx, yy, zz = np.diagonal(R)
+    # squares[k] is 4 q_k^2, and products[i, k] is 4 q_i q_k: row k is q up to the factor 4 q_k.
     squares = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
     products = np.array(
         [
@@ -378,6 +380,7 @@ def make_lamp(bpy: Blender, scene: Blender, lamp: dict, shadows: bool) -> Blende
     """A strength is the radiance of a white surface that faces it, of a point or spot light 1 unit away: an irradiance
     of pi times that, and a power of 4 pi² times that, which Blender sends to all sides, whatever the cone."""
     light = bpy.data.lights.new(lamp["kind"], lamp["kind"].upper())
+    # Blender has a colour and an energy: the colour holds the ratios, the energy the largest strength.
     largest = max(*lamp["strength"], 1e-30)
     light.color = [s / largest for s in lamp["strength"]]
     light.energy = (np.pi if lamp["kind"] == "sun" else 4 * np.pi**2) * largest
@@ -441,6 +444,7 @@ def adjust(scene: Blender, settings: dict) -> None:
     cycles.pixel_filter_type = "BOX"
     cycles.max_bounces = cycles.diffuse_bounces = settings["bounces"]
     cycles.glossy_bounces = cycles.transmission_bounces = cycles.volume_bounces = 0
+    # Rays pass holes and culled faces, each of which takes one of these, and none of the bounces above.
     cycles.transparent_max_bounces = 64
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.light_sampling_threshold = 0.0

@@ -67,6 +67,7 @@ def sums(folder: Path) -> dict[str, str]:
         name = path.relative_to(folder).as_posix()
         if path.is_file() and not NOT_DATA.search(name):
             whole = digests.setdefault(path.relative_to(folder).parent.as_posix(), hashlib.sha256())
+            # A zero ends the name, and a hash of fixed length follows: no other files give the same input.
             whole.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return {name: whole.hexdigest()[:16] for name, whole in digests.items()}
 

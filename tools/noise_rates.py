@@ -34,6 +34,8 @@ from blinkgl.events.noise import DEAD_FRAMES, DEAD_K, DEAD_SIZES, RATE_K, RATE_S
 
 def rate_per_step(size: float, k: float, place: float, cells: int) -> float:
     """Events per frame of a ladder with a rung at ``place``; ``cells`` of the grid between two rungs."""
+    # An Ornstein-Uhlenbeck process from frame to frame: the share of the noise that stays, and the deviation of what is
+    # new.
     a, fresh = np.exp(-k), size * np.sqrt(-np.expm1(-2 * k))
     rungs = int(np.ceil(5.5 * size)) + 1
     below = np.repeat(np.arange(-rungs, rungs), cells)  # of each cell: the rung under it
@@ -56,6 +58,7 @@ def rate_per_step(size: float, k: float, place: float, cells: int) -> float:
         after[rows, n.size :] = move * (new_bit == 1)
         counts[rows] = (move * passed).sum(1)
     system = after.T - np.eye(2 * n.size)
+    # The stationary law solves after.T state = state; the last equation gives way to the sum of all chances, 1.
     system[-1] = 1.0
     state = np.linalg.solve(system, np.eye(1, 2 * n.size, 2 * n.size - 1)[0])
     return float(state @ counts)
@@ -91,6 +94,7 @@ def count_events(size: float, k: float, dead: float, steps: int, seed: int) -> i
             while abs(now - reference) >= 1:
                 events += 1
                 level = reference + (1.0 if now > reference else -1.0)
+                # The part of the frame at which the line reaches the level; the dead time begins there.
                 end = max((level - noise) / (now - noise), look) + dead
                 if end >= 1:
                     wait = end - 1

@@ -221,6 +221,7 @@ def burst(folder: Path, names: list[str]) -> dict[str, dict[str, float]]:
         answer = answer_of(name, height, width)
         if not reads_two(name):
             flows[name] = answer(whole)
+        # The flow over the second half stands for the whole burst, as if its motion were even.
         flows[f"{name}, halves"] = answer(halves) * ((t1 - t0) / (t1 - middle))
     return {name: row_of([(np.asarray(flow, np.float64), truth, valid, hit)]) for name, flow in flows.items()}
 

@@ -132,6 +132,7 @@ def _distances(those: Sequence[np.ndarray], ours: Sequence[At]) -> np.ndarray:
         rounding = 4e-7 * np.maximum.reduceat(np.abs(true[k]).max(axis=1), starts)
         error[:, k] = np.maximum(np.maximum.reduceat(off, starts) - rounding, 0) / scale
         low, high = np.minimum.reduceat(points[nearest], starts), np.maximum.reduceat(points[nearest], starts)
+        # Shrunk to a point, ours is as good as hidden; hidden on one side only is an error of 1.
         gone = (high - low).max(axis=1) <= _NOTHING * largest[:, 0]
         error[:, k] = np.where(hidden[:, k] | gone, (hidden[:, k] != gone) * 1.0, error[:, k])
     return error.max(axis=0)

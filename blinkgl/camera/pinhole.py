@@ -32,6 +32,7 @@ class PinHole(CameraModel):
     def from_lens_point(self, a: float, b: float, focus: float) -> PinHole:
         """Return the camera of a point (a, b) of a lens in front of this camera, focused at depth ``focus``: its centre
         is (a, b, 0), and its picture is shifted."""
+        # The picture is shifted by the parallax at ``focus``, so that points in focus keep their pixels.
         return replace(self, cx=self.cx + self.fx * a / focus, cy=self.cy + self.fy * b / focus)
 
     @property
@@ -81,6 +82,7 @@ class PinHole(CameraModel):
 
     @property
     def magnification(self) -> float:
+        # Z times the Jacobian is f (1, 0, -u; 0, 1, -v), with the largest singular value f sqrt(1 + u^2 + v^2).
         return float(max(self.fx, self.fy) * np.sqrt(1 + np.hypot(*self._edge()) ** 2))
 
     @property

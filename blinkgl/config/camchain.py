@@ -81,6 +81,7 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
     a model, a wrong number of them, impossible values, a distortion that folds inside the image, or a transform that is
     not rigid."""
     where, text = str(path), read_text(path)
+    # A line of COLMAP's: CAMERA_ID MODEL WIDTH HEIGHT PARAMS.
     if re.search(r"^[ \t]*\d+[ \t]+[A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]", text, re.M):
         return _colmap(text, where)
     tree = _tree(text, where)

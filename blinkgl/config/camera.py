@@ -131,6 +131,7 @@ def _model(width, height, lens, distortion, fov, focal, fx, fy, cx, cy, near) ->
     if fx is None:
         if focal is None:
             angle = math.radians(60.0 if fov is None else fov)
+            # An equidistant lens has r = f * angle, a pinhole r = f tan(angle).
             focal = width / angle if lens == "equidistant" else focal_length(width, angle)
         fx = fy = focal
     cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
@@ -218,6 +219,7 @@ def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, 
         T = np.eye(4)
         for link in links:  # from the axes of the camera before to its own
             T = np.asarray(link) @ T
+        # T leads from the first camera to this one; the place on the rig is the way back.
         keys["place"] = {"matrix": np.linalg.inv(T).tolist()}
     imu, place = table.get("imu"), chain[number][1].T_cam_imu if chain else None
     if isinstance(imu, dict) and place is not None and not {"position", "rotation"} & set(imu):

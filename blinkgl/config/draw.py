@@ -62,6 +62,7 @@ def options(path: tuple[str, ...], node: Tree, between: bool = False) -> list[An
     low, high = (_number(x) for x in (spec[2:] if kind == "normal" else spec))
     if kind == "integer":
         return list(dict.fromkeys((int(low), int(high))))
+    # The golden section: between whole ends hardly ever a whole number, so that a key of whole numbers refuses it.
     return list(dict.fromkeys((low, high, low + 0.381966 * (high - low)) if between else (low, high)))
 
 
@@ -177,6 +178,7 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     _check(path, kind, spec)
     key = int.from_bytes(hashlib.sha256("/".join(path).encode()).digest()[:8], "little")
     if kind == "shares":
+        # Without the sequence in its key: all sequences continue one series, so that their shares come out.
         start = int(np.random.SeedSequence(seed, spawn_key=(int(Role.PARAMETERS), key)).generate_state(1, np.uint64)[0])
         return _share_at((start + sequence * _GOLDEN) % 2**64 / 2**64, spec)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(sequence), int(Role.PARAMETERS), key)))

@@ -62,6 +62,7 @@ class ImuConfig(Config):
 
 def imu_count(rate: float, t0_ns: int, t1_ns: int) -> int:
     """Return the number of measurements in [t0, t1], both ends included."""
+    # 1e-9, so that rounding does not lose a measurement at the very end.
     return int((t1_ns - t0_ns) * 1e-9 * rate + 1e-9) + 1
 
 

@@ -134,6 +134,7 @@ def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]
             other = seen.setdefault((file, files[file]["sha256"]), name)
             if other == name:
                 continue
+            # Of one seed and one number the draws are the same, and so may be the bytes.
             numbers = [(known[n].config.seed, known[n].manifest["sequence"]) for n in (name, other)]
             if numbers[0] != numbers[1] and random_scene:
                 problems.setdefault(name, []).append(

@@ -153,6 +153,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
         costs = rehearsals(template, index, config.output.sequences, gl)  # first: with empty caches, as a run begins
         scene, result = sequence_scene(config, index, template.base), Explanation(machine=gl.renderer)
         cameras = list(config.cameras())
+        # Each camera with events draws the same number of event frames.
         frames = costs[0].frames // max(sum(events for *_, events in cameras), 1)
         rate = costs[0].events * 1e9 / (scene.t1_ns - scene.t0_ns)
         for number, name, own, events in cameras:

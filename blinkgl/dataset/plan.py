@@ -44,6 +44,7 @@ class Tasks(Sequence[Task]):
 
     def __init__(self, parts: Sequence[tuple[str, OutputConfig, int, int]]):
         self._parts = tuple(parts)
+        # _starts[k] is the number of the first task of part k; the last entry is the number of all tasks.
         self._starts = [0]
         for *_, count in self._parts:
             self._starts.append(self._starts[-1] + count)
@@ -161,6 +162,8 @@ class Plan:
 def _dealt(num: int, counts: list[int]) -> list[int]:
     """Return ``num`` dealt in proportion to ``counts`` by the method of Sainte-Laguë, in which no share falls when
     ``num`` grows."""
+    # No share is further than (n + 1) / 2 from its exact part, of n groups: the dealing may begin n below it, and takes
+    # no longer for millions.
     shares = [max(num * count // sum(counts) - len(counts), 0) for count in counts]
     while sum(shares) < num:
         shares[min(range(len(counts)), key=lambda k: (2 * shares[k] + 1) / counts[k])] += 1

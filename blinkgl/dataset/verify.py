@@ -73,6 +73,7 @@ def bound(name: str, manifest: dict[str, object], config: SequenceConfig, events
         ]
     causes = events and bool(getattr(config.events, "causes", False))
     if ("events_by_cause" in manifest) != causes:
+        # A value that the manifest does not have: unlike() makes a line of it.
         fields.append(("events_by_cause", "that there are some" if causes else None))
     problems = [*unlike(manifest, fields), *misnamed(name, manifest, config)]
     if config.frames is None and not problems:

@@ -92,6 +92,7 @@ class LightNoise:
         self._batch += 1
         wait, pick = uniform2(self._seed, index, _STREAM, _WHEN)
         keep, _ = uniform2(self._seed, index, _STREAM, _WHICH)
+        # One process of all pixels together; below each candidate gets a pixel, in proportion to the shares.
         t_ns = self._t_ns + waits_ns(wait, self._sums[-1] * self.most_hz)
         self._t_ns = int(t_ns[-1])
         pixel = np.minimum(np.searchsorted(self._sums, pick * self._sums[-1], side="right"), len(self._sums) - 1)

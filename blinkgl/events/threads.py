@@ -30,6 +30,7 @@ def _exchange(typingctx, array, index, value):
 
     def codegen(context, builder, signature, arguments):
         data = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0]).data
+        # "monotonic" sets no order with other memory: it is enough that no part is taken twice.
         return builder.atomic_rmw("xchg", builder.gep(data, [arguments[1]]), arguments[2], "monotonic")
 
     return types.int64(array, types.int64, types.int64), codegen

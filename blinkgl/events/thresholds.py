@@ -48,6 +48,7 @@ def measured_thresholds(file: str, height: int, width: int) -> tuple[np.ndarray,
     low, high = _MEASURED
     outside = ~((values >= low) & (values <= high))
     if outside.any():
+        # The last two indices are y and x, whether or not C+ and C- have an axis of their own.
         y, x = np.argwhere(outside)[0, -2:]
         raise EventDataError(
             f"{np.count_nonzero(outside)} thresholds out of range, the first at pixel ({x}, {y})",

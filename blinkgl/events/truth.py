@@ -101,6 +101,7 @@ class SurfaceTruth:
                 speeds, best = _where(passes, other, speeds), np.where(passes, other[1], best)
         if self._left is not None:
             left = _looked_up(self._left, pixel)
+            # The surface that has left, while its pixel still follows the change and nothing nearer is there.
             follows = (1000 * events.t <= self._until_ns.reshape(-1)[pixel]) & (left[1] < best)
             speeds = _where(follows & (left[0] != speeds[0]), left, speeds)
         truth["instance"], truth["depth"], truth["velocity"] = speeds

@@ -230,6 +230,7 @@ class V2e(Emulator):
     @classmethod
     def response(cls, config: V2eConfig) -> Response:
         """Return the lin-log response: linear up to 20 digital numbers."""
+        # Below 20 DN the chord from the origin, whose slope is per DN: full_scale times as much per unit of luminance.
         return Response(
             min(config.thresholds), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale
         )

@@ -377,10 +377,12 @@ class DvsVoltmeter(Emulator):
 
     @classmethod
     def response(cls, config: VoltmeterConfig) -> Response:
+        # Without noise and leak V is k1 ln(L + k2) but for a constant, and its threshold is 1.
         return Response(1.0, config.k1, config.k2 / config.full_scale)
 
     @classmethod
     def noiseless(cls, config: VoltmeterConfig) -> EsimConfig:
+        # V's threshold of 1 is 1 / k1 in ln units, here limited to what ESIM accepts.
         return EsimConfig(contrast_threshold=min(max(1 / config.k1, 0.001), 10))
 
     def __init__(

@@ -91,6 +91,7 @@ def _load_library() -> ctypes.CDLL:
     lib = ctypes.CDLL(name)
     if not hasattr(lib, "OSMesaCreateContextAttribs"):
         raise OSMesaUnavailable("libOSMesa is too old (no OSMesaCreateContextAttribs, Mesa < 12)")
+    # Declared, because ctypes takes every result for a C int by default and would cut off half of a pointer.
     pointer = ctypes.c_void_p
     lib.OSMesaCreateContextAttribs.argtypes = [pointer, pointer]
     lib.OSMesaCreateContextAttribs.restype = pointer

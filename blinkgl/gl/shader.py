@@ -244,6 +244,7 @@ def _ends_in_comment(line: str, inside: bool) -> bool:
                 return True
             inside, position = False, end + 2
         start, slashes = line.find("/*", position), line.find("//", position)
+        # A // before it comments out the opening of a block comment.
         if start < 0 or 0 <= slashes < start:
             return False
         inside, position = True, start + 2
@@ -295,6 +296,7 @@ class ShaderLoader:
         """Return the program of file ``name`` with ``defines``; it is compiled when first requested, and again when a
         generated include has changed. Raises ShaderError."""
         key = (name, normalised(defines))
+        # A plug-in may have registered another source of a generated include since the program was compiled.
         if key not in self._programs or not self._made.get(key, {}).items() <= made_includes().items():
             self._programs[key] = self._compile(name, defines)
         return self._programs[key]

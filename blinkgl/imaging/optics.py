@@ -83,10 +83,12 @@ def kernels_of(psf: GaussianPsfConfig | AiryPsfConfig | KernelPsfConfig) -> list
     from scipy.special import j1
 
     reach = math.ceil(psf.radius * _AIRY_ZEROS[1] / _AIRY_ZEROS[0])
+    # Places of the samples, px from the centre of the middle pixel; all pixels have _WITHIN of them a side.
     place = np.arange(-reach * _WITHIN - _WITHIN // 2, reach * _WITHIN + _WITHIN // 2 + 1) / _WITHIN
     distance = np.hypot(place[:, None], place[None]) * _AIRY_ZEROS[0] / psf.radius
     inside = (distance > 0) & (distance < _AIRY_ZEROS[1])
     ring = np.where(inside, distance, 1.0)
+    # Airy's pattern, (2 J1(x) / x)^2: 1 in its middle, and cut off at the third dark ring.
     pattern = np.where(inside, (2 * j1(ring) / ring) ** 2, distance == 0)
     weights = pattern.reshape(2 * reach + 1, _WITHIN, 2 * reach + 1, _WITHIN).mean(axis=(1, 3))
     return [weights / weights.sum()]

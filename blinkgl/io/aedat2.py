@@ -69,6 +69,7 @@ class Aedat2Reader:
         # jAER names the chip by its Java class, whose last part is such as DAVIS346B.
         chip = re.search(r"^#\s*AEChip:\s*(\S+)", self._header, re.M)
         name = chip.group(1).rpartition(".")[2] if chip else None
+        # A digit behind the name would belong to the number of another chip.
         known = next((known for known in SIZES if name and re.match(rf"{known}(?!\d)", name, re.I)), None)
         if chip is None:
             known = self._unnamed(reading)
@@ -256,6 +257,7 @@ def _unwrap(address, kinds, stamp, state, height, width, keep, t):
             now = state[0] + (step if step < 0x80000000 else step - 0x100000000)
         # Within its own kind a record must not be earlier than the one before.
         if (now < state[1 + kind] and not keep) or now < 0:
+            # For the message: the time that this record must not precede.
             state[0] = state[1 + kind]
             return i, 2
         t[i] = now
@@ -308,6 +310,7 @@ def _assemble(address, t, begin, reset, signal, times):
     for i in range(begin, len(address)):
         # Bit fields of a frame sample: x, y, and the 10 bits of the ADC.
         x, y, sample = address[i] >> 12 & 0x3FF, address[i] >> 22 & 0x1FF, address[i] & 0x3FF
+        # Bit 10 is 1 for a signal read and 0 for a reset read.
         if address[i] >> 10 & 1:
             # A second read of a pixel belongs to the next frame.
             if signal[y, x] >= 0:

@@ -284,8 +284,13 @@ class Aedat4Writer(CheckedWriter):
         super().__init__(path, height, width)
         self._packets: list[tuple[int, int, int, int, int]] = []
         info = _INFO.format(height=height, width=width).encode()
+        # The vtable: its size, the size of the table, and where the table has its fields: compression, place of the
+        # table of packets, text. The table: distance back to the vtable, compression 0 (none), offset of the text, no
+        # place yet (-1).
         vtable = struct.pack("<5H", 10, 20, 4, 12, 8)
         table = struct.pack("<iiIq", 10, 0, 12, -1)
+        # The table begins at byte 24. Its field of 64 bits, 12 bytes on, then lies at a multiple of eight from the
+        # length on, and at _TABLE_AT of the file.
         body = struct.pack("<I4s6x", 24, b"IOHE") + vtable + table + struct.pack("<I", len(info)) + info + b"\0"
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
@@ -297,9 +302,13 @@ class Aedat4Writer(CheckedWriter):
             rows = np.zeros(len(part), _EVENT)
             for name in "txyp":
                 rows[name] = getattr(part, name)
+            # Root at byte 16, the four letters, padding; a vtable of 6 bytes for a table of 8 with one field, at 4,
+            # which leads to the list; then the number of events.
             head = struct.pack("<I4sHHHHiII", 16, b"EVTS", 0, 6, 8, 4, 6, 4, len(part))
             size = 4 + len(head) + rows.nbytes
+            # The packet's own header, stream 0 and its size, then the FlatBuffer's length.
             self._file.write(struct.pack("<III", 0, size, size - 4) + head)
+            # A packet's place is that of its FlatBuffer's length, behind the packet's header.
             self._packets.append((self._file.tell() - 4 - len(head), size, len(part), int(part.t[0]), int(part.t[-1])))
             self._file.write(rows.data)
 
@@ -321,6 +330,8 @@ def _table_of_packets(packets: list[tuple[int, int, int, int, int]]) -> bytes:
     vtable_at = list_at + 4 * len(packets)
     first = vtable_at + 14 + (4 - (vtable_at + 14)) % 8
     offsets = [first + step * k - (list_at + 4 * k) for k in range(len(packets))]
+    # The vtable: its size, the size of an entry, and where an entry has its place, stream and size, number of events,
+    # first and last time.
     body = head + struct.pack(f"<{len(packets)}I", *offsets) + struct.pack("<7H", 14, 44, 12, 4, 20, 28, 36)
     body += b"\0" * (first - 4 - len(body))
     for k, (place, size, count, begin, end) in enumerate(packets):

@@ -96,6 +96,7 @@ def _matrix(body: memoryview) -> tuple[str, object]:
     """Return name and value. The fields of each element of a struct array follow each other as matrices without names;
     the elements' columns are joined."""
     parts = _elements(body)
+    # An array begins with its flags, whose first byte is its class, its sides and its name.
     flags, shape, called = next(parts)[1], np.frombuffer(next(parts)[1], "<i4"), next(parts)[1]
     name = bytes(called).decode("latin-1")
     if flags[0] == _STRUCT:
@@ -198,6 +199,8 @@ class NpzFolderReader:
                 raise AssetError("another sensor than in the file before", where=str(path), value=size)
             for events in one.chunks():
                 if not count and len(events):
+                    # Times that only overlap are refused where their order is checked; a file that begins no later than
+                    # the one before it has a clock of its own.
                     if events.t[0] <= begun < last:
                         raise AssetError(
                             "the times begin again in this file",
@@ -262,6 +265,7 @@ def _candidates(
         order = ("t", "x", "y", "p") if evimo else reading.columns
         return table_of_rows(array, where, order, place=name, **{**known, **layout})
 
+    # What the file itself states overrules a layout.
     for layout, types, unit, per_px in _LAYOUTS:
         if set(columns.values()) == types.keys() and all(shapes[k][1] == np.dtype(kind) for k, kind in types.items()):
             known = {"unit": unit, "layout": layout, "per_px": per_px, **known}
@@ -269,6 +273,7 @@ def _candidates(
         used = [*columns.values(), *(["cause"] if "cause" in shapes else [])]
         count = shapes[columns["t"]][0][:1]
         others = [name for name, (shape, _) in shapes.items() if shape[:1] == count and name not in (*used, *_KNOWN)]
+        # Of a single event every lone number in the file is as long as a column, and need not be one.
         known["notes"] = [*known["notes"], *not_columns(others if count != (1,) else ())]
         arrays = {name: load(name) for name in used}
         return [("", lambda: _of_columns(columns, arrays, where, **known))]

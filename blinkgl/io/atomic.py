@@ -90,6 +90,7 @@ def _alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except OSError:
+        # A process of another user, which this one may not signal.
         return True
     return True
 
@@ -125,6 +126,7 @@ def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator
     with _appearing(final) as temporary:
         yield temporary
         with output_errors(final):
+            # The content reaches the disk before the name does: a power cut leaves the old file or the whole new one.
             fsync(temporary)
             os.replace(temporary, final)
             fsync(final.parent)
@@ -183,6 +185,7 @@ def atomic_folder(final: str | os.PathLike, *, overwrite: bool = False) -> Itera
             for path in sorted(temporary.rglob("*"), reverse=True):  # what a folder holds comes before the folder
                 fsync(path)
             fsync(temporary)
+            # os.rename puts no folder in the place of one that holds files, as os.replace does for a file.
             if overwrite:
                 shutil.rmtree(final, ignore_errors=True)
             refuse_existing(final)
@@ -221,6 +224,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
             os.write(handle, f"process {os.getpid()} of {socket.gethostname()}".encode())
         yield
     finally:
+        # Removed while it is still locked: a run that has opened it meanwhile sees that it is gone and makes another.
         if is_still(path, handle):
             path.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # a refused run leaves nothing; records stay

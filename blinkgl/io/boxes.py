@@ -54,7 +54,9 @@ def kitti_text(value: Boxes) -> str:
     for k in np.flatnonzero(value.visible_pixels > 0):
         T, (length, width, height) = value.T_cam_box[k], value.size[k]
         x, y, z = T[:3, 3] - T[:3, 2] * height / 2
+        # A turn by r about y takes (1, 0, 0) to (cos r, 0, -sin r).
         turn = float(-np.arctan2(T[2, 0], T[0, 0]))
+        # The turn as seen along the ray to the box; sine and cosine bring the difference into (-pi, pi].
         alpha = np.arctan2(np.sin(turn - np.arctan2(x, z)), np.cos(turn - np.arctan2(x, z)))
         hidden = int(np.searchsorted([_PARTLY, _LARGELY], value.occluded[k], side="right"))
         box = value.cut_box[k]

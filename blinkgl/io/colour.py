@@ -27,6 +27,7 @@ def flow_wheel() -> np.ndarray:
     """Return the colour of unit-disc flow (u, v) at [255 + 255 v, 255 + 255 u], (511, 511, 3) uint8; white at rest."""
     ring = np.concatenate([np.linspace(a, b, n, endpoint=False) for n, a, b in _BANDS])
     v, u = np.mgrid[-_RADIUS : _RADIUS + 1, -_RADIUS : _RADIUS + 1] / _RADIUS
+    # Middlebury's colour code: the angle of (-u, -v), from -pi to pi, is the place on the ring.
     position = (np.arctan2(-v, -u) / np.pi + 1) / 2 * len(ring)  # closed: no seam at pure +x
     low = position.astype(int) % len(ring)
     high = (low + 1) % len(ring)
@@ -98,6 +99,7 @@ def event_colour(counts: np.ndarray) -> np.ndarray:
     return rgb
 
 
+# The first event takes 59 % of a channel, each further one 59 % of what is left; eight take all of it.
 _SHADE = np.rint(255 * (1 - np.exp(-0.9 * np.arange(9)))).astype(np.uint8)
 
 

@@ -271,6 +271,7 @@ def whole(
             value=str(column.dtype),
             accepted="integers or floats",
         )
+    # A type that can only hold accepted values needs no pass over the column.
     limits = None if column.dtype.kind in "fb" else np.iinfo(column.dtype)
     fits = column.dtype.kind == "b" or (limits is not None and limits.min >= low and limits.max <= high)
     if not fits and len(column) and not (column.min() >= low and column.max() <= high):  # NaN compares False

@@ -116,6 +116,7 @@ class EvtReader:
         name, *rest = fields.get("format", "").split(";")
         options = dict(part.split("=", 1) for part in rest if "=" in part)
         system = fields.get("system_ID", "")
+        # A system_ID tells something only where no other integrator is named.
         prophesee = {fields.get(k, "Prophesee") for k in _INTEGRATORS} == {"Prophesee"}
         usual = _SYSTEMS.get(int(system)) if prophesee and system.isdigit() and len(system) < 10 else None
         stated = name or fields.get("evt", "") or (usual[0] if usual else "")
@@ -274,6 +275,7 @@ def _decode_evt2(words, masks, state, x, y, t, p, triggers, kinds):
     -1: none).
 
     masks : bit k is an event at the word's x + k; of EVT2 that is 1.   kinds : what each type is, of _KINDS."""
+    # Kinds: 0 and 1 an event, 2 and 3 a vector, 4 TIME_HIGH, 5 a trigger, 6 skipped, 7 unknown (_EVENT to _UNKNOWN).
     n, bad, seen = 0, -1, 0
     high, wraps, untimed, vector = state[0], state[1], state[2], state[10]
     for i in range(len(words)):
@@ -284,6 +286,7 @@ def _decode_evt2(words, masks, state, x, y, t, p, triggers, kinds):
             if vector:
                 # EVT4: this word is the mask of the vector before it.
                 mask, word, vector = word, vector, 0
+                # Vectors of OFF and ON are two kinds above single events of OFF and ON.
                 kind = kinds[word >> 28] - 2
             # Before the first TIME_HIGH the time is unknown.
             if high < 0:
@@ -291,6 +294,7 @@ def _decode_evt2(words, masks, state, x, y, t, p, triggers, kinds):
                 continue
             # Of the time, from the top: wraps, 28 bits of TIME_HIGH, 6 bits of the word itself.
             column, now = (word >> 11) & 0x7FF, (((wraps << 28) | high) << 6) | ((word >> 22) & 63)
+            # A word of one event, as all of EVT2 are: no loop over the bits.
             if mask == 1:
                 x[n], y[n], t[n], p[n] = column, word & 0x7FF, now, kind
                 n += 1
@@ -313,9 +317,11 @@ def _decode_evt2(words, masks, state, x, y, t, p, triggers, kinds):
                 wraps += 1
             high = new
         elif kind <= 3:
+            # EVT4: the next word is the mask of this one.
             vector = word
         elif kind == 5:
             if high >= 0:
+                # Bits 12..8 are the channel, bit 0 the edge.
                 triggers[seen] = (((wraps << 28) | high) << 6) | ((word >> 22) & 63), (word >> 8) & 31, word & 1
                 seen += 1
         elif kind == 7:

@@ -142,5 +142,6 @@ class NMnistWriter(CheckedWriter):
         if events.x.max() > 255 or events.y.max() >= _PASSES:  # of a sensor whose size is not known
             raise OutputError("an event outside what .bin holds", where=str(self.path), accepted="256x240 px")
         rows["x"], rows["y"], rows["low"] = events.x, events.y, events.t & 0xFFFF
+        # Bit 7 is the polarity; the seven below it are the upper ones of the time.
         rows["high"] = events.p << 7 | (events.t >> 16).astype(np.uint8)
         self._file.write(rows.tobytes())

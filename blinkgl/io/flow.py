@@ -34,6 +34,7 @@ def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_
     """
     valid = np.asarray(valid, bool)
     with np.errstate(invalid="ignore", over="ignore"):
+        # The code is 2^15 + scale * flow, rounded; float32 holds whole numbers of this size exactly.
         code = np.asarray(flow, np.float32) * np.float32(scale)
         np.rint(code, out=code)
         code += np.float32(_ZERO)

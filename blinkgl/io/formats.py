@@ -213,6 +213,7 @@ class EventFile(Closing):
             t = events.t
             peak = np.maximum.accumulate(np.append(latest, t))[1:]  # the latest time so far, at each event
             latest, behind = (int(peak[-1]) if len(t) else latest), peak - t
+            # With sort all events are here at once, so that none comes too late.
             lost = (behind > _OVERLAP_US) & (not self.reading.sort)
             late, moved = late + int(np.count_nonzero(lost)), moved + int(np.count_nonzero(behind[~lost]))
             most = max(most, int(behind[~lost].max(initial=0)))

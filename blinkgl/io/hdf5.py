@@ -90,6 +90,7 @@ class Data(_Held):
         memory; damaged."""
         self.check()
         with hdf5_errors(self._path):
+            # The bytes of the result: an axis without a part is read whole, and an integer takes one of it.
             count, parts = self.dtype.itemsize, place if isinstance(place, tuple) else (place,)
             for size, part in itertools.zip_longest(self.shape, parts[: len(self.shape)], fillvalue=slice(None)):
                 count *= len(range(*part.indices(size))) if isinstance(part, slice) else 1
@@ -293,6 +294,7 @@ def _check_storage(data: h5py.Dataset, name: str, path: Path) -> None:
             for offset, size, mask in chunks:
                 file.seek(offset)
                 unpacked = 0 if mask >> codes.index(packing[0]) & 1 else _CLAIMED[packing[0]](file, size, raw)
+                # A chunk that cannot be packed may be longer than its values, by a 128th and a few bytes.
                 if max(unpacked, size - raw // 128 - 64) > raw + _SUM_BYTES:
                     problem = f"damaged HDF5 file: a chunk of {name} unpacks to more than its values"
                     raise AssetError(problem, where=str(path), value=f"{size} bytes", accepted=f"{raw} bytes of values")

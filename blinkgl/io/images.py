@@ -212,6 +212,7 @@ def checked_arrays(
         stated, _ = file.shapes()
         for name, (axes, kinds) in wanted.items():
             shape, (length, dtype) = (), stated.get(name, ((), np.dtype("V")))
+            # A letter has the length that the first array with this letter gives it.
             for axis, side in zip(axes, length):
                 shape += (int(axis) if axis.isdigit() else sizes.setdefault(axis, side),)
             if name in stated and (len(length) != len(axes) or length != shape or dtype.kind not in kinds):
@@ -249,6 +250,7 @@ def over(
     if (alpha >= 0.998 * top).all():  # FFmpeg widens 10 bits to 1023 * 64
         return (colour[..., 0] if grey else colour), None
     below = np.asarray(background or (0, 0, 0), np.float64) / 255 * top
+    # A grey picture takes the luminance of the colour, by BT.709's weights.
     below = below @ [0.2126, 0.7152, 0.0722] if grey else below
     share = alpha / top
     multiplied = image.dtype.kind == "f" if associated is None else associated
@@ -280,6 +282,7 @@ def read_pfm(path: str | os.PathLike) -> np.ndarray:
         raise AssetError(
             "truncated or malformed PFM file", where=str(path), value=f"{len(data)} bytes", accepted=f"{expected}"
         )
+    # The sign of the scale tells the order of the bytes; its size is not applied.
     pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end()).astype(np.float32)
     return np.ascontiguousarray(pixels.reshape((height, width, 3) if channels == 3 else (height, width))[::-1])
 
@@ -320,6 +323,7 @@ def _image_problem(data: bytes) -> str | None:
         return "a JPEG, where pictures without loss are read"
     if data[:2] == b"#?":
         size_line = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
+        # Radiance usually states rows first: -Y HEIGHT +X WIDTH.
         size = size_line and (int(size_line[2]), int(size_line[1]))
     else:
         try:
@@ -331,6 +335,7 @@ def _image_problem(data: bytes) -> str | None:
             return "cannot decode image (corrupt or truncated)" if not len(data) else None
     if not size:
         return "cannot decode image (no size in its header)"
+    # OpenCV unpacks Radiance to three float32 a pixel; for other kinds four bytes are taken.
     return size_problem(*size, len(data), 12 if data[:2] == b"#?" else 4)
 
 

@@ -124,6 +124,7 @@ def _alike(files: list[Path], folder: Path) -> tuple[list[Path], list[Path]]:
     if len(shapes) < 2:
         return files, []
     (first, often), (second, less) = shapes.most_common(2)
+    # Names without a number are no series, so that none is a stranger to it.
     if "#" not in first:
         return files, []
     if often >= max(_MAJORITY * len(files), 3):

@@ -184,6 +184,7 @@ def with_tracks(picture: np.ndarray, tracks: TrackLines, t_us: int) -> np.ndarra
     now, share = _between(tracks.t_us, t_us)
     later = min(now + 1, len(tracks.t_us) - 1)
     first = int(np.searchsorted(tracks.t_us, t_us - TAIL_US))
+    # Between two times a point is visible if it is at the nearer one.
     seen = ~tracks.occluded[:, now if share < 0.5 else later]
     ends = (1 - share) * tracks.px[:, now] + share * tracks.px[:, later]
     places = np.concatenate([tracks.px[:, first : now + 1], ends[:, None]], axis=1)

@@ -224,6 +224,7 @@ def _unpacked(
         t = (np.int64(message.time_base) + (values & 0xFFFFFFFF).astype(np.int64) + 500) // 1000
         x, y = (values >> 32 & 0xFFFF).astype(np.uint16), (values >> 48 & 0x7FFF).astype(np.uint16)
         return Events(x, y, t, (values >> 63).astype(np.uint8)), 0
+    # The decoder takes little-endian words, whatever the packet's order.
     rest, parts, lost = data.view(words).astype(words.newbyteorder("<"), copy=False), [], 0
     while True:
         events, bad = decode(message.encoding, rest, state, triggers=triggers)

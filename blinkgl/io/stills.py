@@ -331,6 +331,7 @@ def _tiff(path: Path) -> Stills:
 
 def _check_tags(page: Any, path: Path) -> None:
     """Raise AssetError, naming the tag, for a value that is not in the tables here."""
+    # Tag 339 is SampleFormat; a file without it holds unsigned samples (1).
     formats = page.tags.get(339)
     formats = 1 if formats is None else formats.value
     kinds = {int(one) for one in (formats if isinstance(formats, tuple) else (formats,))}

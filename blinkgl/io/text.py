@@ -125,6 +125,7 @@ class TextReader:
         bare = [name.partition("@")[0] for name in names]
         slots = [declared.get(name) or slot_of(name) for name in bare]
         order = tuple("_" if s in self._reading.named and n not in declared else s for s, n in zip(slots, bare))
+        # A comment is a heading only if each of its words names a column: other comments may contain such words.
         named = all(order.count(slot) == 1 for slot in "txyp") and not (comment and "_" in order)
         if not self._order and named:
             self._order, self._unit = order, self._heading(dict(zip(order, names)))
@@ -359,6 +360,7 @@ def _separates(c):
 def _word(buffer, i, place, pair):
     """Return (value, next index) of a field that is no number: an ignored one, or True and False. Next index -1:
     neither."""
+    # Bit 5 makes a letter small; 116 is t, 102 f.
     letter = buffer[i] | 32
     if place != 4 and not (place == 3 and (letter == 116 or letter == 102)):
         return np.int64(0), -1
@@ -397,6 +399,7 @@ def _fields(buffer, i, values, places, shift, pair, ecd):
                 wrong, i = 2 if place == 3 else 1, begin
                 break
             continue
+        # A time without a point: the line is not of the Event Camera Dataset's layout.
         if ecd and place == 0 and exponent >= 0:
             wrong = 3
         # Times are multiplied by 10^shift: that makes microseconds.
@@ -432,6 +435,8 @@ def _parse(buffer, x, y, t, p, places, shift, pair, keep, ecd):
                 n += 1
                 i, line = i + 1, line + 1
                 continue
+            # A line that does not fit is no event (1), also where its time lacks a point (3). One that fits has an
+            # unknown polarity (2), or another layout (3) where the layout has 0 and 1 alone.
             wrong = wrong if wrong and (fits or wrong != 3) else 1 if not fits else 3 if ecd else 2
             if not keep or wrong != 1:
                 return n, line, lost, wrong

@@ -173,6 +173,7 @@ def _form(path: Path, text: str) -> str | None:
         return "colmap"
     row = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
     count = len(re.split(r"[\s,;]+", row.strip()))
+    # A place and a quaternion are seven numbers, three rows of a 4x4 matrix twelve.
     if count == 7 and "," not in row:
         return "tartanair"
     return "kitti" if count == 12 and "," not in row else None
@@ -344,6 +345,7 @@ def _order_of(names: Sequence[str]) -> list[int]:
 
 def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
     try:
+        # Numbers stay text, from which times are converted exactly; NumPy makes floats of the matrices.
         tree = json.loads(text, parse_int=str, parse_float=str)
         frames = tree["frames"]
         matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)

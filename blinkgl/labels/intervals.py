@@ -80,6 +80,7 @@ class _OverIntervals(Label):
 
     @property
     def forms(self) -> tuple[Form, ...]:
+        # The folders are flow/intervals and occlusion/intervals, of names such as "flow_intervals".
         return (Form(f"{self.name.split('_')[0]}/intervals", "h5", self._encode, self._read),)
 
     def _encode(self, value: Any) -> bytes:

@@ -139,6 +139,7 @@ class SceneFlow(Label):
         change = to_camera @ (then.T_world_obj - now.T_world_obj)[:, :3]
         # A sky at infinity is static: its box only follows the camera.
         change[[obj.at_infinity for obj in shot.scene.objects]] = 0.0
+        # Of shapes that change: from a motion in the other time's clip space, x, y and w, to the camera's axes now.
         of_clip = to_camera @ then.T_world_cam[:3, :3] @ np.linalg.inv(then.view.projection[[0, 1, 3], :3])
         return {"change_in_space": change, "space_from_clip": np.tile(of_clip, (len(change), 1, 1))}
 

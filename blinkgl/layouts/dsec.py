@@ -177,6 +177,7 @@ def _write_disparity(left: Source, right: Source, folder: Path) -> list[str]:
         write_bytes(folder / f"event/{2 * k + 2:06d}.png", encode_disparity(disparity))
     # DSEC's provider drops the first disparity, of a time without events before it.
     write_bytes(folder / "event/000000.png", encode_disparity(np.zeros((left.height, left.width))))
+    # Every second time but the last: that of the empty disparity, then those of the labels.
     write_lines(folder / "timestamps.txt", image_times(left)[:-1:2])
     return []
 
@@ -204,6 +205,7 @@ def cam_to_cam(source: Source, camera: CameraModel) -> str:
     T_right_left = np.linalg.inv(right.poses["T_world_cam"][0]) @ source.poses["T_world_cam"][0]
     tables = None
     if (baseline := _baseline(source, right)) is not None:
+        # Q (x, y, disparity, 1) is the homogeneous point (X, Y, Z, W), with Z / W = f b / disparity.
         focal, _, cx, cy = camera.intrinsics
         Q = [[1.0, 0.0, 0.0, -cx], [0.0, 1.0, 0.0, -cy], [0.0, 0.0, 0.0, focal]]
         tables = {"cams_03": [[float(v) for v in row] for row in (*Q, [0.0, 0.0, 1 / baseline, 0.0])]}

@@ -61,6 +61,7 @@ def _data(source: Source, file: h5py.File, group: str) -> None:
     for k in range(len(taken)):
         append(pictures, source.grey(k)[None])
     keep(file, f"{group}/image_raw_ts", taken * 1e-6)
+    # Images after the last event get its number.
     keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
     if source.unit is not None:
         imu = read_imu(source.unit)

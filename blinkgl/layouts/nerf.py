@@ -146,6 +146,7 @@ def _colmap(camera: CameraModel, T_world_cam: np.ndarray) -> dict[str, list[str]
     # FULL_OPENCV: k1 k2 p1 p2 k3 k4 k5 k6, the last three of a denominator of 1.
     values = [*_intrinsics(camera), *camera.distortion, *([0.0] * 3 if camera.kind == "radtan" else [])]
     world = np.linalg.inv(T_world_cam)
+    # SciPy's quaternions have w last, COLMAP's first.
     turns = Rotation.from_matrix(world[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     poses = [
         line
@@ -179,6 +180,7 @@ def _depths_of_boxes(source: Source) -> np.ndarray:
     depths = [np.empty(0)]
     for number, T_world_obj in zip(poses.get("object_ids", []), poses.get("T_world_obj", [])):
         if box := boxes.get(int(number)):
+            # All eight corners, homogeneous: along each axis the low or the high end of the box.
             corners = np.array([*itertools.product(*zip(*box), (1.0,))])
             depths.append((np.linalg.inv(poses["T_world_cam"]) @ T_world_obj @ corners.T)[:, 2].ravel())
     every = np.concatenate(depths)
@@ -193,6 +195,7 @@ def _event_nerf(source: Source, camera: CameraModel, frames: Frames, T_world_cam
     write_bytes(folder / "events/events.npz", encoded(np.savez_compressed, **columns))
     fx, fy, cx, cy = _intrinsics(camera)
     lens = camera.distortion[:2] if camera.kind == "radtan" else (0.0, 0.0)
+    # A 4x4 matrix of intrinsics, and k1 and k2 in a fifth row.
     rows = [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1], [*lens, 0, 0]]
     for k, (file, pose) in enumerate(zip(frames.files, T_world_cam)):
         write_lines(folder / f"intrinsics/{k:06d}.txt", [_text(row) for row in rows])

@@ -52,6 +52,7 @@ class TapVid(Layout):
         at, shown = _common(source, tracks["t_us"])
         hidden = tracks["occluded"][:, at]
         ever = ~hidden.all(axis=1)  # points that no frame shows cannot be queried
+        # Pixel centres are at whole numbers here, so the corner of the image is at -0.5.
         share = (tracks["target_points"][:, at] + 0.5) / [source.width, source.height]
         table = {
             "video": np.stack([source.image(k) for k in shown]),

@@ -50,6 +50,7 @@ class RosBag(Layout):
 
         eyes = [source, *([] if source.right is None else [source.right])]
         streams = itertools.chain.from_iterable(_camera(eye, f"/cam{k}", store) for k, eye in enumerate(eyes))
+        # Each stream is in order of time, so that merging holds one message of each.
         whole = heapq.merge(*streams, _poses(source, store), _imu(source, store), key=lambda message: message[0])
         path = folder / f"{source.name}.bag"
         with output_errors(path), Writer(path) as bag:
@@ -130,6 +131,7 @@ def _camera_info(source: Source, t_us: int, store: Typestore) -> tuple[str, obje
     flat = isinstance(camera, PinHole)
     distortion = [0.0] * 5 if flat else [getattr(camera, name) for name in camera.coefficients]
     fx, fy, cx, cy = camera.intrinsics
+    # R and P are those of a camera by itself: nothing is rectified, and P is K beside a column of zeros.
     roi = store.types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return kind, store.types[kind](
         header=_header(store, t_us),

@@ -35,6 +35,7 @@ class Heartbeat:
         self.heard()
 
         def beat() -> None:
+            # Sleeps until 30 s after the last line; one that is shown meanwhile puts the next one off.
             while not done.wait(max(self._shown + EVERY_S - time.monotonic(), 0.01)):
                 if time.monotonic() < self._shown + EVERY_S:
                     continue

@@ -260,6 +260,7 @@ def _of_scene(
     clip = clip_of_frames(events, frames, size, reading, seed=seed)
     if reading.delay_ms is not None:
         return clip, None
+    # The clock is found from the fitted half alone, like the parameters.
     search = Search([(clip, (clip.intervals + 1) // 2)], base, seed, lambda done: say("clock", done))
     search.roughly(search.responding(keys), starts)
     return _without_lag(clip, search, events, frames, size, reading, seed), search
@@ -286,6 +287,7 @@ def _without_lag(
 
 def judge_half(recorded: GroupSums, simulated: GroupSums) -> Judged:
     """Return the comparison of ``simulated`` with ``recorded``; its products must be with ``recorded``."""
+    # Of these lists 0 is the rates of moving pixels, 4 the events of still ones, 6 to 8 products, pixels and alike.
     own, other = recorded.without(None), simulated.without(None)
     total = lambda parts: parts[0].sum(axis=0) + parts[4]  # OFF, ON of those that moved and of those that did not
     a, b = total(own), total(other)

@@ -59,6 +59,8 @@ class FrameChecks:
                 f"{self._repeated:.0f} of {count} frames repeat the one before, as in a film at a higher rate: their "
                 "changes make events at once"
             )
+        # The second difference of a steady change is 0; of brightness that goes up and down by one factor it is twice
+        # the logarithm of that factor.
         jumps = np.diff(np.log(np.maximum(self._brightness, 1e-6)), 2)
         if len(jumps) >= 3 and np.median(np.abs(jumps)) > _FLICKER:
             yield (

@@ -83,15 +83,18 @@ class Clips:
         """Yield the frames of a picture, linear light (h, w)."""
         (h, w), (height, width) = light.shape, self.size
         table = np.zeros((h + 1, w + 1))
+        # table[i, j] is the sum over the rows before i and the columns before j.
         table[1:, 1:] = light.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
         low, high = self.path[:, 1:].min(axis=0), self.path[:, 1:].max(axis=0)
         # scale : px of the picture over one of the sensor; the picture stays in view all along the path, but for half
         # a pixel of its border: N-MNIST's 28x28 px move by 7 in 34x34.
         room = np.array([width, height]) - (high - low) + 1
         scale = max(w / room[0], h / room[1])
+        # Edges of the sensor's pixels, px of the sensor from its middle.
         columns, rows = (np.arange(side + 1) - side / 2 for side in (width, height))
         for t_s, x, y in positions(self.path):
             dx, dy = np.array([x, y]) - (low + high) / 2
+            # The table at all edges, first along y, then along x; its differences are the sums over the pixels.
             sums = _at(_at(table, h / 2 + scale * (rows + dy)).T, w / 2 + scale * (columns + dx)).T
             means = np.diff(np.diff(sums, axis=0), axis=1) / scale**2
             # Rounding may leave black a little below 0.

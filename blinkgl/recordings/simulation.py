@@ -380,6 +380,7 @@ def file_to_events(
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))
     iterator = iter(frames)
+    # The files need the first time, and the preview the interval, before the first step is made.
     first = list(itertools.islice(iterator, 2))
     start_us, gap_ns = first[0][1] // 1000, first[-1][1] - first[0][1]
     numbered = enumerate(itertools.chain(first, iterator))

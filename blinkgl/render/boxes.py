@@ -32,6 +32,7 @@ def boxes_of(scene: Scene, t_ns: int, ids: np.ndarray, categories: Categories) -
         T_world_obj = obj.path.pose(t_ns)
         T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
         x0, y0, x1, y1, seen = (int(n) for n in shown[obj.instance_id])
+        # The ball's radius is that of the shape at rest, which says nothing of a deforming one.
         if not seen and not obj.deforms and _aside(camera, obj, T_cam_obj):
             continue
         vertices, faces = _solid(obj, t_ns, T_cam_obj)
@@ -117,6 +118,7 @@ def _holed(scene: Scene, obj: SceneObject, t_ns: int, box: np.ndarray) -> tuple[
     to be more than :data:`WIDEST` times as wide and high."""
     camera = scene.camera
     size = np.array([camera.width, camera.height])
+    # Pixel centres are whole numbers: the first and the last ones in the box.
     low, high = np.ceil(box[:2]), np.floor(box[2:])
     near, far = np.maximum(low, -WIDEST * size), np.minimum(high, WIDEST * size)
     if (far < near).any():
@@ -212,6 +214,7 @@ def cover(px: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> None:
                 elif slope < 0.0:
                     right = min(right, -rest / slope)
                 elif rest < 0.0:
+                    # A horizontal edge: the row is on its inner side as a whole, or not at all.
                     right = -1.0
             if not left <= right + 2.0 * _EDGE:
                 continue

@@ -186,6 +186,7 @@ def nearest(
     camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
     relative = [cam_from_obj(camera_pose, obj.path.pose(t_ns)) for obj, _ in scene_parts(scene)]
+    # R^T, whose columns are the camera's axes in the object's frame.
     axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
     # The camera's centre in each object's axes, -R^T t.
     origins = np.array([-m[:3, :3].T @ m[:3, 3] for m in relative]).reshape(-1, 3)

@@ -161,9 +161,11 @@ class Lines:
         """Return the share of the picture's pixels in which three silhouettes cross, or two at depths that differ by
         more than :data:`_APART`, hidden ones included: which surfaces they divide is a guess (edges.glsl)."""
         pixels, crossings = self.in_pixels(moment, items, width, height)
+        # reduceat needs increasing starts, and the pixels are in the order of their numbers of crossings.
         first = np.sort(pixels[:, 2])
         if not len(first):
             return 0.0
+        # Column 6 is the kind, 0 or -1 for outlines; column 3 is the depth, near / Z.
         outline, depth = crossings[:, 6] < 0.5, crossings[:, 3].astype(np.float64)
         count = np.add.reduceat(outline.astype(np.int64), first)
         nearest = np.maximum.reduceat(np.where(outline, depth, 0.0), first)
@@ -203,6 +205,7 @@ def _part_in_picture(ax, ay, dx, dy, width, height):
     pixel outside, where float32 is accurate; high <= low: none (Liang-Barsky)."""
     low, high = 0.0, 1.0
     for k in range(4):
+        # k: left, right, upper and lower side; d: the line's way towards it; room: distance of its first end.
         d = -dx if k == 0 else dx if k == 1 else -dy if k == 2 else dy
         room = ax + 1 if k == 0 else width + 1 - ax if k == 1 else ay + 1 if k == 2 else height + 1 - ay
         if d > 0:
@@ -210,6 +213,7 @@ def _part_in_picture(ax, ay, dx, dy, width, height):
         elif d < 0:
             low = max(low, room / d)
         elif room < 0:
+            # Parallel to this side, and beyond it.
             high = -1.0
     return low, high
 
@@ -218,6 +222,7 @@ def _part_in_picture(ax, ay, dx, dy, width, height):
 def _cut_at_near_plane(ends):
     """Move an end behind the near plane, z <= w, to where the edge meets it. ends : (2, 4) clip coordinates. Return
     whether anything is in front of it."""
+    # w - z is linear along the edge: above 0 in front of the near plane, 0 on it.
     r0, r1 = ends[0, 3] - ends[0, 2], ends[1, 3] - ends[1, 2]
     if r0 <= 0 and r1 <= 0:
         return False

@@ -106,6 +106,7 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
     first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if len(key) else np.zeros(0, np.int64)
     # Index among its edge's sides: 0 the first, 1 the second.
     rank = np.arange(len(key)) - np.repeat(first, np.diff(np.r_[first, len(key)]))
+    # The second side of an edge is stored in the row of the first; every other side begins a row.
     lead = np.flatnonzero(rank != 1)
     second = np.full(len(lead), -1)
     paired = (rank[lead] == 0) & (lead + 1 < len(key))
@@ -135,6 +136,7 @@ def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
     mine, other = mine[order], other[order]
     nearest = np.r_[True, (np.diff(mine) != 0) | (np.diff(part[other]) != 0)][: len(mine)]
     mine, other = mine[nearest], other[nearest]
+    # A pair as one number, so that its reverse can be looked up: only mutual nearest neighbours are joined.
     back = np.isin(other.astype(np.int64) * len(at) + mine, mine.astype(np.int64) * len(at) + other)
     for one, for_it in zip(at[mine[back]].tolist(), at[other[back]].tolist(), strict=True):
         result[one] = min(result[one], result[for_it])
@@ -153,6 +155,7 @@ def _joined(edges: np.ndarray, places: int) -> np.ndarray:
     begins = np.r_[True, key[1:] != key[:-1]] if len(key) else np.zeros(0, np.bool_)
     alone = np.diff(np.r_[np.flatnonzero(begins), len(key)]) == 2
     first = np.flatnonzero(begins)[alone]
+    # Neighbouring faces of one orientation run along their common side in opposite directions.
     first = first[ends[first, 0] == ends[first + 1, 1]]
     edges[border[first], 3] = edges[border[first + 1], 2]
     return np.ascontiguousarray(np.delete(edges, border[first + 1], axis=0))

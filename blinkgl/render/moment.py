@@ -88,6 +88,7 @@ def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) ->
     farthest, nearest = np.maximum(centre_z + radius, near), np.maximum(centre_z - radius, near)
     inverse = np.empty((len(centre_z), 2), np.float32)
     inverse[:, 0], inverse[:, 1] = 1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest
+    # Bits of floats above 0 are ordered as the floats: one unsigned comparison in the shader tests both limits.
     bits = inverse.view(np.uint32)
     bits[:, 1] -= bits[:, 0]
     return bits

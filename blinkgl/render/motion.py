@@ -193,6 +193,7 @@ class Motion:
         velocity changes steadily: an eighth of this change times the time."""
         apart = b.velocities - a.velocities
         squares = np.einsum("ipk,ipk->ip", apart, apart)
+        # fmax passes over nan: points that are out of view at one of the two times.
         return math.sqrt(float(np.fmax.reduce(squares, axis=None, initial=0.0))) * (b.t_ns - a.t_ns) * 1e-9 / 8
 
 
@@ -240,6 +241,7 @@ def _represented(mesh: Mesh, most: int) -> tuple[Mesh, np.ndarray, float]:
         return mesh, mesh.faces, 1.0
     used, faces = np.unique(mesh.faces[::step], return_inverse=True)
     deformer = None if mesh.deformer is None else mesh.deformer.of_vertices(used)
+    # A deformer that cannot be reduced moves all vertices, also those of faces that are left out.
     if mesh.deformer is not None and deformer is None:
         return mesh, mesh.faces[::step], float(step)
     fewer = replace(
@@ -280,6 +282,7 @@ class View:
             return cls(planes, camera.near, np.zeros(2), np.ones(2), np.ascontiguousarray(diagonal))
         x, y = np.linspace(-0.5, camera.width - 0.5, 65), np.linspace(-0.5, camera.height - 0.5, 65)
         rays = camera.rays(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+        # The cells cover all (X / Z, Y / Z) of the picture; rays at 90 degrees and more have none.
         seen = rays[rays[:, 2] > 0]
         low, high = (f(seen[:, :2] / seen[:, 2:], axis=0) for f in (np.nanmin, np.nanmax))
         size = (high - low) / CELLS

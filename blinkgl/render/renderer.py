@@ -384,6 +384,7 @@ class Labels:
             drawn = _read(self._drawn(names, t_ns, ends), names)
         values: dict[str, object] = {}
         for name in request:
+            # These come from the colour pass, not from the buffers of the label pass.
             if LABELS[name].anti_aliased:
                 at = self._moment(t_ns)
                 values[name] = (draw.colour(t_ns) if self._view is None else draw.flat_colour(at)).read()

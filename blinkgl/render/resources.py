@@ -356,6 +356,7 @@ class SceneResources:
             (width, height),
             components,
             np.ascontiguousarray(image).tobytes(),
+            # Rows follow each other without padding; by default OpenGL expects multiples of four bytes.
             alignment=1,
             dtype=dtype,
             internal_format=internal_format,

@@ -142,6 +142,7 @@ def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[V
 @lru_cache(maxsize=64)
 def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, float, float]:
     """Return ``shadow_scale`` of shadows.glsl."""
+    # x + y times the depth is the width of a texel, z the depth in the map of a world unit, w the size of the lamp.
     camera = view_of(lamp, box, size, np.eye(4))[0].camera
     if isinstance(camera, Parallel):
         return 2 * max(camera.half_x, camera.half_y) / camera.size, 0.0, 1 / camera.depth, lamp.size

@@ -30,6 +30,7 @@ def _velocity(x, y, z, dx, dy, dz, lens):
     """Return (px/s of a point in x and in y, px² per unit² around it); nan where the lens shows nothing. lens : corner,
     size and Jacobians of :class:`~blinkgl.render.motion.View`."""
     corner, size, jacobians = lens
+    # The quotient rule on the point's place at distance 1, then the lens's Jacobian in the cell of that place.
     u, v = x / z, y / z
     du, dv = (dx - u * dz) / z, (dy - v * dz) / z
     i = min(max(int((v - corner[1]) / size[1]), 0), jacobians.shape[0] - 1)
@@ -44,9 +45,11 @@ def _pattern(x, y, z, light, lens):
     """Return the largest px/s of the light's patterns at a point."""
     (twists, cones), most = light, 0.0
     for k in range(len(twists)):
+        # Columns of a lamp: 0 to 2 position, 3 to 5 direction, 6 cosine of its half angle, 7 reach.
         lamp, M = cones[k], twists[k]
         a, b, c = x - lamp[0], y - lamp[1], z - lamp[2]
         distance = math.sqrt(a * a + b * b + c * c)
+        # Beyond its reach or outside its cone, where it lights nothing.
         if distance > lamp[7] or a * lamp[3] + b * lamp[4] + c * lamp[5] < lamp[6] * distance:
             continue
         dx = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]
@@ -63,6 +66,7 @@ def _patterns(polygon, count, area, light, lens):
     maps and cones of :meth:`~blinkgl.render.motion.Motion.light`."""
     n, most = min(max(int(math.sqrt(area) / 4.0), 1), 64), 0.0
     for k in range(1, count - 1):
+        # The polygon as a fan of triangles around its first corner; s and t go along two sides of each.
         a, b, c = polygon[0], polygon[k], polygon[k + 1]
         for i in range(n + 1):
             for j in range(n + 1 - i):
@@ -80,6 +84,8 @@ def _cut(polygon, count, out, nx, ny, nz, d):
     number of corners."""
     m = 0
     for k in range(count):
+        # Sutherland and Hodgman (1974): a corner inside is kept, and a side that crosses the plane gives a corner
+        # there, with the velocity at that place.
         p, q = polygon[k], polygon[(k + 1) % count]
         a = nx * p[0] + ny * p[1] + nz * p[2] - d
         b = nx * q[0] + ny * q[1] + nz * q[2] - d
@@ -118,9 +124,11 @@ def _in_view(polygon, other, planes, near, common, row):
             n, d = (_AHEAD, near) if k == last else (planes[k], 0.0)
             g, s = _gap(polygon, 3, n, d)
             gap, aside = max(gap, g), max(aside, s)
+    # Wholly outside of a plane: nothing is left, and the triangle is at least as far away as each such plane.
     if common:
         count = 0
     else:
+        # Each cut writes to the other array, so two arrays serve for any number of planes.
         count = _cut(polygon, count, other, 0.0, 0.0, 1.0, near)
         polygon, other = other, polygon
     for k in range(last):
@@ -149,6 +157,7 @@ def _move(R, dR, points, rates, planes, near, lens, moved, outside):
         for r in range(3):
             row[r] = R[r, 0] * p[0] + R[r, 1] * p[1] + R[r, 2] * p[2] + R[r, 3]
             row[3 + r] = dR[r, 0] * p[0] + dR[r, 1] * p[1] + dR[r, 2] * p[2] + dR[r, 3]
+            # The shape's own motion, in the body's axes, besides that of the body.
             row[3 + r] += R[r, 0] * dp[0] + R[r, 1] * dp[1] + R[r, 2] * dp[2]
         for k in range(len(planes)):
             if planes[k, 0] * row[0] + planes[k, 1] * row[1] + planes[k, 2] * row[2] < 0.0:
@@ -176,6 +185,7 @@ def _add(q, corners, total, row):
         u, v = q[0] / q[2], q[1] / q[2]
         corners[_FASTEST], corners[_DENSITY] = max(corners[_FASTEST], speed), max(corners[_DENSITY], q[8])
         corners[_SUM_X], corners[_SUM_Y] = corners[_SUM_X] + x, corners[_SUM_Y] + y
+        # Parts of the velocity away from the middle of the view and around it, times the distance from there.
         total[_SPREAD] += math.sqrt(u * u + v * v)
         total[_OUTWARDS], total[_AROUND] = total[_OUTWARDS] + x * u + y * v, total[_AROUND] + y * u - x * v
 
@@ -212,6 +222,7 @@ def _count(area, fastest, corners, count, total, histogram):
     total[_MEAN_X] += area * corners[_SUM_X] / count
     total[_MEAN_Y] += area * corners[_SUM_Y] / count
     if fastest >= SLOWEST:
+        # SLOWEST, 2^-40, is the lower end of bin 0.
         k = min(max(int((math.log2(fastest) + 40.0) * OCTAVE), 0), BINS - 1)
         areas[k] += area
         sums[k] += area * fastest
@@ -286,6 +297,7 @@ def _behind(a, b, c):
 def _represent(moved, outside, count, total, out):
     """Write the velocities of an item's row of a look."""
     for k in range(POINTS):
+        # Vertices evenly spread over the part's numbers, its first and its last among them.
         v = k * (count - 1) // (POINTS - 1)
         if count > 0 and outside[v] == 0:
             out[k, 0], out[k, 1] = moved[v, 6], moved[v, 7]
@@ -314,6 +326,7 @@ def hides(
     v_cam, w_cam, off_cam, woff_cam = camera[0], camera[1], camera[2], camera[3]
     for i in range(len(body)):
         bound = limits[body[i]]
+        # arm: distance of the part's farthest point from the origin that its body turns about.
         moves, turns = bound[0] + v_cam, bound[1] * arm[i]
         deforms = timescale[i] < np.inf
         if not deforms and moves + turns + w_cam == 0.0:
@@ -325,6 +338,7 @@ def hides(
             reach = (moves + turns) * seconds
             turned = w_cam * seconds
             far, wide = a[i, AWAY] + b[i, AWAY], a[i, ASIDE] + b[i, ASIDE]
+            # It enters by moving, by the camera's turning, or by a part of the way each.
             if (reach > 0.0 and reach >= far) or (turned > 0.0 and turned >= wide) or reach / far + turned / wide > 1.0:
                 return True
             continue
@@ -351,4 +365,5 @@ def hides(
 @kernel(error_model="numpy")
 def _bow(angle):
     """Return the height of an arc over its chord, by its radius."""
+    # 1 - cos(angle / 2) is at most angle^2 / 8, and never above the diameter, 2.
     return min(2.0, angle * angle / 8.0)

@@ -114,6 +114,7 @@ class TextureReader:
             raise NoInteropError(f"no cuda-bindings ({type(error).__name__})") from None
         self._call("cuInit", 0)
         self._gl.resume()
+        # CUDA shares textures only with the card on which OpenGL draws.
         every = self._driver.CUGLDeviceList.CU_GL_DEVICE_LIST_ALL
         count, cards = self._call("cuGLGetDevices", 16, every)
         if not count or int(cards[0]) != (self.device.index or 0):
@@ -148,6 +149,7 @@ class TextureReader:
         made = torch.empty(shape, dtype=dtype, device=self.device)
         stream = torch.cuda.current_stream(self.device).cuda_stream if self.device.type == "cuda" else 0
         copy = self._driver.CUDA_MEMCPY2D()
+        # A mapped texture is a CUDA array, whose layout is the driver's own; the tensor is plain memory.
         copy.srcMemoryType = self._driver.CUmemorytype.CU_MEMORYTYPE_ARRAY
         copy.dstMemoryType = self._driver.CUmemorytype.CU_MEMORYTYPE_DEVICE
         copy.dstDevice = made.data_ptr()

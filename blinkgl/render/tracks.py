@@ -103,6 +103,7 @@ def _of_a_grid(scene: Scene, points: int, times: list[int]) -> tuple[np.ndarray,
     y = np.floor((np.arange(rows) + 0.5) * height / rows)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     hits = casting.cast(scene, times[0], xy)
+    # A point of the grid at which nothing is hit has no surface to follow.
     hits = replace(hits, **{name: getattr(hits, name)[hits.hit] for name in _ARRAYS})
     # A query is (number of the time, y, x).
     return np.column_stack([np.zeros(len(hits.xy)), hits.xy[:, ::-1]]), hits

@@ -128,6 +128,7 @@ def seen_around(light: Light) -> np.ndarray:
     elif light.quadric is not None:
         directions, _ = pixel_directions(height, width)
         picture += ambient(np.asarray(light.quadric, np.float64), directions, quartic_of(light))
+    # Rows run from the zenith downwards: the upper half is the sky.
     picture[: height // 2] += np.float32(light.sky) * np.asarray(light.sky_color, np.float32)
     return picture
 
@@ -160,6 +161,7 @@ def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
         # The window of KHR_lights_punctual: 0 at the reach, and no change nearby.
         fall = fall * np.maximum(0.0, 1.0 - (distance / lamp.reach) ** 4)
     if lamp.kind == "spot":
+        # KHR_lights_punctual: 1 within the inner angle, 0 from the outer one on.
         scale, offset = lamp.cone
         fall = fall * np.clip(towards @ axis * scale + offset, 0.0, 1.0) ** 2
     return towards, fall[:, None] * strength
@@ -291,7 +293,9 @@ def random_lamps(config: RandomLightsConfig, rng: np.random.Generator, half_widt
         color = 1 - saturation * (1 - color / color.max())
         strength = _scaled(color, np.exp(rng.uniform(low, high)))
         place = np.array([*rng.uniform(-half_width, half_width, 2), rng.uniform(*config.height)])
+        # A spot light shines on the ground between the region's middle and the place below it.
         target = np.array([*(place[:2] * rng.uniform(0, 1)), 0.0])
+        # Drawn for lamps of every kind, so that the kind changes no later draw.
         elevation, azimuth, angle = rng.uniform(25, 80), rng.uniform(-180, 180), rng.uniform(*config.angle)
         if kind == "sun":
             pose = lamp_pose(shines=-np.asarray(direction_of(elevation, azimuth)))

@@ -449,6 +449,7 @@ class Scene:
         if self.light.over_time is not None:
             yield "light", self.light.over_time, -1
         for lamp in self.light.lamps:
+            # A panorama's suns share the waveform of its light, which has been yielded.
             if lamp.over_time is not None and lamp.over_time is not self.light.over_time:
                 yield lamp.name, lamp.over_time, -1
         parts = ((obj.name, k, part) for obj in self.objects for k, part in enumerate(obj.parts))

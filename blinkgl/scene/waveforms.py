@@ -45,6 +45,7 @@ class Waveform(Protocol):
 
 def factor_at(wave: Waveform | None, t_ns: int, t0_ns: int) -> float:
     """Return the factor that a frame at a time shows, of a sequence that begins at t0; 1 without a waveform."""
+    # A nanosecond earlier: from a jump on the factor is the new one, and the frame at the jump shows the old one.
     return 1.0 if wave is None else wave.factor(max(t_ns - 1, t0_ns))
 
 
@@ -84,6 +85,7 @@ class Sine:
 
     def mean(self, t0_ns: int, t1_ns: int) -> float:
         angle = lambda t: 2 * math.pi * (self.frequency * t * 1e-9 + self.phase)
+        # The integral of a sine is minus the cosine, divided by the angular frequency.
         swing = math.cos(angle(t0_ns)) - math.cos(angle(t1_ns))
         return 1.0 + self.depth * swing / (2 * math.pi * self.frequency * (t1_ns - t0_ns) * 1e-9)
 

@@ -42,10 +42,12 @@ class LightTruth:
         most, rest = np.abs(now) * _ROUNDING, total.copy()
         shares = []
         for number, source in self._sources:
+            # The frame as it would be had this light alone kept its factor: the difference is its share of the change.
             held = source._replace(factor=factor_at(source.wave, last[0], t0_ns))
             if held.factor != factor_at(source.wave, t_ns, t0_ns):
                 share = now - self._light(self._moment(t_ns).holding(held))
                 shares.append((number, share))
+                # What no light explains is the motion's.
                 rest -= share
         # Only a part in the direction of the whole change can be what made it.
         most = np.maximum(most, rest * np.sign(total))

@@ -129,7 +129,9 @@ def _holds_until(pace: Pace, t: int, end: int, min_step_ns: int) -> int:
             middle = (a + b) // 2
             intervals += [(middle, b), (a, middle)]
             continue
+        # In the shortest step that is allowed more than a whole step's motion may still be hidden.
         if b - a <= min_step_ns and pace.hides(a, b, NS_PER_S / (b - a)) and pace.misses(a, b):
+            # The step ends where this interval begins, which is then a step of its own: both of its ends get frames.
             return a if a > t else b
         most = max(fastest, pace.at(b))
         if most * (b - t) > _LIMIT:

@@ -94,6 +94,7 @@ class Stage:
             forward = (at - eye) / np.linalg.norm(at - eye)
             right = np.cross(forward, self._turn[:, 2])
             right /= np.linalg.norm(right)
+            # The rows are the axes of this view; the turn brings them onto the stage's own right, forward and up.
             turn = self._turn @ np.stack([right, forward, np.cross(right, forward)])
             up = 0.25 * height * (len(halves) - 1 - 2 * number) * self._turn[:, 2]
             node = {"world": self.world, "events": self.space}[name]

@@ -64,6 +64,7 @@ def open_online(
     Raises BlinkGLError: the recipe is bad, or cannot be rendered here."""
     recipe = str(s.recipe)
     template = load_run(recipe, s.set)
+    # The seed of the training joins the recipe's own, which must be read first.
     template = load_run(recipe, s.set, seed=stream_seed(template.seed, seed))
     job = StreamJob(
         "",
@@ -79,6 +80,7 @@ def open_online(
     )
     apart = max(LEAST_APART, loaded)
     kept = s.uses * apart if s.uses > 1 else 0
+    # With `uses` the buffer of the last samples is filled anew after a resume: it begins so much earlier.
     first, ahead = max(0, first // s.uses - kept), 1 + (batch + kept) // (MIX * s.samples)
     with placed(lambda where: f"{recipe}: {where}" if where else recipe):
         stream = SampleStream.of(template, job, workers=s.workers, first=first, ahead=ahead)

@@ -123,6 +123,7 @@ def render_pool(
         except KeyboardInterrupt:
             if done == 0:
                 raise
+            # The file that was being moved may be incomplete.
             (folder / f"{done:07d}.npz").unlink(missing_ok=True)
         tree = {**(about or {}), "version": _VERSION, "samples": done, "backward": stream.has_backward}
         with output_errors(folder):

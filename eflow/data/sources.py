@@ -111,6 +111,7 @@ class FolderSource:
         height, width = self._size(sequence, reader, flow, rectify)
         span = entry.to_us - entry.from_us
         return RawSample(
+            # The older window has the length of the newer, although a label says nothing about it.
             old=self._window(reader, entry.from_us - span, entry.from_us, rectify),
             new=self._window(reader, entry.from_us, entry.to_us, rectify),
             height=height,
@@ -143,6 +144,7 @@ class FolderSource:
                 value=(int(e.x.max()), int(e.y.max())),
                 accepted=f"x < {rectify.shape[1]}, y < {rectify.shape[0]}",
             )
+        # The map holds (x, y) for each raw pixel, float32: rectified events lie between pixels.
         xy = rectify[e.y, e.x]
         return Window(np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1]), e.t, e.p, t0, t1)
 
@@ -212,6 +214,7 @@ def parts_of(source: Source, share: float, where: str) -> tuple[Part, Part]:
         raise ConfigError("single windows are of no sequence", where=where, accepted="a folder of sequences")
     assert isinstance(source, FolderSource | MvsecSource)
     names = source.sequence_names()
+    # The first 48 bits of a digest, as a number in [0, 1): exact in a float64.
     draws = {name: int(sha256(name.encode()).hexdigest()[:12], 16) / 16**12 for name in names}
     least, most = min(draws.values()), max(draws.values())
     if not least < share <= most:

@@ -111,6 +111,7 @@ def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], c
     h = round(w * height / width)
     rows = -(-len(tiles) // columns)
     gap, head, foot, top = 14, 20, 32, 44
+    # In px, at 100 a figure inch; matplotlib takes fractions of the page, from its lower left corner.
     W, H = columns * (w + gap) + gap, top + rows * (h + head + foot) + 4
     figure = Figure(figsize=(W / 100, H / 100))
     figure.text(gap / W, 1 - 22 / H, caption, fontsize=10, color=INK, va="center", weight="bold")

@@ -156,6 +156,7 @@ def _surface(parts, p, triangle, bary) -> dict:
 
 def _barycentric(parts, p, gpu, x, y, t_ns):
     """Of the GPU's interpolated local position in the triangle it drew; None: it has no area."""
+    # The GPU numbers triangles from 1 on; 0 is none.
     triangle = int(gpu["triangle"][y, x]) - 1
     if p < 0 or not 0 <= triangle < len(parts[p][1].mesh.faces):
         return None

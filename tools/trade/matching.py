@@ -73,6 +73,7 @@ def _trains(events: Events, height: int, width: int) -> tuple[np.ndarray, np.nda
 def _group(x, y, p, width, starts, order):
     """Sort by counting; the sort is stable, so the order of time is kept within a train."""
     for i in range(len(x)):
+        # Train 2 * pixel + polarity is counted one further on, so that the sums become beginnings.
         starts[2 * (np.int64(y[i]) * width + x[i]) + p[i] + 1] += 1
     for k in range(1, len(starts)):
         starts[k] += starts[k - 1]
@@ -89,6 +90,7 @@ def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
     the first i events of a and the first j of b. Row i holds j from low[i], the number of b's events too early for
     event i - 1 of a, to high[i], the number of those not too late for it. Outside, events are always unmatched, at
     ``limit`` half µs each."""
+    # Rows lie one after the other in cost and choice: cell (i, j) is at row_start[i] + j - low[i].
     low, high = np.empty(64, np.int64), np.empty(64, np.int64)
     row_start = np.empty(64, np.int64)
     cost, choice = np.empty(256, np.int64), np.empty(256, np.uint8)

@@ -129,6 +129,7 @@ def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int) -> 
     rng = np.random.default_rng(0)
     xy = np.stack([rng.integers(0, width, PIXELS), rng.integers(0, height, PIXELS)], axis=1)
     hits = casting.cast(scene, t_ns, (xy[:, None] + _AROUND).reshape(-1, 2))
+    # Column 0 is the pixel itself, the others are its four neighbours.
     ids = hits.instance.reshape(PIXELS, len(_AROUND))
     exact = casting.flow_to(scene, hits, t_next_ns)
     flow, valid = exact.flow.reshape(PIXELS, len(_AROUND), 2)[:, 0], exact.valid.reshape(PIXELS, -1)[:, 0]

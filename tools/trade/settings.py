@@ -121,6 +121,7 @@ def pareto_front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
     one; of equal rows the first stays. Rows whose error is not a number are left out."""
     result: list[dict] = []
     for row in sorted((r for r in rows if math.isfinite(r[error])), key=lambda r: (r[cost], r[error])):
+        # Rows come by rising cost: one is on the front where its error is below that of every cheaper one.
         if not result or row[error] < result[-1][error]:
             result.append(row)
     return result

@@ -95,6 +95,7 @@ class Clock:
                 if shapes[obj.name] is not None:
                     matrix = one.matrix_world
                     if obj.type == "CAMERA":
+                        # The scale of a camera has no effect on its picture.
                         matrix = Matrix.LocRotScale(*matrix.decompose()[:2], None)
                     key = owner.name, obj.name, tuple(one.persistent_id) if one.is_instance else None
                     yield frame, key, obj, np.array(matrix), *shapes[obj.name]
@@ -194,6 +195,7 @@ class Track:
         begin, _, start = self.kept[-1] if self.kept else (frame, None, points)
         stride = len(self.waiting) // 8 + 1  # every frame, and some between
         for at, _, passed in [one for k, one in enumerate(self.waiting) if one[0] == int(one[0]) or k % stride == 0]:
+            # Where the straight line from the last key to this time passes at a time in between.
             line = start + (points - start) * ((at - begin) / (frame - begin))
             if np.abs(passed - line).max() > limit * (1 if at == int(at) else 12) or len(self.waiting) == WAITING:
                 self.kept.append(self.waiting[-1])

@@ -332,6 +332,7 @@ def counts(tree: dict) -> dict[str, int]:
     triangles = 0
     for node in nodes:
         for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            # Without indices the vertices' order gives the triangles. Mode 4: separate triangles.
             which = primitive.get("indices", primitive["attributes"]["POSITION"])
             triangles += accessors[which]["count"] // 3 if primitive.get("mode", 4) == 4 else 0
     return {

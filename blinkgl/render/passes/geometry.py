@@ -25,6 +25,7 @@ LENS_UNIT = 7
 """Texture unit of the sample offsets of a lens's pixels."""
 MOST_BUFFERS = 8
 """Number of outputs that every OpenGL 4 has (GL_MAX_DRAW_BUFFERS)."""
+# Uniforms that a label may not give; "" is the program itself in a table of uniforms.
 _OF_THE_PASS = {
     "", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward", "coverage", "cutoff",
     "lens_claims", "target_size", "lens_plane", "lens_focal", "lens_limit", "lens_k",

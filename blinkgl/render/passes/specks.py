@@ -135,6 +135,7 @@ class Specks(OverPass):
         uniforms["image_size"].value = shot.size
         # The nearest comes first among the portraits, and last into the picture.
         buffer = ctx.buffer(np.ascontiguousarray(table[::-1]))
+        # "/i": a row of the table for each instance. Nine points, because a speck touches at most 3 x 3 pixels.
         array = ctx.vertex_array(program, [(buffer, "4f 2i /i", "in_body", "in_cell")])
         shot.target.use()
         # Alpha is the share of a pixel that a body covers; the rest of it shows what is behind.

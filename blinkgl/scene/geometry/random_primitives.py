@@ -45,6 +45,7 @@ def _figure(dice: _Dice) -> Mesh:
         build=dice.between(0.8, 1.3),
         legs=parts[0],
         arms=parts[1],
+        # A small figure has a large head in proportion, as a child has.
         head=parts[2] * (1.75 / grown) ** 0.5,
         clip=does,
         variant=dice.index,

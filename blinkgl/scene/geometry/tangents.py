@@ -48,6 +48,7 @@ def _tangents(mesh: Mesh) -> np.ndarray:
         length = np.linalg.norm(flat, axis=1, keepdims=True)
         unit = np.divide(flat, length, out=np.zeros_like(flat), where=length > 0)
         np.add.at(sums, at, unit * angle[:, None])
+        # Where plain and mirrored faces meet, the wider angle decides.
         np.add.at(sign, at, np.sign(area) * angle)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     # The axis farthest from the normal, made perpendicular: any direction will do.

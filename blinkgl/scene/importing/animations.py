@@ -83,6 +83,7 @@ class Animation:
         morphs = self._morphs(node, raw, source, at_rest)
         where = f"{self.document.path.name}, mesh of node '{self.document.nodes[node].name}'"
         if bound is not None and skin is not None:
+            # glTF ignores the transform of a node that shows a skin: the joints alone place its vertices.
             joints, bind = self.document.skin(skin)
             before = np.linalg.inv(at_rest)
             return Skin(

@@ -92,6 +92,7 @@ class Document:
         """Return the rest transform of a node to the file's world, (4, 4)."""
         T = np.eye(4)
         for step in self.chain(node):
+            # From the node upwards: a parent's transform is applied after its child's.
             T = self.nodes[step].local() @ T
         return T
 

@@ -262,6 +262,7 @@ def _libraries(
         # A name may have blanks, and a line may have several names.
         plain = _COMMENT.split(rest)[0].rstrip()
         whole = Neighbours(near.path, near.border, log=near.log).optional((rest, plain))
+        # A blank behind a backslash belongs to the name.
         parts = [part.replace("\\ ", " ") for part in re.split(r"(?<!\\)\s+", plain)]
         for name, file in [(plain, whole)] if whole else [(part, near.optional((part,))) for part in parts]:
             own: dict[str, _Entry] = {}

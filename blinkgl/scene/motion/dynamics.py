@@ -240,8 +240,10 @@ class _World:
             density=density,
             # solref below 0 is -stiffness, -damping, per unit of mass: w^2 and 2 zeta w.
             solref=[-(frequency**2), -2.0 * damping_ratio(config.restitution, self.impact_steps) * frequency],
+            # The impedance at the surface and at depth: equal, so that the width, middle and power have no effect.
             solimp=[_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0],
             friction=[config.friction, rolling, rolling],
+            # Forces along the normal, and against sliding, spinning and rolling, the three numbers of ``friction``.
             condim=6,
             # Dynamic bodies collide with all; the others do not collide with each other. Bit masks: geometries collide
             # where one's contype and the other's conaffinity share a bit.

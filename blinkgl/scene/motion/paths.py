@@ -344,6 +344,7 @@ class AffinePath:
         """Return bounds, see :class:`PosePath`, from samples; a quarter is added for what lies between them."""
         if self._span_ns:
             tb_ns = min(tb_ns, ta_ns + self._span_ns)
+        # Four samples in each time scale, rounded up, and at least both ends.
         samples = min(max(2, 4 * -(-(tb_ns - ta_ns) // self._timescale_ns)), _SPEED_SAMPLES)
         rates = [self.derivative(int(t)) for t in np.linspace(ta_ns, tb_ns, samples)]
         speed = max(float(np.linalg.norm(D[:3, 3])) for D in rates)

@@ -342,6 +342,7 @@ def unseen(ta: int, tb: int, knots: np.ndarray, cp: np.ndarray, cr: np.ndarray) 
     if tb < knots[0] or ta > knots[-1] or tb < ta:
         return 0.0, 0.0
     i, j = _piece(ta, knots), _piece(tb, knots)
+    # Before the first knot and after the last one the body stands still, and the velocities stay 0.
     if ta >= knots[0]:
         _slope(cp[i], (ta - knots[i]) * 1e-9, a)
         _slope(cr[i], (ta - knots[i]) * 1e-9, da)

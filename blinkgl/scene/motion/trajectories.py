@@ -64,6 +64,7 @@ class FreeSpace:
         bool obstacles to ignore."""
         low = self.low.copy()
         if self.ground_z is not None:
+            # A body that is too large for the box has its ceiling as the only free height.
             low[2] = min(max(low[2], self.ground_z + radius), self.high[2])
         out = np.maximum(np.maximum(low - points, points - self.high), 0.0).max(axis=1)
         if len(self.radii):
@@ -276,6 +277,7 @@ def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
     # A minimum step, because two waypoints in one place would give the spline a parameter step of 0.
     steps = np.sqrt(np.maximum(legs, 0.05 * max(legs.max(), 1e-12)))
     parameter = np.r_[0.0, np.cumsum(steps)]
+    # Arc length by the midpoint rule, and the parameter (``at``) at which each length is reached.
     middle = (parameter[:-1, None] + steps[:, None] * (np.arange(_SAMPLES) + 0.5) / _SAMPLES).ravel()
     rate = np.linalg.norm(CubicSpline(parameter, points)(middle, 1), axis=1)
     arc = np.r_[0.0, np.cumsum(rate * np.repeat(steps, _SAMPLES) / _SAMPLES)]
@@ -378,6 +380,7 @@ def _rotations(R, turns, times, t0_ns, t1_ns, rate) -> Rotation:
 
 
 def _shaken(rng, config, times, positions, rotations):
+    # At least ``shake_rate`` key frames per second, each with a turn of its own.
     parts = math.ceil(np.diff(times).max() * 1e-9 * config.shake_rate)
     finer, moved = _resampled(times, positions, parts) if parts > 1 else (times, positions)
     smooth = RotationSpline(_seconds(times), rotations)((finer - times[0]) * 1e-9)

@@ -122,6 +122,7 @@ class Playing:
         if len(places) * (1 if period is None else (t1_ns - t0_ns) // period + 1) > MOST_JUMPS:
             return []
         for place in places:
+            # The sequence's time at which the clip is at ``place``, in one of its rounds.
             at = round(((place - self.first - self.phase) / self.speed) * 1e9)
             rounds = [0] if period is None else range((t0_ns - at) // period, (t1_ns - at) // period + 1)
             times |= {self._last_before(place, at + k * (period or 0)) for k in rounds}
@@ -130,6 +131,7 @@ class Playing:
     def _last_before(self, place: float, about_ns: int) -> int:
         """Return the last time before the clip passes a time of its own, which is known to a nanosecond or two."""
         for t_ns in range(about_ns - 2, about_ns + 2):
+            # Passed between these two nanoseconds, or the loop begins anew there and its time moves far.
             a, b = self.at(t_ns)[0], self.at(t_ns + 1)[0]
             if (a < place) != (b < place) or abs(b - a) > 0.5 * (self.last - self.first):
                 return t_ns

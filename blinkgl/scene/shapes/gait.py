@@ -252,6 +252,7 @@ def _walk(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
             forearm=(0, -20 * swing + 13 * swing * back, 0),
             hand=(0, -6 + 4 * back),
         )
+    # Each foot is down for 61 % of the round: above a half, so that both feet are down at times.
     pose.plant(_feet(pose, stride, 0.61, math.radians(18), math.radians(50), 0.045 * u, 0.05 * u), 0.996)
     # Cycle rounds its period to whole ns, and the speed fits the rounded one.
     return pose.cycle(period, phase, stride / (round(period * 1e9) * 1e-9))

@@ -268,6 +268,7 @@ def _followed(points, joints, weights, matrices, place):
     for v in range(len(points)):
         x, y, z = points[v]
         for i in range(3):
+            # Row i of the vertex's blended matrix; d is its translation.
             a = b = c = d = 0.0
             for k in range(weights.shape[1]):
                 w, j = weights[v, k], joints[v, k]

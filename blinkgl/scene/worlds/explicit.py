@@ -152,6 +152,7 @@ def _objects(
                 )
             parts = deforming(parts, item.deform)
         path = _object_path(item, parts, t0_ns, t1_ns, where, base, log)
+        # Ids begin at 1: in a picture of ids 0 stands for nothing.
         objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     return objects
 
@@ -277,6 +278,7 @@ def trajectory_path(
             value=f"{t_ns[0] * 1e-9:.6g} to {t_ns[-1] * 1e-9:.6g} s on its clock",
             accepted=f"{t0_ns * 1e-9:.6g} to {t1_ns * 1e-9:.6g} s: a shorter time.duration, or another start",
         )
+    # Poses of the sequence, those that smoothing reads beside it, and some more for the spline.
     aside = round(1e9 * config.smooth)
     first = max(0, int(np.searchsorted(t_ns, t0_ns - aside)) - _BEYOND)
     last = int(np.searchsorted(t_ns, t1_ns + aside)) + _BEYOND
@@ -332,9 +334,11 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
     """
     if config.look_at is not None:
         R = look_rotation(np.subtract(config.look_at, config.position))
+        # A camera's columns are right, down and ahead, an object's ahead, left and up.
         axes = R if camera else np.column_stack([R[:, 2], -R[:, 0], -R[:, 1]])
     elif config.quaternion is not None:
         w, x, y, z = config.quaternion
+        # Configurations have the scalar first, scipy has it last.
         axes = Rotation.from_quat([x, y, z, w]).as_matrix()
     elif config.euler is not None:
         axes = Rotation.from_euler("xyz", config.euler, degrees=True).as_matrix()

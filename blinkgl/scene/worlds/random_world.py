@@ -330,6 +330,7 @@ def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str
         rng, float(rng.uniform(*config.strength)), _log_uniform(rng, config.period)
     )
     parts = deforming(asset.parts, drawn)
+    # The farthest point of any shape over time: made smaller by it at rest, all shapes fit.
     reach = max(
         float(np.linalg.norm(points, axis=1).max()) + margin for points, margin in (filled(p.mesh) for p in parts)
     )
@@ -356,6 +357,7 @@ def _candidate(config, camera, rng, T_cam, in_view, resting) -> np.ndarray:
     pixel = rng.random(2) * (camera.width, camera.height) - 0.5
     ray = T_cam[:3, :3] @ camera.rays(pixel)
     if resting:
+        # Along the ground; the caller sets the height of a resting body.
         ray[2] = 0.0
     return T_cam[:3, 3] + ray / math.sqrt(ray @ ray) * _log_uniform(rng, config.objects.distance)
 
@@ -420,6 +422,7 @@ def _sides(config: RandomSceneConfig) -> list[Barrier]:
     ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
+    # Normals point inwards: normal . x >= offset is the inner side.
     sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
     sides.append(Barrier((0.0, 0.0, -1.0), -(config.region.height + reach)))
     if config.ground is None:

@@ -101,10 +101,12 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
     key = "camera_matrix" if dsec else "intrinsics"
     raw = [name for name in names if not (dsec and name.startswith("camRect"))]
     cameras = {name: _camera(tables[name], f"{where}: {name}", key) for name in raw}
+    # DSEC's T_30 leads from cam0, the raw camera before it in the file, to cam3.
+    numbers = [name.removeprefix("cam") for name in raw]
     for k, (name, one) in enumerate(cameras.items()):
         matrix, key = tables[name].get("T_cn_cnm1"), "T_cn_cnm1"
         if dsec and isinstance(places, dict) and k:
-            key = f"T_{k}{k - 1}"
+            key = f"T_{numbers[k]}{numbers[k - 1]}"
             matrix = places.get(key)
         before = None if matrix is None else _rigid(matrix, f"{where}: {name}.{key}")
         unit = next((k for k in ("T_cam_imu", "T_imu_cam") if tables[name].get(k) is not None), None)

@@ -253,7 +253,7 @@ def check_images(
                 value=rows_us,
                 accepted=f"at most {1e6 / rate:g} µs for all rows together, or a lower rate",
             )
-        if whole_us > 1e6 * seconds:
+        if whole_us > 1e6 * seconds * (1 + 1e-9):
             raise Refused(
                 "no exposure fits into the sequence",
                 where="images.exposure_us",

@@ -16,7 +16,7 @@ def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, 
     return grid
 
 
-@kernel
+@kernel(error_model="numpy")
 def _vote(x, y, t, p, t0, t1, grid):
     last = grid.shape[0] - 1
     scale = last / np.float64(t1 - t0)

@@ -306,7 +306,7 @@ def _emit_pixel(i, pixel_word, state, moved, v, explained, cap, packed, out):
         t_us += after_us
         event_ns, voltage = min(np.int64(t_us * 1e3), v.dt_ns), 0.0
         if emitted == cap or draw >= last:  # too many to draw them all: count the expected number
-            cut = 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
+            cut, since_us, light, leak = 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma)), dt_us, 0.0, 0.0
             break
         word = pixel_word | np.int64(side > 0)
         if explained:

@@ -332,7 +332,7 @@ def _egl(device: int) -> object:
     """Return glcontext's EGL object, current in this thread."""
     from glcontext import egl  # type: ignore[missing-module-attribute]  # an extension module
 
-    libegl = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
+    libegl = _egl_library()
     if libegl is None:
         raise _EGLUnavailable("libEGL.so.1 not found")
     # glcontext also opens libGL, although EGL provides every function: machines without X11 have no libGL.
@@ -355,8 +355,7 @@ def _egl(device: int) -> object:
 
 def _unbind_egl() -> ctypes.CDLL:
     """Return libEGL, after unbinding the current context of this thread from EGL."""
-    name = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
-    lib = ctypes.CDLL(name)
+    lib = ctypes.CDLL(_egl_library())
     lib.eglGetCurrentDisplay.restype = ctypes.c_void_p
     lib.eglGetCurrentContext.restype = ctypes.c_void_p
     lib.eglMakeCurrent.argtypes = [ctypes.c_void_p] * 4
@@ -365,6 +364,12 @@ def _unbind_egl() -> ctypes.CDLL:
     if display:
         lib.eglMakeCurrent(display, None, None, None)
     return lib
+
+
+def _egl_library() -> str | None:
+    """Return the name of libEGL, that of glcontext's variable if it is set; None: it cannot be loaded."""
+    named = os.environ.get("GLCONTEXT_LINUX_LIBEGL")
+    return _loadable((named,) if named else _EGL_LIBRARIES)
 
 
 def _loadable(names: tuple[str, ...]) -> str | None:
@@ -384,7 +389,7 @@ def _one_line(error: Exception) -> str:
 def egl_devices() -> list[str]:
     """Return one description per EGL device, in ``gl.device`` order; empty without EGL or its device extension. Makes
     no context."""
-    name = _loadable(_EGL_LIBRARIES)
+    name = _egl_library()
     if name is None:
         return []
     lib = ctypes.CDLL(name)

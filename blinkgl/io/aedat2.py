@@ -258,7 +258,7 @@ def _unwrap(address, kinds, stamp, state, height, width, keep, t):
         # Within its own kind a record must not be earlier than the one before.
         if (now < state[1 + kind] and not keep) or now < 0:
             # For the message: the time that this record must not precede.
-            state[0] = state[1 + kind]
+            state[0] = max(state[1 + kind], 0)
             return i, 2
         t[i] = now
         state[0] = max(now, state[0])

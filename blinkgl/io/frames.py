@@ -140,8 +140,9 @@ class FrameSource:
             raise EventDataError("frames without times", where=str(self.path), accepted="--fps or --timestamps")
         if stamps is not None and stamps.note:
             self.notes.append(stamps.note)
-        if stamps is None and self.own_times and declared.fps is not None:
-            self.notes.append("the times in the file are not used, because of --fps")
+        because = "--timestamps" if declared.timestamps else "--fps" if stamps is None and declared.fps else None
+        if self.own_times and because:
+            self.notes.append(f"the times in the file are not used, because of {because}")
         if stamps is None and self.times_ns is None and declared.time_unit is not None:
             self.notes.append("no list of times is read; --time-unit is not used")
         times = None if stamps is None else stamps.times_ns
@@ -185,10 +186,13 @@ def open_frames(path: str | os.PathLike, declared: Declared = NOTHING) -> FrameS
     )
 
 
+_ONE_SERIES = "there is one series of frames; --stream is not used"
+
+
 def _alone(source: FrameSource, declared: Declared) -> FrameSource:
     """Return the only series of a folder or file; one that is chosen of several is not there."""
     if declared.stream is not None:
-        source.notes.append("there is one series of frames; --stream is not used")
+        source.notes.append(_ONE_SERIES)
     return source
 
 
@@ -246,7 +250,7 @@ def _stacks(where: Path, series_: Series, declared: Declared, ours: bool = False
     # A frame begins when the delays before it have passed.
     own = [round(1e6 * t) for t in np.cumsum([0.0, *delays])] if len(delays) == pages else None
     times = None
-    if own is not None and declared.fps is None:
+    if own is not None and declared.fps is None and declared.timestamps is None:
         shown = f"{min(delays):g}" if min(delays) == max(delays) else f"{min(delays):g} to {max(delays):g}"
         notes.append(f"each frame is shown for {shown} ms, as the file says (--fps for another rate)")
     elif declared.fps is not None and pages == len(files) and (places := series_.places()) is not None:
@@ -401,6 +405,7 @@ def _array(path: Path, declared: Declared) -> FrameSource:
         if path.suffix.lower() == ".npy":
             check_npy(path)
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
+            notes += [] if declared.stream is None else [_ONE_SERIES]
         else:
             with NpzReader(path) as data:
                 held = [k for k in CALLED if k in data]

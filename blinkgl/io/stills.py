@@ -228,27 +228,23 @@ def open_stills(path: Path) -> Stills:
 
 def _png(path: Path, head: bytes) -> Stills:
     """Read the chunks before the pixels that say what codes mean (PNG specification, 11.3.2)."""
-    stills, bits = Stills(path), 0
-    for _, kind, body in png_chunks(head):
-        if kind == b"IHDR":
-            # The bit depth comes after width and height, four bytes each.
-            bits = int.from_bytes(body[8:9])
-        elif kind == b"cICP" and len(body) == 4:
-            from blinkgl.io.video import TRANSFERS
+    stills = Stills(path)
+    before = itertools.takewhile(lambda chunk: chunk[1] not in (b"IDAT", b"IEND"), png_chunks(head))
+    chunks = {kind: body for _, kind, body in before}
+    # They come in any order; of curves cICP counts more than sRGB, and that more than gAMA.
+    if len(code := chunks.get(b"cICP", b"")) == 4:
+        from blinkgl.io.video import TRANSFERS
 
-            stills.transfer = TRANSFERS.get(body[1])
-            break
-        elif kind == b"gAMA" and len(body) == 4:
-            # gAMA holds 100,000 times the exponent of encoding.
-            exponent = 1e5 / max(int.from_bytes(body, "big"), 1)
-            stills.transfer = "linear" if abs(exponent - 1) < 0.01 else None if abs(exponent - 2.2) < 0.02 else exponent
-        elif kind == b"sRGB":
-            stills.transfer = None
-            break
-        elif kind == b"sBIT" and bits == 16 and body and body[0] < 16:
-            stills.white = 2 ** body[0] - 1  # only where the codes are no larger, which the reader of the clip checks
-        elif kind in (b"IDAT", b"IEND"):
-            break
+        stills.transfer = TRANSFERS.get(code[1])
+    elif b"sRGB" not in chunks and len(gamma := chunks.get(b"gAMA", b"")) == 4:
+        # gAMA holds 100,000 times the exponent of encoding.
+        exponent = 1e5 / max(int.from_bytes(gamma, "big"), 1)
+        stills.transfer = "linear" if abs(exponent - 1) < 0.01 else None if abs(exponent - 2.2) < 0.02 else exponent
+    significant = chunks.get(b"sBIT", b"")
+    # The bit depth comes after width and height, four bytes each.
+    if chunks.get(b"IHDR", b"")[8:9] == b"\x10" and significant and significant[0] < 16:
+        # Only where the codes are no larger, which the reader of the clip checks.
+        stills.white = 2 ** significant[0] - 1
     if stills.transfer is not None:
         curve = f"{stills.transfer:.4g}" if isinstance(stills.transfer, float) else stills.transfer
         stills.notes.append(f"the images state the curve {curve}")

@@ -19,7 +19,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.columns import events_of, microseconds, proposed_polarity
 from blinkgl.io.reading import EventReading, chosen
 from blinkgl.io.records import shown_names
-from blinkgl.io.times import NANOSECONDS, named_unit
+from blinkgl.io.times import NANOSECONDS, named_unit, overruled
 from blinkgl.types.events import Events
 
 _NAMES = {
@@ -80,13 +80,6 @@ def not_read(names: Iterable[str], known: Collection[str]) -> list[str]:
 def not_columns(names: Iterable[str]) -> list[str]:
     """Return the line that says which columns of the events' table, one value an event, are not read."""
     return [f"left out: columns that are none of t, x, y, p: {shown_names(left)}"] if (left := list(names)) else []
-
-
-def overruled(stated: str | None, reading: EventReading) -> list[str]:
-    """Return the line that says that another unit of time was declared than the file states."""
-    declared = reading.time_unit
-    other = stated is not None and declared is not None and stated != declared
-    return [f"the file says {stated}; --time-unit {declared} is used"] if other else []
 
 
 def proposal(rows: np.ndarray | None, times: np.ndarray | None = None) -> str:
@@ -233,7 +226,7 @@ class TableReader:
         self._dated = stated[0] in NANOSECONDS and stated[1] == 1
         own = table.unit or (stated[0] if self._dated else named_unit(table.heading))
         unit = reading.time_unit or own
-        self.notes += overruled(own, reading)
+        self.notes += overruled(own, reading.time_unit)
         if table.named and reading.columns and not reading.named:
             self.notes.append("the columns have names; --columns is not used (x=NAME,y=NAME … for others)")
         if unit is None:
@@ -257,9 +250,10 @@ class TableReader:
             x, y = (columns[side] if self._table.per_px == 1 else columns[side] / self._table.per_px for side in "xy")
             p, cause = columns["p"], columns.get("cause")
             polarity = self._polarity
-            if polarity is None and len(p) and p.dtype.kind in "if":
+            # NaN and infinity are refused below, where the event is named.
+            if polarity is None and p.dtype.kind in "if" and len(known := p[np.isfinite(p)]):
                 # OFF is 0 or -1; the second of them in a file is another code.
-                off |= {-1, 0} if p.min() < 0 and (p == 0).any() else {min(int(p.min()), 1)}
+                off |= {-1, 0} if known.min() < 0 and (known == 0).any() else {min(int(known.min()), 1)}
                 if off >= {-1, 0}:
                     accepted = f"0 and 1, or -1 and 1{proposed_polarity(p)}"
                     raise EventDataError("polarities -1 and 0 in one file", where=where, accepted=accepted)

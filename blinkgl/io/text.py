@@ -28,8 +28,8 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import CheckedWriter, proposed_polarity
 from blinkgl.io.reading import AS_FILE, Damage, EventReading, chosen
-from blinkgl.io.tables import not_columns, overruled, slot_of, undeclared
-from blinkgl.io.times import named_unit
+from blinkgl.io.tables import not_columns, slot_of, undeclared
+from blinkgl.io.times import named_unit, overruled
 from blinkgl.machine.kernels import kernel
 from blinkgl.types.events import Events
 from blinkgl.types.numbers import is_number
@@ -91,7 +91,7 @@ class TextReader:
         wide = len(numbers[0]) if numbers else 4
         self._sample = np.array([row for row in numbers if len(row) == wide], np.float64).reshape(-1, wide)
         self.unit = reading.time_unit or self._unit or ("s" if self._ecd else "")
-        self.notes += overruled(self._unit, reading)
+        self.notes += overruled(self._unit, reading.time_unit)
         if numbers and not (self._order and self.unit):
             if not self._order:
                 raise undeclared("no heading names the columns", str(path), self._sample)

@@ -98,11 +98,17 @@ def _constant(steps: Sequence[int], tick: Fraction, rates: Sequence[Fraction]) -
 @dataclass(frozen=True)
 class Stamps:
     """times_ns : int ns, in the file's order.   names : of the frames, None where the list has none.   note : the line
-    that says a layout that was recognised, or None."""
+    that says a layout that was recognised, or a unit that was overruled; or None."""
 
     times_ns: list[int]
     names: list[str] | None = None
     note: str | None = None
+
+
+def overruled(stated: str | None, declared: str | None, option: str = "--time-unit") -> list[str]:
+    """Return the line that says that another unit of time was declared than the file states."""
+    other = stated is not None and declared is not None and stated != declared
+    return [f"the file says {stated}; {option} {declared} is used"] if other else []
 
 
 class Undeclared(EventDataError):
@@ -148,15 +154,17 @@ def read_timestamps(
         texts.append(chosen[0])
         times.append(sum(map(exact, chosen), Fraction(0)) / len(chosen))
     names = _names(rows, columns, path)
+    own = _stated(titles, columns, heading, path)
+    note = next((f"{path.name}: {line}" for line in overruled(own, unit)), None)
     if unit == "frames":
         if fps is None:
             raise ConfigError(
                 "times in frames need a frame rate", where="--time-unit", value=unit, accepted="--fps, too"
             )
-        return Stamps([round(time * 10**9 / Fraction(fps)) for time in times], names)
-    stated = unit or _stated(titles, columns, heading, path) or usual
+        return Stamps([round(time * 10**9 / Fraction(fps)) for time in times], names, note)
+    stated = unit or own or usual
     if stated is not None:
-        return Stamps(nanoseconds(times, stated), names)
+        return Stamps(nanoseconds(times, stated), names, note)
     places = places_of(texts)
     if places and (names is not None or places >= PLACES) and len(columns) == 1:
         note = f"{path.name}: read as the Event Camera Dataset's and TUM's lists: seconds with a point"
@@ -205,11 +213,11 @@ def read_label_times(path: Path, columns: int, count: int | None = None) -> list
 def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str) -> Stamps:
     """Return the times of an array (N,) named ``name``; the unit as of :func:`read_timestamps`. Raises EventDataError:
     not numbers, not finite."""
-    values = np.asarray(values).reshape(-1)
+    values, own = np.asarray(values).reshape(-1), named_unit(name)
     # NumPy's datetime64 and timedelta64 say their unit in the type.
     if values.dtype.kind in "mM" and not np.isnat(values).any():
         dated, step = np.datetime_data(values.dtype)
-        unit, values = unit or (dated if step == 1 and dated in NANOSECONDS else None), values.astype(np.int64)
+        own, values = dated if step == 1 and dated in NANOSECONDS else own, values.astype(np.int64)
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
         bad = int(np.argmax(~np.isfinite(values))) if values.dtype.kind == "f" else 0
         raise EventDataError(
@@ -218,10 +226,10 @@ def stamps_of_array(name: str, values: np.ndarray, unit: str | None, where: str)
             value=values[bad : bad + 1].tolist(),
             accepted="a finite number",
         )
-    stated = unit or named_unit(name)
+    stated = unit or own
     if stated is None:
         raise _undeclared(f"{where}: '{name}'", values.dtype.kind == "f" and bool((values % 1).any()))
-    return Stamps(nanoseconds(values, stated))
+    return Stamps(nanoseconds(values, stated), note=next(iter(overruled(own, unit)), None))
 
 
 def _undeclared(where: str, points: bool) -> Undeclared:

@@ -33,6 +33,7 @@ from blinkgl.io.times import (
     checked_unit,
     named_unit,
     nanoseconds,
+    overruled,
     places_of,
     read_rows,
     read_timestamps,
@@ -147,6 +148,8 @@ def read_trajectory(
         )
     lines = [] if notes is None else notes
     lines += table.notes
+    if declared.columns is not None and form in readers:
+        lines.append(f"{path.name}: columns is not used, because of form {form}")
     t_ns = _times(table, declared, path, lines)
     T = np.tile(np.eye(4), (len(t_ns), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = table.rotations.as_matrix(), table.positions
@@ -183,11 +186,19 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
     """Read a table of positions and quaternions."""
     heading, rows = read_rows(text)
     titles = titles_of(heading)
-    roles = (declared.columns or "").replace(",", " ").split() or _roles(titles)
-    roles = roles or _COLUMNS.get(declared.form or "", "").split()
-    notes: list[str] = []
+    given, own, usual = (
+        (declared.columns or "").replace(",", " ").split(),
+        _roles(titles),
+        _COLUMNS.get(declared.form or "", "").split(),
+    )
+    roles = given or own or usual
     if not rows:
         return _Table(None, np.empty((0, 3)), Rotation.identity(), [])
+    notes: list[str] = []
+    if own and given and _places(own) != _places(given):
+        notes.append(f"{path.name}: the heading names the columns otherwise; columns: {' '.join(given)} is used")
+    elif own and usual and not given and _places(own) != _places(usual):
+        notes.append(f"{path.name}: the heading names the columns otherwise than form: {declared.form}, and is used")
     if not roles:
         roles = _COLUMNS["tum"].split()
         if len(rows[0][1]) >= 8 and places_of([fields[0] for _, fields in rows]) < PLACES:
@@ -196,10 +207,10 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
                 where=str(path),
                 accepted=f"try form: tum or euroc, or columns: {_COLUMNS['tum']} and time_unit: s, ms, us or ns",
             )
-    at = {role: k for k, role in enumerate(roles) if role != "-"}
+    at = _places(roles)
     if titles and declared.columns is None:
-        own = zip(titles[: len(rows[0][1])], [*roles, *"-" * len(titles)])
-        left = [title for title, role in own if role == "-" and title]
+        named = zip(titles[: len(rows[0][1])], [*roles, *"-" * len(titles)])
+        left = [title for title, role in named if role == "-" and title]
         notes += [f"{path.name}: left out: columns that are no pose: {shown_names(left)}"] if left else []
     wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
     most = max((at[role] for role in wanted), default=0)
@@ -217,6 +228,10 @@ def _columns(path: Path, text: str, declared: PoseFile) -> _Table:
         unit = known[1]
     metres = _metres(path, titles, [at[axis] for axis in "xyz"]) if len(titles) >= len(roles) else 1.0
     return _Table(times, numbers[:, :3] * metres, _rotations(numbers[:, 3:], lines, path), lines, unit, notes)
+
+
+def _places(roles: Sequence[str]) -> dict[str, int]:
+    return {role: k for k, role in enumerate(roles) if role != "-"}
 
 
 def _metres(path: Path, titles: Sequence[str], columns: Sequence[int]) -> float:
@@ -380,8 +395,15 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
     """Return the times of poses, ns. Raises AssetError."""
     count = len(table.positions)
     beside = Path(declared.times) if declared.times is not None else path.with_name("times.txt")
-    if table.times is None and declared.rate is not None:
+    if table.times is not None:
+        unused = [key for key in ("rate", "times") if getattr(declared, key) is not None]
+        notes += [f"{path.name}: the poses have times; {key} is not used" for key in unused]
+    elif declared.rate is not None:
+        unused = [key for key in ("time_unit", "times") if getattr(declared, key) is not None]
+        notes += [f"{path.name}: {key} is not used, because of rate" for key in unused]
         return np.round(np.arange(count) * (1e9 / declared.rate)).astype(np.int64)
+    elif declared.times is not None and not beside.is_file():
+        raise AssetError("no such file", where=str(beside), accepted="a file of times, or rate: in Hz")
     if table.times is None and beside.is_file():
         try:
             stamps = read_timestamps(beside, declared.time_unit)
@@ -401,6 +423,8 @@ def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> n
                 raise _no_pose(path, number, [text], "a time first, a finite number")
         times = list(map(exact, texts))
         unit = declared.time_unit or table.unit
+        own = None if declared.form else table.unit  # of a form that is declared, the unit may be another
+        notes += [f"{path.name}: {line}" for line in overruled(own, declared.time_unit, "time_unit:")]
         if unit is None:
             proposed = "s" if any("." in text for text in texts) else "ns" if max(map(abs, times)) > 1e17 else "us"
             accepted = f"try time_unit: {proposed} if that is right"

@@ -141,7 +141,7 @@ class Decoder:
         def distance(luminance: float) -> float:
             # The table rises, so the code of a luminance is where it would be inserted.
             at = int(np.clip(np.searchsorted(table, luminance), step, len(table) - 1))
-            return float(table[at] - table[at - step]) * 255 * step / (white - black) or 1e-12
+            return float(table[at] - table[at - step]) * (white - black) / (255 * step) or 1e-12
 
         return distance
 

@@ -14,11 +14,11 @@ from blinkgl.types.events import Events
 
 SIDE_PX = 16
 WINDOWS = 16
+"""Number of time windows; a patch is SIDE_PX x SIDE_PX pixels by one of them."""
 LEAST_IN_PATCH = 8
 """Events; patches with fewer are not used."""
 LEAST_PATCHES = 100
 """Fewer patches with events are not enough."""
-"""Number of time windows; a patch is SIDE_PX x SIDE_PX pixels by one of them."""
 NEAR_US = 2000
 """An event has company where an adjacent pixel fired at most this long before."""
 _BURST = 64
@@ -149,7 +149,7 @@ def _of_pixels(x, y, t, p, window, size, sums):
         turn = p[i] != before[at]
         # The first event of a pixel in a window has no interval: it would reach into another window.
         if seen[at] != k:
-            seen[at], count[at] = k, 0
+            seen[at], count[at], gap = k, 0, -1
             s[6] += 1
         else:
             log_gap = np.log(max(gap, 1))

@@ -114,13 +114,13 @@ def _covered(px: np.ndarray, faces: np.ndarray, shape: tuple[int, ...]) -> int:
 
 def _holed(scene: Scene, obj: SceneObject, t_ns: int, box: np.ndarray) -> tuple[np.ndarray, int]:
     """Return (the amodal box of a body with holes, the pixels of the picture that it covers): of the pixel centres in
-    the box of its triangles whose rays meet it, as if it were alone. The box is that one where the picture would have
-    to be more than :data:`WIDEST` times as wide and high."""
+    the box of its triangles whose rays meet it, as if it were alone. The box is that one where it is
+    farther away from the picture than :data:`WIDEST` of its sizes."""
     camera = scene.camera
     size = np.array([camera.width, camera.height])
     # Pixel centres are whole numbers: the first and the last ones in the box.
     low, high = np.ceil(box[:2]), np.floor(box[2:])
-    near, far = np.maximum(low, -WIDEST * size), np.minimum(high, WIDEST * size)
+    near, far = np.maximum(low, -WIDEST * size), np.minimum(high, (1 + WIDEST) * size - 1)
     if (far < near).any():
         return box, 0
     x, y = (np.arange(a, b + 1) for a, b in zip(near, far, strict=True))

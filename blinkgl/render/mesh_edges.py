@@ -118,7 +118,10 @@ def _edges(faces: np.ndarray, places: int) -> np.ndarray:
 def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
     """Return (V,) int32: for each place the one that replaces it. Places on the borders of two parts are joined where
     each is the other's nearest, up to :data:`WELD`. borders : places on each part's borders."""
-    from scipy.spatial import KDTree  # objects of one part do not need SciPy
+    # Objects of one part do not need SciPy.
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
 
     result = np.arange(len(places), dtype=np.int32)
     at, part = np.concatenate(borders), np.repeat(np.arange(len(borders)), [len(border) for border in borders])
@@ -138,9 +141,12 @@ def _welded(places: np.ndarray, borders: Sequence[np.ndarray]) -> np.ndarray:
     mine, other = mine[nearest], other[nearest]
     # A pair as one number, so that its reverse can be looked up: only mutual nearest neighbours are joined.
     back = np.isin(other.astype(np.int64) * len(at) + mine, mine.astype(np.int64) * len(at) + other)
-    for one, for_it in zip(at[mine[back]].tolist(), at[other[back]].tolist(), strict=True):
-        result[one] = min(result[one], result[for_it])
-    return result
+    ends = at[mine[back]], at[other[back]]
+    # Where three parts meet, pairs form chains; one place replaces all of a chain, so that no crack is left.
+    pairs = csr_array((np.ones(len(ends[0]), np.bool_), ends), shape=(len(places), len(places)))
+    _, chain = connected_components(pairs, directed=False)
+    np.minimum.at(first := np.full(chain.max() + 1, len(places), np.int32), chain, result)
+    return first[chain]
 
 
 def _joined(edges: np.ndarray, places: int) -> np.ndarray:

@@ -26,6 +26,7 @@ from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.tracks import Tracks, track_points
 from blinkgl.rng import Role, generator, kernel_seed
+from blinkgl.scene.shapes.sweep import filled
 from blinkgl.scene.types import Scene, SceneObject
 from blinkgl.sequence.inertial import Inertial, measured
 from blinkgl.sequence.light_truth import LightTruth
@@ -362,9 +363,16 @@ def nothing_in_view(scene: Scene) -> tuple[str, ...]:
     for one in bodies:
         at = world @ one.path.poses(times)
         # A sphere meets the picture if its centre is outside no plane by more than its radius.
-        if (at[:, :3, 3] @ planes.T >= -one.radius).all(axis=1).any():
+        outside = -(at[:, :3, 3] @ planes.T).min(axis=1).max()
+        if outside <= one.radius or (one.deforms and outside <= _reach(one)):
             return ()
     return ("no body is ever in the camera's view: its pose may be meant otherwise",) if bodies else ()
+
+
+def _reach(one: SceneObject) -> float:
+    """Return the largest distance of a body's points from its origin at any time."""
+    shapes = [filled(part.mesh) for part in one.parts]
+    return max(float(np.linalg.norm(hull, axis=1).max()) + margin for hull, margin in shapes)
 
 
 def _described(one: SceneObject) -> Tree:

@@ -140,9 +140,10 @@ class Watched(Protocol):
 
 class Timeline:
     """Iterator over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when
-    requested. ``stops_ns``: times of impacts, which adaptive kinds do not cross.   ``lights``: those that change over
-    time: adaptive kinds have a frame at each of their jumps, as at those of what moves, and one a nanosecond later, do
-    not cross their turning points, and in between take steps in which a light changes by a threshold at most."""
+    requested. ``stops_ns``: times of impacts, which adaptive kinds do not cross.   ``lights``: those that change
+    over time: adaptive kinds have a frame at each of their jumps, as at those of what moves, and one a nanosecond
+    later, do not cross their turning points, and in between take steps in which a light changes by a threshold at
+    most, where the response is logarithmic."""
 
     def __init__(
         self,
@@ -233,7 +234,8 @@ class Timeline:
 
     def _counted(self, t_ns: int) -> float:
         self.looks += 1
-        lights = [light.steepness(t_ns) / self.response.threshold for light in self.lights]
+        gain = self.response.gain / self.response.threshold
+        lights = [light.steepness(t_ns) * gain for light in self.lights]
         return max([self.pace(t_ns), *lights, *(other.pace(t_ns) for other in self.others)])
 
 
@@ -315,11 +317,16 @@ class Shared(Timeline):
     """One of several timelines that share their times."""
 
     def __init__(self, own: Timeline, times: Iterator[int]):
-        self._times = times
+        self._own, self._times = own, times
         super().__init__(own.config, own.t0_ns, own.t1_ns, own.scene, own.response, own.stops_ns)
 
     def __iter__(self) -> Iterator[int]:
         return self._times
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        # The steps of all are counted by the timeline of the first.
+        return self._own.notes
 
 
 def together(timelines: Sequence[Timeline]) -> list[Timeline]:

@@ -280,3 +280,14 @@ def test_calibrations_of_other_pictures_are_refused(tmp_path, more, named):
     (tmp_path / "c.yaml").write_text(text + more)
     with pytest.raises(ConfigError, match=rf"of other pictures or another lens.*{named}.*as they are stored"):
         read_camchain(tmp_path / "c.yaml")
+
+
+def test_the_right_camera_of_dsec_keeps_its_place(tmp_path):
+    """Its keys are made of the cameras' numbers, which need not follow each other: T_30 is of cam3 beside cam0."""
+    T, model = np.eye(4), PinHole(64, 48, 50.0, 51.0, 31.5, 23.0)
+    T[0, 3] = -0.6
+    for numbers in ((0, 3), (0, 1), (2, 5)):
+        text = cam_to_cam_yaml([Calibrated(model), Calibrated(model, T)], numbers)
+        assert f"T_{numbers[1]}{numbers[0]}" in text
+        (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+        np.testing.assert_array_equal(read_camchain(tmp_path / "c.yaml")[f"cam{numbers[1]}"].T_cam_before, T)

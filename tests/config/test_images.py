@@ -3,6 +3,8 @@
 import pytest
 import yaml
 
+from blinkgl.config.images import check_images
+from blinkgl.config.problems import Refused
 from blinkgl.config.run import load_run
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
@@ -92,3 +94,11 @@ def test_times_take_the_place_of_a_rate(tmp_path, preset):
     again = tmp_path / "again.yaml"
     again.write_text(config_yaml(config, 0))
     assert load_run(again).sequence(0).images == config.images
+
+
+@pytest.mark.parametrize("exposure_us", [249, 100_003, 199_999])
+def test_an_exposure_as_long_as_the_sequence_fits(exposure_us):
+    check_images(None, None, float(exposure_us), 0.0, 0.0, exposure_us * 1e-6)
+    check_images(1e-3, None, float(exposure_us), 0.0, 0.0, exposure_us * 1e-6)
+    with pytest.raises(Refused, match="no exposure fits"):
+        check_images(1e-3, None, float(exposure_us), 0.0, 0.0, (exposure_us - 1) * 1e-6)

@@ -12,6 +12,7 @@ from blinkgl.cli import run as command
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.errors import EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
+from blinkgl.events.grids import voxel_grid
 from blinkgl.events.truth import Surfaces, SurfaceTruth
 from blinkgl.io.formats import convert, event_writer, open_events, write_events
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
@@ -230,3 +231,10 @@ def test_what_a_pixel_remembers_is_still_that_of_what_left():
         if ms == 20:
             assert truth.of(events((0, 15_000)), 20 * MS_TRUTH)["instance"][0] == 2
     assert truth.of(events((0, 24_000), (0, 26_000)), 30 * MS_TRUTH)["instance"].tolist() == [2, 1]
+
+
+def test_a_voxel_grid_of_a_window_without_length_is_empty():
+    events = Events(np.ones(1, np.uint16), np.ones(1, np.uint16), np.array([5]), np.ones(1, np.uint8))
+    for t0, t1 in ((5, 5), (4, 4), (9, 9)):
+        assert not voxel_grid(events, t0, t1, 2, 2, 3).any()
+    assert voxel_grid(events, 5, 6, 2, 2, 3)[0, 1, 1] == 1

@@ -16,6 +16,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events import Esim, V2e, make_emulator, threads
 from blinkgl.events.noise import noise_size
 from blinkgl.events.packing import PackedBuffer
+from blinkgl.types.events import Events, count_causes, named_causes
 from tests.events.clips import assert_same
 
 
@@ -384,3 +385,19 @@ def test_an_emulator_that_changes_frames_sees_all_of_them():
         emulator = kind(8, 8, config)
         emulator.step(frame, 0)
         assert len(emulator.step(frame, 1_000_000, rows=(0, 0))) == due
+
+
+def test_what_comes_after_a_cut_has_its_own_cause():
+    """A still bright picture after a jump too large for one step: the leak alone makes events, as without a limit."""
+    causes = []
+    for limit in (10**6, 1024):
+        config = VoltmeterConfig(causes=True, max_events_per_step=limit)
+        emulator = make_emulator(config, 32, 32, 1)
+        for t_ns, light in ((0, 0.05), (10**7, 0.9)):
+            emulator.step(np.full((32, 32), light, np.float32), t_ns)
+        assert (emulator.saturated > 0) == (limit == 1024)
+        later = [emulator.step(np.full((32, 32), 0.9, np.float32), 4 * 10**7 * (k + 1)) for k in range(25)]
+        causes.append(named_causes(count_causes(Events.concatenate(later))))
+    # What V holds at the end of the cut step is no light any more.
+    whole, cut = causes
+    assert cut["leak"] > 100 and cut["signal"] == 0 and whole["signal"] > 0

@@ -394,3 +394,9 @@ def test_a_context_of_another_thread_is_refused_and_nothing_of_ours_is_freed(gl)
         done.set()
         thread.join()
     assert box["other"].released and gl.ctx.error == "GL_NO_ERROR"
+
+
+def test_devices_are_of_the_library_that_draws(monkeypatch):
+    """glcontext's variable names it; one that is not there has none."""
+    monkeypatch.setenv("GLCONTEXT_LINUX_LIBEGL", "libNoSuchEGL.so.7")
+    assert egl_devices() == []

@@ -210,3 +210,10 @@ def test_damage_is_refused_by_its_place(tmp_path, data, message):
 def test_a_header_without_an_end(tmp_path):
     with pytest.raises(AssetError, match=rf"a header without an end, at byte {START}"):
         open_events(put(tmp_path / "e.aedat", header() + b"#" + b"x" * 200_000))
+
+
+def test_a_time_below_zero_names_what_would_do(tmp_path):
+    """A frame's sample after an event of 100 µs, by the clock 101 µs before it: no time precedes the recording."""
+    data = header() + records([0, 1 << 31], [100, 2**32 - 1])
+    with pytest.raises(AssetError, match=r"times decrease: record 1, .*expected at least 0 µs"):
+        list(open_events(put(tmp_path / "e.aedat", data)).chunks())

@@ -578,3 +578,29 @@ def test_every_pair_of_seldom_kinds_of_tiff(tmp_path):
         light = np.rint(COLOUR // 2 * (1.0 if extra == 1 else 128 / 255))
         turned = light[::-1, ::-1] if orientation == 3 else light[::-1].swapaxes(0, 1)
         assert np.abs(image - turned).max() <= 1
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def test_what_a_png_states_comes_in_any_order(tmp_path):
+    """Significant bits, a code of the curve, sRGB and gamma before the pixels, in each order; a code of the curve
+    counts more than sRGB, and that more than gamma."""
+    pixels = (np.arange(12).reshape(3, 4) * 300).astype(">u2")
+    body = zlib.compress(b"".join(b"\0" + row.tobytes() for row in pixels))
+    head, end = chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 3, 16, 0, 0, 0, 0)), chunk(b"IEND", b"")
+    stated = {
+        b"sBIT": b"\x0c",
+        b"cICP": bytes([9, 16, 0, 1]),
+        b"sRGB": b"\0",
+        b"gAMA": struct.pack(">I", 100000),
+    }
+    for kinds in (kinds for n in range(5) for kinds in itertools.permutations(stated, n)):
+        chunks = b"".join(chunk(kind, stated[kind]) for kind in kinds)
+        path = tmp_path / "a.png"
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + chunks + chunk(b"IDAT", body) + end)
+        one = open_stills(path)
+        curve = "pq" if b"cICP" in kinds else None if b"sRGB" in kinds else "linear" if b"gAMA" in kinds else None
+        assert (one.white, one.transfer) == (4095 if b"sBIT" in kinds else None, curve), kinds
+        np.testing.assert_array_equal(one.read(), pixels)

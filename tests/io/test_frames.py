@@ -5,13 +5,15 @@ from __future__ import annotations
 import shutil
 
 import cv2
+import imageio
 import numpy as np
 import pytest
+import tifffile
 
-from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError
 from blinkgl.io.frames import open_frames, read_any_image
 from blinkgl.io.reading import Declared
-from blinkgl.io.times import read_timestamps
+from blinkgl.io.times import read_timestamps, stamps_of_array
 from blinkgl.io.video import VideoWriter
 from tests.videos import put_exr
 
@@ -234,3 +236,50 @@ def test_lines_that_are_no_times(tmp_path):
         path.write_text(text)
         with pytest.raises(EventDataError, match=said):
             read_timestamps(path)
+
+
+def declared_of_frames(folder):
+    """A clip of each kind: name -> (path, whether it has times of its own)."""
+    film = np.random.default_rng(0).integers(0, 255, (6, 24, 32, 3), np.uint8)
+    np.save(folder / "a.npy", film)
+    np.savez(folder / "a.npz", frames=film)
+    np.savez(folder / "b.npz", frames=film, t_us=np.arange(6) * 1000)
+    tifffile.imwrite(folder / "a.tif", film)
+    imageio.v3.imwrite(folder / "a.gif", film, duration=40)
+    (folder / "f").mkdir()
+    for k, frame in enumerate(film):
+        imageio.v3.imwrite(folder / "f" / f"{k:04d}.png", frame)
+    return {"a.npy": False, "a.npz": False, "b.npz": True, "a.tif": False, "a.gif": True, "f": False}
+
+
+def test_whatever_is_declared_of_a_clip_is_used_or_said(tmp_path):
+    """Of each kind: a stream that is not there, a unit without times, a unit that the file states otherwise, times
+    beside the file's own."""
+    clips = declared_of_frames(tmp_path)
+    (tmp_path / "times.txt").write_text("\n".join(f"{k * 0.01:.3f}" for k in range(6)), encoding="utf-8")
+    listed = {"timestamps": tmp_path / "times.txt", "time_unit": "s"}
+    for name, timed in clips.items():
+        for fields in ({"stream": "nosuch"}, {"time_unit": "ms"}, listed):
+            more = {} if timed or "timestamps" in fields else {"fps": 50.0}
+            plain = open_frames(tmp_path / name, Declared(**({} if timed else {"fps": 50.0})))
+            before = [t for _, t, _ in plain]
+            try:
+                now = open_frames(tmp_path / name, Declared(**fields, **more))
+                times = [t for _, t, _ in now]
+            except BlinkGLError as error:
+                assert "stream" in fields and "--stream" in str(error), (name, fields)
+                continue
+            new = [line for line in now.notes if line not in plain.notes]
+            assert new or (times != before and not timed), (name, fields)
+            assert not any("as the file says" in line for line in now.notes) or times == before, (name, fields)
+
+
+def test_units_that_a_list_or_an_array_of_times_states_otherwise_are_said(tmp_path):
+    (tmp_path / "times.csv").write_text("t_us,name\n0,a\n1000,b\n2000,c\n", encoding="utf-8")
+    assert read_timestamps(tmp_path / "times.csv").note is None
+    stamps = read_timestamps(tmp_path / "times.csv", "ms")
+    assert stamps.times_ns == [0, 10**9, 2 * 10**9]
+    assert stamps.note == "times.csv: the file says us; --time-unit ms is used"
+    dated = np.array([0, 5], "timedelta64[ms]")
+    assert stamps_of_array("t", dated, None, "a.npz").note is None
+    assert stamps_of_array("t", dated, "us", "a.npz").note == "the file says ms; --time-unit us is used"

@@ -513,3 +513,14 @@ def test_a_small_mat_that_unpacks_to_gigabytes(tmp_path):
     for name in ("e.mat", "e.npz"):
         with pytest.raises(BlinkGLError, match="unpacks to more than 100 times its size"):
             read(tmp_path / name)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_polarity_that_is_no_number_is_named(tmp_path, value):
+    events = np.zeros(4, [("t", "i8"), ("x", "i4"), ("y", "i4"), ("p", "f4")])
+    events["t"], events["p"] = [10, 20, 30, 40], [0, 1, value, 1]
+    np.save(tmp_path / "e.npy", events)
+    for rows in (slice(None), slice(2, 3)):
+        np.save(tmp_path / "e.npy", events[rows])
+        with pytest.raises(EventDataError, match="polarity|p of event|event"):
+            open_events(tmp_path / "e.npy", EventReading.of(time_unit="us")).read()

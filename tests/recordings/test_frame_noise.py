@@ -14,6 +14,7 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events
 from blinkgl.io.frames import open_frames
 from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
+from blinkgl.recordings.decoding import Decoder
 from blinkgl.recordings.frame_noise import BAND, MOST_CODES, DenoisedLight, estimated, looked_at
 from blinkgl.recordings.simulation import SimulationReport, frames_to_events
 from tests.shared_data import shared
@@ -339,3 +340,11 @@ def test_the_frame_camera_of_a_sequence_says_what_it_is(tmp_path, noise):
     assert source.levels == (0.0625 * 4095, 4095.0) and source.transfer == "linear"
     assert source.exact == ("false" in noise) and [t for _, t, _ in source] == [0, 10**6, 2 * 10**6, 3 * 10**6]
     assert any("linear, 12 bits, rggb filters" in note for note in source.notes)
+
+
+@pytest.mark.parametrize(
+    ("levels", "dtype"), [(None, "u1"), (None, "u2"), ((16, 235), "u1"), ((64, 940), "u2"), ((0, 4095), "u2")]
+)
+def test_the_distance_of_codes_is_that_of_256(levels, dtype):
+    """Of linear codes it is 1/255 everywhere, however many of them lie between black and white."""
+    assert Decoder("linear", levels).code_distance(dtype)(0.5) * 255 == pytest.approx(1, rel=1e-3)

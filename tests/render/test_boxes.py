@@ -241,3 +241,20 @@ def test_a_holed_body_at_the_edge_of_the_picture_is_cut_there(gl):
         assert len(boxes.instance) == seen
         if seen:
             assert boxes.truncated[0] == pytest.approx(0.5, abs=0.03) and boxes.occluded[0] == 0
+
+
+def test_a_holed_body_far_beside_the_picture_is_looked_for_on_both_sides(gl):
+    """A long plate whose middle is open: its box on the right mirrors that on the left, up to twice the picture's
+    width."""
+    alpha = np.full((64, 64), 255, np.uint8)
+    alpha[:, 60:] = 0
+    camera, found = rig().sensors[0].camera, []
+    for side in (-1, 1):
+        cut = Mask(np.ascontiguousarray(alpha[:, ::side]))
+        paint, at = Material(mask=cut, both_sides=True), still((side * 3.0, 3, 0), FACING)
+        asked = asked_for(LabelsConfig(boxes=True, ids=True, flow=(), images=False))
+        with Renderer(gl, scene([thing("plate", 1, quad(3.2, 0.5), at, paint)]), RenderConfig()) as renderer:
+            found.append(renderer.labels(0, asked).boxes.amodal_box[0])
+    left, right = found
+    assert right[2] > 2 * camera.width
+    np.testing.assert_allclose(right[[0, 2]], 2 * camera.cx - left[[2, 0]], atol=1.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from blinkgl.camera import PinHole, Radtan
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.contours import CROSSING, LINE, Lines
-from blinkgl.render.mesh_edges import Contour
+from blinkgl.render.mesh_edges import WELD, Contour, _welded
 from blinkgl.render.passes import Luminance, filtered
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
@@ -530,3 +531,12 @@ def test_small_triangles_do_not_flicker(gl, subdivisions, dents):
     for step in (1, 2):
         change = {name: rmse(np.diff(error[::step], axis=0), 0) for name, error in off.items()}
         assert change["edges"] < 0.45 * change["none"]
+
+
+def test_places_in_a_chain_of_three_parts_are_one():
+    """Each end is the middle's nearest, and the ends are no neighbours: the order of the parts does not matter."""
+    off = 0.7 * WELD
+    for order in itertools.permutations(range(3)):
+        places = np.concatenate([np.array([[k * off, 0, 0]]) for k in order] + [[[1.0, 0, 0]]])
+        joined = _welded(places, [np.array([0]), np.array([1]), np.array([2])])
+        assert joined.tolist() == [0, 0, 0, 3], order

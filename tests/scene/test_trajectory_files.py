@@ -20,6 +20,7 @@ from blinkgl import (
 )
 from blinkgl.config.run import load_run
 from blinkgl.front.runs import configured
+from blinkgl.io import trajectories
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.motion.paths import smoothed
 from tests.refusals import refusal
@@ -456,3 +457,39 @@ def test_frames_of_nerf_by_any_spelling_of_their_names(tmp_path, start):
     assert np.abs(poses - circle(np.arange(11) * 0.1)).max() < 1e-9
     alike = json.dumps({"frames": [{**frame, "file_path": "a"} for frame in frames]})
     assert len(read_of(tmp_path, "transforms.json", alike, rate=10)[1]) == 11
+
+
+TUM = "# timestamp tx ty tz qx qy qz qw\n" + "".join(f"{k * 0.1:.6f} {k * 0.01} 0 0 0 0 0 1\n" for k in range(6))
+NAMED = "t_us,x,y,z,qx,qy,qz,qw\n" + "".join(f"{k * 100_000},{k * 0.01},0,0,0,0,0,1\n" for k in range(6))
+KITTI = "".join(f"1 0 0 {k * 0.01} 0 1 0 0 0 0 1 0\n" for k in range(6))
+
+
+@pytest.mark.parametrize(
+    ("text", "declared", "line"),
+    [
+        (TUM, {"rate": 30.0}, "the poses have times; rate is not used"),
+        (TUM, {"times": "times.txt"}, "the poses have times; times is not used"),
+        (NAMED, {"time_unit": "ns"}, "the file says us; time_unit: ns is used"),
+        (NAMED, {"form": "euroc"}, "the heading names the columns otherwise than form: euroc, and is used"),
+        (NAMED, {"columns": "t x y z qw qx qy qz"},
+         "the heading names the columns otherwise; columns: t x y z qw qx qy qz is used"),
+        (KITTI, {"form": "kitti", "rate": 10.0, "time_unit": "s"}, "time_unit is not used, because of rate"),
+        (KITTI, {"form": "kitti", "rate": 10.0, "times": "times.txt"}, "times is not used, because of rate"),
+        (KITTI, {"rate": 10.0, "columns": "t x y z qx qy qz qw"}, "columns is not used, because of form kitti"),
+    ],
+)  # fmt: skip
+def test_whatever_is_declared_of_poses_is_used_or_said(tmp_path, text, declared, line):
+    path, notes = tmp_path / "poses.txt", []
+    path.write_text(text, encoding="utf-8")
+    trajectories.read_trajectory(path, trajectories.PoseFile(**declared), notes)
+    assert f"poses.txt: {line}" in notes
+    plain = []
+    alone = {"rate": 10.0} if text == KITTI else {}
+    trajectories.read_trajectory(path, trajectories.PoseFile(**alone), plain)
+    assert not any("not used" in one or "otherwise" in one or "says" in one for one in plain)
+
+
+def test_a_file_of_times_that_is_not_there_is_named(tmp_path):
+    (tmp_path / "poses.txt").write_text(KITTI, encoding="utf-8")
+    with pytest.raises(AssetError, match="nosuch.txt: no such file; expected a file of times, or rate: in Hz"):
+        trajectories.read_trajectory(tmp_path / "poses.txt", trajectories.PoseFile(times=tmp_path / "nosuch.txt"))

@@ -204,3 +204,20 @@ def test_a_camera_that_turns_to_a_body_sees_it(tmp_path, gl):
     with simulate_sequence(SequenceRequest(config_of(tmp_path, scene=scene), 0), gl) as sequence:
         list(sequence)
         assert not [line for line in sequence.notes if "view" in line]
+
+
+def test_a_body_that_breathes_into_view_is_in_view(tmp_path, gl):
+    """At rest it is beside the picture; breathing brings it in."""
+    scene = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box", "position": [0, 2.88, 0]}],
+        "camera": {"position": [-3, 0, 0], "look_at": [0, 0, 0]},
+    }
+    for deform, seen in ((None, False), ({"kind": "breathe", "amount": [0, 0.9, 0], "period": 0.1}, True)):
+        scene["objects"][0]["deform"] = deform
+        config = config_of(tmp_path, camera={"width": 48, "height": 36, "fov": 60}, scene=scene)
+        with simulate_sequence(SequenceRequest(config, 0), gl) as sequence:
+            list(sequence)
+            said = [line for line in sequence.notes if "in the camera's view" in line]
+        assert len(said) == (not seen)

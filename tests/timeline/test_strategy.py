@@ -21,6 +21,7 @@ from blinkgl.events.v2e_model import lin_log
 from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
+from blinkgl.scene.waveforms import Sine
 from blinkgl.timeline import make_timeline, together, uniform_times
 from tests.render.render_scenes import FACING, drift, mixed_scene, quad, rig, scene, still, thing
 from tests.timeline.paces import displacement_times
@@ -147,6 +148,8 @@ class Seen:
     def motion(self):
         return self
 
+    unbounded = ()
+
     def look(self, t_ns: int):
         speed = self.before if t_ns < self.until else self.after
         return SimpleNamespace(largest=speed, percentile=lambda percent: speed)
@@ -236,3 +239,25 @@ def test_few_steps_are_refused_where_the_pace_changes_smoothly(speed):
     least = trapezoid(speed(np.linspace(0, 100 * MS, 10_001)), dx=1e-5) / 0.5
     assert len(asked) <= 1.1 * len(times)
     assert len(times) <= 1.1 * least + 2
+
+
+def test_what_the_steps_of_a_rig_are_too_long_for_is_said_by_it():
+    """Whichever camera it is of: the steps are the same."""
+    config = DisplacementTimeline(max_px=1.0, min_step_us=1000.0)
+    alone = made(Seen(9000, 9000, 0), config)
+    list(alone)
+    assert "9 times shorter" in alone.notes[0]
+    for speeds in ((9000, 20), (20, 9000)):
+        both = together([made(Seen(speed, speed, 0), config) for speed in speeds])
+        for one in both:
+            list(one)
+        assert [line for one in both for line in one.notes] == list(alone.notes)
+
+
+@pytest.mark.parametrize("config", [EsimConfig(), V2eConfig(), VoltmeterConfig()], ids=["esim", "v2e", "voltmeter"])
+def test_a_light_changes_by_a_threshold_a_step_whatever_the_emulators_gain(config):
+    wave, response = Sine(frequency=5, depth=0.9), emulator_of(config).response(config)
+    steps = DisplacementTimeline(max_px=1.0, min_step_us=10.0, max_step_us=1e5)
+    times = list(make_timeline(steps, 0, 1000 * MS, Seen(0, 0, 0), response, (), [wave]))
+    signal = response.signal(np.array([5.0 * wave.factor(t) for t in times], np.float32))
+    assert 0.5 < np.abs(np.diff(signal)).max() / response.threshold < 1.02

@@ -295,7 +295,7 @@ class AffinePath:
     nearest to its linear part.
 
     motion : (M, dM/dt), ((4, 4), (4, 4) 1/s), at a time in ns.   local : (4, 4) rigid, from the body to M's axes.
-    span_ns : time in which the motion takes all its values; 0: unknown.
+    span_ns : time from 0, or any later time, on in which the motion takes all its later values; 0: unknown.
     timescale_ns : time in which its velocity changes little.
     jumps : the times in (t0, t1), ns, after which it jumps; None: it does not."""
 
@@ -343,7 +343,7 @@ class AffinePath:
     def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
         """Return bounds, see :class:`PosePath`, from samples; a quarter is added for what lies between them."""
         if self._span_ns:
-            tb_ns = min(tb_ns, ta_ns + self._span_ns)
+            tb_ns = min(tb_ns, max(ta_ns, 0) + self._span_ns)
         # Four samples in each time scale, rounded up, and at least both ends.
         samples = min(max(2, 4 * -(-(tb_ns - ta_ns) // self._timescale_ns)), _SPEED_SAMPLES)
         rates = [self.derivative(int(t)) for t in np.linspace(ta_ns, tb_ns, samples)]

@@ -71,7 +71,6 @@ def thin(
     """Return (N,) bool: which of N poses, ``step`` seconds apart, a ``HermitePath`` needs to pass all of them within
     ``tolerance`` (units) and ``angle`` (rad); both ends are included. Arrays as there. From each kept pose the next is
     found by halving."""
-    # The largest step that passes all poses between, found by halving.
     keep = np.empty(len(positions), dtype=bool)
     p, v, q, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, velocities, quaternions, rates))
     _thin(step, p, v, q, w, tolerance, angle, keep)

@@ -82,8 +82,12 @@ class Playing:
 
     @property
     def span_ns(self) -> int:
-        """Return the time from 0 after which nothing changes."""
-        return 0 if self.is_static else round((self.last - self.first) / abs(self.speed) * 1e9)
+        """Return the time from 0 on in which it takes all its values: a round of a loop; 0: it stands still by then."""
+        if self.is_static:
+            return 0
+        # Without a loop it plays once, and begins late where the phase puts it before the end it comes from.
+        passed = 0.0 if self.loop else self.phase if self.speed > 0 else self.last - self.first - self.phase
+        return max(round((self.last - self.first - passed) / abs(self.speed) * 1e9), 0)
 
     @property
     def is_static(self) -> bool:

@@ -13,6 +13,7 @@ from skinned import Swinging, arm
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.motion.paths import AffinePath
 from blinkgl.scene.shapes.clips import Clip, Playing, Track
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin, joined
@@ -186,3 +187,25 @@ def test_what_cannot_be_drawn_is_refused(said, make):
 
 def skin_of(bones=(0, 1), inverse_bind=BIND, joints=((0, 1), (0, 1)), weights=((0.5, 0.5), (1, 0))):
     return Skin(Skeleton([-1, 0], Swinging()), bones, inverse_bind, joints, weights, where="somebody.glb")
+
+
+@pytest.mark.parametrize("speed", [1.0, -2.0, 0.5])
+@pytest.mark.parametrize("phase", [-5.0, 0.0, 0.25, 1.0, 7.0])
+def test_a_clip_that_plays_once_moves_until_the_end_of_its_span(phase, speed):
+    """Also one that begins late, and one that is over at 0; its path's bound of speed sees it from any time on."""
+    playing = Playing(0.0, 1.0, speed, phase, loop=False)
+
+    def motion(t_ns):
+        place, rate = playing.at(t_ns)
+        matrix, change = np.eye(4), np.zeros((4, 4))
+        matrix[0, 3], change[0, 3] = 3 * place, 3 * rate
+        return matrix, change
+
+    end = 10**10
+    path = AffinePath(motion, 0, end, np.eye(4), playing.span_ns, 10**8)
+    times = np.arange(0, end, 10**7)
+    moves = [t for t in times if playing.at(int(t))[1] != 0]
+    assert max(moves, default=0) <= playing.span_ns
+    for first in (0, 3 * 10**9, 5_400_000_000):
+        fastest = max((np.linalg.norm(path.derivative(int(t))[:3, 3]) for t in times if t >= first), default=0)
+        assert path.speed_bound(first, end)[0] >= fastest

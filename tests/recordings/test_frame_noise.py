@@ -244,7 +244,7 @@ def test_frames_with_a_caveat(tmp_path, capsys, frames, said):
     assert ("warning:" in out) == ("warning:" in said or "at an end" in said)
 
 
-@pytest.mark.parametrize(("more", "dark"), [(0.1, 0.8), (0.5, 0.5), (0.84, 0.15), (0.9, 0.02)])
+@pytest.mark.parametrize(("more", "dark"), [(0.1, 0.8), (0.5, 0.5), (0.84, 0.15), (0.9, 0.02), (0.02, 0.8)])
 def test_how_much_the_picture_flickers(tmp_path, capsys, more, dark):
     """The brighter frames over the darker ones, for small factors and for large ones."""
     np.save(tmp_path / "v.npy", flickering(9, more, dark))

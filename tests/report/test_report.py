@@ -16,7 +16,8 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.report import charts
 from blinkgl.report.charts import histogram
-from blinkgl.report.collect import collect
+from blinkgl.report.collect import Parameter, collect
+from blinkgl.report.page import _counts
 
 RECIPE = {
     "seed": 5,
@@ -203,3 +204,16 @@ def test_bars_of_counts_stand_apart_and_are_labelled_by_counts():
     assert len(lefts) == 3 and min(np.diff(lefts)) > 1.3 * h.bar_width
     middle = (h.left + h.right) / 2
     assert lefts[0] + h.bar_width / 2 == pytest.approx(middle - 1.5 * (h.right - h.left) / 4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "spec"),
+    [
+        ("shares", [{"value": "a", "share": 0.25}, {"value": "b", "share": 0.75}]),
+        ("weighted", {"a": 2.0, "b": 6.0}),
+        ("choice", ["a", "b", "b", "b"]),
+    ],
+)
+def test_expected_counts_add_up_to_those_drawn(kind, spec):
+    rows = _counts(Parameter("run", "output.label", kind, spec, ["b", "a", "b", "b", "b", "b", "b", "b"]))
+    assert sorted(rows) == [("a", 1, pytest.approx(2.0)), ("b", 7, pytest.approx(6.0))]

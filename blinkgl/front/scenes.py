@@ -450,10 +450,11 @@ class Scene(Piece):
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """Return the scene for the renderer. Raises ConfigError and AssetError: files."""
-        from blinkgl.scene.build import equipped, in_fog, seen_by
+        from blinkgl.scene.build import equipped, in_fog, seen_by, sharpest_of
 
         span_ns = config.time.t0_ns, config.time.t1_ns
-        made = explicit_scene(config.scene, seen_by(config).model, *span_ns, Path.cwd(), self._listed[1])
+        where = Path.cwd(), self._listed[1], sharpest_of(config)
+        made = explicit_scene(config.scene, seen_by(config).model, *span_ns, *where)
         if notes := dict.fromkeys(note for body in self.objects for note in body.notes):
             made = replace(made, omissions=(*made.omissions, f"pyrender's scene is drawn without: {'; '.join(notes)}"))
         return equipped(in_fog(made, config.scene), config)

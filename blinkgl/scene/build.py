@@ -9,7 +9,7 @@ import numpy as np
 
 from blinkgl.config.camera import CameraConfig, camera_radius
 from blinkgl.config.lights import LightConfig
-from blinkgl.config.poses import TrajectoryConfig
+from blinkgl.config.poses import KeyedMotionConfig
 from blinkgl.config.rig import RigSensorConfig, baseline_of
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import SequenceConfig
@@ -37,10 +37,11 @@ def build_scene(
     seed: int = 0,
     sequence: int = 0,
     base: Path | str = ".",
+    px_per_slope: float = 0.0,
 ) -> Scene:
     """Return the scene over [t0_ns, t1_ns].
 
-    camera : the camera; a file's own may replace it (``scene.intrinsics``).
+    camera : the camera; a file's own may replace it (``scene.intrinsics``).   px_per_slope : of a rig's sharpest.
     split : 'train' or 'test', the part of the pools for random scenes.
     seed, sequence : random scenes are a function of these and the configuration; repetition gives identical arrays.
     base : folder that the configuration's relative paths start from.
@@ -54,7 +55,7 @@ def build_scene(
     if isinstance(config, RandomSceneConfig):
         scene = random_world(config, camera.model, t0_ns, t1_ns, split, seed, sequence, base)
     elif isinstance(config, ExplicitSceneConfig):
-        scene = explicit_scene(config, camera.model, t0_ns, t1_ns, base)
+        scene = explicit_scene(config, camera.model, t0_ns, t1_ns, base, px_per_slope=px_per_slope)
     else:
         scene = scene_from_file(config, camera.model, t0_ns, t1_ns, base)
     return in_fog(scene, config)
@@ -97,6 +98,7 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
         seed=seed,
         sequence=index,
         base=base,
+        px_per_slope=sharpest_of(config),
     )
     return equipped(scene, config)
 
@@ -117,6 +119,11 @@ def seen_by(config: SequenceConfig) -> CameraConfig:
     return next((one.camera for one in config.sensors or () if one.sees), config.camera)
 
 
+def sharpest_of(config: SequenceConfig) -> float:
+    """Return the largest ``px_per_slope`` of a rig's cameras; 0: no rig."""
+    return max((one.camera.model.px_per_slope for one in config.sensors or () if one.sees), default=0.0)
+
+
 def _with_room(config: SequenceConfig) -> SceneConfig:
     """Return the scene's configuration in which a random world keeps clear of every camera of the rig."""
     scene = config.scene
@@ -132,7 +139,8 @@ def _with_room(config: SequenceConfig) -> SceneConfig:
 
 
 def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "train") -> None:
-    """Find missing folders, empty pools and missing files before any work starts. Raises ConfigError or AssetError."""
+    """Find missing folders, empty pools and every missing file that a sequence would open, before any work starts.
+    Raises ConfigError or AssetError."""
     base = Path(base)
     if isinstance(config, RandomSceneConfig):
         objects, textures = pools(config, base)
@@ -141,11 +149,9 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
             objects.split(split)
         textures.split(split)
     elif isinstance(config, ExplicitSceneConfig):
-        # Every file that a sequence would open is looked for before the first one is drawn.
-        moving = [("scene.camera", config.camera), *((f"scene.objects.{k}", o) for k, o in enumerate(config.objects))]
-        for where, motion in moving:
-            if motion.trajectory is not None:
-                _check_trajectory(motion.trajectory, base, f"{where}.trajectory")
+        _check_motion(config.camera, base, "scene.camera")
+        for k, item in enumerate(config.objects):
+            _check_motion(item, base, f"scene.objects.{k}")
         for name, mesh in config.meshes.items():
             _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
             if mesh.primitive is not None:
@@ -153,19 +159,21 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
         for name, material in config.materials.items():
             for key, used in material.files.items():
                 _exists(used, base, f"scene.materials.{name}.{key}", "an image file")
-        _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
     else:
         assert isinstance(config, FileSceneConfig)
-        _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
         _exists(config.path, base, "scene.path", "a gltf or glb file")
-        if config.pose is not None and config.pose.trajectory is not None:
-            _check_trajectory(config.pose.trajectory, base, "scene.pose.trajectory")
+        _check_motion(config.pose, base, "scene.pose")
+    _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
+    for k, lamp in enumerate(config.light.lights):
+        _check_motion(getattr(lamp, "motion", None), base, f"scene.light.lights.{k}.motion")
 
 
-def _check_trajectory(config: TrajectoryConfig, base: Path, where: str) -> None:
-    _exists(config.file, base, f"{where}.file", "a trajectory")
-    if isinstance(config.T_body_sensor, str):
-        _exists(config.T_body_sensor, base, f"{where}.T_body_sensor", "EuRoC's sensor.yaml")
+def _check_motion(config: KeyedMotionConfig | None, base: Path, where: str) -> None:
+    if config is None or config.trajectory is None:
+        return
+    _exists(config.trajectory.file, base, f"{where}.trajectory.file", "a trajectory")
+    if isinstance(place := config.trajectory.T_body_sensor, str):
+        _exists(place, base, f"{where}.trajectory.T_body_sensor", "EuRoC's sensor.yaml")
 
 
 def panorama_of(light: LightConfig) -> str | None:

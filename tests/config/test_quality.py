@@ -98,3 +98,10 @@ def test_a_folder_of_that_name_hides_no_run(tmp_path, monkeypatch):
         load_run("other")
     (tmp_path / "stereo").write_text("seed: 7\n")
     assert run_file("stereo") == Path("stereo")
+
+
+def test_what_says_no_quality_is_balanced(tmp_path):
+    """A sequence and the corners of a recipe; ``null`` is none of them."""
+    nothing, balanced, null = (load_run_of(tmp_path, tree) for tree in ({}, {"quality": "balanced"}, {"quality": None}))
+    assert nothing.sequence(0).timeline == balanced.sequence(0).timeline != null.sequence(0).timeline
+    assert nothing.corners[0].timeline == balanced.corners[0].timeline != null.corners[0].timeline

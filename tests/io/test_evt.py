@@ -228,3 +228,30 @@ def test_sizes_beyond_eleven_bits(tmp_path):
     for size in ((2049, 10), (10, 2049)):
         with pytest.raises(EventDataError, match="EVT3 has 11-bit coordinates"):
             EvtWriter(tmp_path / "f.raw", *size)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1 << 17])
+@pytest.mark.parametrize("version", ["evt2", "evt3"])
+def test_triggers_among_random_words(tmp_path, version, block):
+    """Time, channel and edge of each, by the words before it, in whatever pieces the file is read."""
+    rng, two = np.random.default_rng(4), version == "evt2"
+    kinds, rest = ([0, 1, 8, 10], 28) if two else ([0, 2, 6, 8, 10], 12)
+    words = [int(rng.choice(kinds)) << rest | int(rng.integers(0, 1 << rest)) for _ in range(600)]
+    high, low, turns, expected = None, 0, 0, []
+    for word in words:
+        kind, value = word >> rest, word & (1 << rest) - 1
+        if kind == 8:
+            turns += high is not None and high - value > (2**27 if two else 2**11 - 1)
+            low = 0 if not two and value != (high or 0) else low
+            high = value
+        elif kind == 6:
+            low = value
+        elif kind == 10 and high is not None:
+            now = (turns * 2**28 + high) * 64 + (value >> 22) if two else (turns * 2**12 + high) * 4096 + low
+            expected.append([now, value >> 8 & (31 if two else 15), value & 1])
+    path = tmp_path / "t.raw"
+    path.write_bytes(b"% evt " + version[-1].encode() + b".0\n% end\n" + np.array(words, WORD[version]).tobytes())
+    reader = EvtReader(path)
+    for _ in range(2):
+        list(reader.chunks(block))
+        assert reader.triggers.tolist() == expected and len(expected) > 100

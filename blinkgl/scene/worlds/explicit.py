@@ -63,9 +63,17 @@ class InMemory:
 
 
 def explicit_scene(
-    config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()
+    config: ExplicitSceneConfig,
+    camera: CameraModel,
+    t0_ns: int,
+    t1_ns: int,
+    base: Path,
+    memory: InMemory = InMemory(),
+    px_per_slope: float = 0.0,
 ) -> Scene:
     """Return the configured scene; nothing is random, and collisions are searched only if configured.
+
+    px_per_slope : of the sharpest camera of a rig, for levels of detail; the camera's own where it is larger.
 
     Raises ConfigError (missing file, bad parameter; with ``collisions``, bodies that touch at the start; with
     ``physics``, what :func:`simulate` raises) and AssetError."""
@@ -74,7 +82,7 @@ def explicit_scene(
     objects = _objects(config, t0_ns, t1_ns, base, memory, log, omissions)
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", base, camera=True, log=log)
     objects = [
-        obj if item.mesh in memory.meshes else _in_detail(obj, item, config, camera, path)
+        obj if item.mesh in memory.meshes else _in_detail(obj, item, config, camera, path, px_per_slope)
         for obj, item in zip(objects, config.objects, strict=True)
     ]
     bodies = {obj.name: item.physics for obj, item in zip(objects, config.objects) if item.physics is not None}
@@ -185,7 +193,12 @@ def _parts(asset: Asset, item: ObjectConfig, material: Material | None, config: 
 
 
 def _in_detail(
-    obj: SceneObject, item: ObjectConfig, config: ExplicitSceneConfig, camera: CameraModel, path: PosePath
+    obj: SceneObject,
+    item: ObjectConfig,
+    config: ExplicitSceneConfig,
+    camera: CameraModel,
+    path: PosePath,
+    px_per_slope: float,
 ) -> SceneObject:
     """Return a body whose primitive has levels of detail with the coarsest vertices that are at most :data:`APART` px
     from each other when it is nearest to the camera."""
@@ -198,7 +211,7 @@ def _in_detail(
     # From the height of the body's middle, which may come as near as half of its radius.
     middle, size = (part.mesh.vertices.max(axis=0) + part.mesh.vertices.min(axis=0)) / 2, part.mesh.radius / 2
     nearest = max(float(np.linalg.norm(apart + middle, axis=1).min()) - size / 2, camera.near)
-    px_per_unit = camera.px_per_slope / nearest * float(np.max(item.scale))
+    px_per_unit = max(camera.px_per_slope, px_per_slope) / nearest * float(np.max(item.scale))
     level = max((k for k, spacing in enumerate(SPACINGS) if spacing * px_per_unit <= APART), default=0)
     if not level:
         return obj

@@ -16,6 +16,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.thresholds import measured_thresholds
+from blinkgl.io.trajectories import TIMES
 from blinkgl.scene.build import check_assets as check_scene, panorama_of
 from blinkgl.scene.importing.mesh_files import border_of, identity_of
 from blinkgl.scene.motion.dynamics import engine_version
@@ -152,6 +153,11 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
     tree = scene.light.model_dump() if isinstance(scene, RandomSceneConfig) else scene.model_dump()
     for used in dict.fromkeys([*_values(tree, "file"), *_values(tree, "T_body_sensor")]):
         if isinstance(used, str) and resolve(used, base).is_file():  # a mesh, a trajectory, a clip
+            file(resolve(used, base), used)
+    for trajectory in _values(tree, "trajectory"):
+        # Poses without times take them from there.
+        used = Path(trajectory["file"]).with_name(TIMES).as_posix() if isinstance(trajectory, dict) else None
+        if used is not None and resolve(used, base).is_file():
             file(resolve(used, base), used)
     if isinstance(scene, ExplicitSceneConfig):
         for used in {used: None for m in scene.materials.values() for used in m.files.values()}:

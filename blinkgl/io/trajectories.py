@@ -112,6 +112,8 @@ class PoseFile:
 
 
 ANY = PoseFile()
+TIMES = "times.txt"
+"""The list, beside poses without times, that has them (KITTI)."""
 
 
 @dataclass
@@ -394,7 +396,7 @@ def _nerf(path: Path, text: str, declared: PoseFile) -> _Table:
 def _times(table: _Table, declared: PoseFile, path: Path, notes: list[str]) -> np.ndarray:
     """Return the times of poses, ns. Raises AssetError."""
     count = len(table.positions)
-    beside = Path(declared.times) if declared.times is not None else path.with_name("times.txt")
+    beside = Path(declared.times) if declared.times is not None else path.with_name(TIMES)
     if table.times is not None:
         unused = [key for key in ("rate", "times") if getattr(declared, key) is not None]
         notes += [f"{path.name}: the poses have times; {key} is not used" for key in unused]

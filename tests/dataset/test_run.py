@@ -220,6 +220,26 @@ def test_assets_that_moved_are_the_same_assets(tmp_path, capsys):
         file.write_text(text)
 
 
+def test_times_beside_poses_are_an_asset(tmp_path, capsys):
+    """KITTI's poses have none of their own."""
+    poses = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(4))
+    (tmp_path / "way.txt").write_text(poses)
+    (tmp_path / "times.txt").write_text("".join(f"{k}.000000\n" for k in range(4)))
+    scene = {
+        "kind": "explicit",
+        "meshes": {"m": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "m", "position": [3, 0, 0]}],
+        "camera": {"trajectory": {"file": str(tmp_path / "way.txt"), "form": "kitti"}},
+    }
+    path = tmp_path / "recipe.yaml"
+    path.write_text(yaml.safe_dump({**RECIPE, "scene": scene, "output": {"sequences": 2}}))
+    line = ["generate", str(path), "--out", str(tmp_path / "out"), "--quiet", "--resume"]
+    assert run([*line, "--num", "1"]) == 0
+    (tmp_path / "times.txt").write_text("".join(f"{1.5 * k:f}\n" for k in range(4)))
+    assert run(line) == 2
+    assert "the pools have changed since the run began: times.txt (changed)" in capsys.readouterr().err
+
+
 def test_another_recipe_is_refused(tmp_path):
     recipe = load_run(recipe_file(tmp_path))
     run_dataset(recipe, tmp_path / "out", num=3)

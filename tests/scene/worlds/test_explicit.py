@@ -5,15 +5,17 @@ import json
 import numpy as np
 import pytest
 import trimesh
+import yaml
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.camera import CameraConfig
 from blinkgl.config.poses import PoseConfig
 from blinkgl.config.problems import validate
+from blinkgl.config.run import load_run
 from blinkgl.config.scene import ExplicitSceneConfig
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import build_scene, check_assets, sequence_scene
 from blinkgl.scene.worlds.explicit import pose_matrix
 from tests.refusals import refusal
 from tests.scene.gltf_files import GltfBuilder
@@ -308,3 +310,39 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
 )
 def test_bad_input(tmp_path, tree, expected):
     assert refusal((ConfigError, AssetError), build, tmp_path, **tree).startswith(expected)
+
+
+def test_the_sharpest_camera_of_a_rig_decides_the_detail(tmp_path):
+    """Of a figure far away a camera with a long lens sees more than the rig's first: it has the vertices that it would
+    have for that camera alone."""
+    scene = {
+        "kind": "explicit",
+        "meshes": {"a": {"primitive": "figure"}},
+        "objects": [{"mesh": "a", "position": [12, 0, 0]}],
+        "camera": {"position": [0, 0, 0]},
+    }
+    wide, long = {"width": 64, "height": 48, "fov": 70}, {"width": 640, "height": 480, "fov": 5}
+
+    def vertices(**cameras) -> int:
+        tree = {"scene": scene, "time": {"duration": 0.2, "label_rate": 10}, **cameras}
+        path = tmp_path / "r.yaml"
+        path.write_text(yaml.safe_dump(tree))
+        return len(sequence_scene(load_run(path).sequence(0), 0).objects[0].parts[0].mesh.vertices)
+
+    alone = {name: vertices(camera=one) for name, one in (("wide", wide), ("long", long))}
+    assert alone["wide"] < alone["long"]
+    sensors = [{"name": "one", "camera": wide}, {"name": "two", "camera": long}]
+    assert vertices(sensors=sensors) == vertices(sensors=sensors[::-1]) == alone["long"]
+
+
+@pytest.mark.parametrize("kind", ["random", "explicit"])
+def test_trajectories_of_lamps_are_looked_for_before_work_starts(tmp_path, kind):
+    lights = [{"kind": "point", "motion": {"trajectory": {"file": "gone.txt"}}}]
+    world = {"meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a"}], "camera": {}}
+    scene = {"kind": kind, "light": {"lights": lights}, **(world if kind == "explicit" else {})}
+    path = tmp_path / "r.yaml"
+    path.write_text(yaml.safe_dump({"scene": scene}))
+    with pytest.raises(
+        ConfigError, match=r"scene.light.lights.0.motion.trajectory.file: no such file \(got 'gone.txt'"
+    ):
+        check_assets(load_run(path).sequence(0).scene, tmp_path)

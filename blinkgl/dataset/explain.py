@@ -154,8 +154,9 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
         scene, result = sequence_scene(config, index, template.base), Explanation(machine=gl.renderer)
         cameras = list(config.cameras())
         # Each camera with events draws the same number of event frames.
-        frames = costs[0].frames // max(sum(events for *_, events in cameras), 1)
-        rate = costs[0].events * 1e9 / (scene.t1_ns - scene.t0_ns)
+        sharing = max(sum(events for *_, events in cameras), 1)
+        frames = costs[0].frames // sharing
+        rate = costs[0].events / sharing * 1e9 / (scene.t1_ns - scene.t0_ns)
         for number, name, own, events in cameras:
             own, seen = own.model_copy(update={"preview": config.preview}), scene.seen_by(number)
             with Renderer(gl, seen, config.render) as renderer:

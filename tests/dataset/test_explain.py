@@ -48,6 +48,8 @@ def test_expected_frames_and_passes_are_those_of_the_run(tmp_path):
     assert [p.name for p in told.passes] == ["event frames", "speeds", "colour", "labels", "event kernel"]
     assert f"{made.triangles:,}" == told.scene["triangles"] and "4 objects" in told.scene["bodies"]
     assert all(p.count > 0 for p in told.passes) and told.stages["render"] > 0
+    span_s = run.sequence(0).time.t1_ns * 1e-9
+    assert f"about {made.events / span_s / 1e6:.1f} M events per simulated second" in told.passes[-1].why
 
 
 @pytest.mark.parametrize(

@@ -524,3 +524,24 @@ def test_a_polarity_that_is_no_number_is_named(tmp_path, value):
         np.save(tmp_path / "e.npy", events[rows])
         with pytest.raises(EventDataError, match="polarity|p of event|event"):
             open_events(tmp_path / "e.npy", EventReading.of(time_unit="us")).read()
+
+
+@pytest.mark.parametrize("place", ["CD/events", "elsewhere/events"])
+@pytest.mark.parametrize("geometry", [None, "file", "data"])
+def test_records_of_metavision_are_in_microseconds(tmp_path, place, geometry):
+    """Known by their place, or by the sensor's geometry; other records need their unit."""
+    events, path = some_events(50, 0, 10**6, 480, 640), tmp_path / "e.h5"
+    rows = np.zeros(len(events), [("x", "u2"), ("y", "u2"), ("p", "i2"), ("t", "i8")])
+    for slot in "xypt":
+        rows[slot] = getattr(events, slot)
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset(place, data=rows)
+        if geometry is not None:
+            {"file": file, "data": data}[geometry].attrs["geometry"] = "640x480"
+    if geometry is None and place != "CD/events":
+        with pytest.raises(AssetError, match="no unit of the times"):
+            open_events(path)
+        return
+    with open_events(path) as file:
+        assert same(file.read(), events)
+        assert "read as Metavision's records of events: µs" in file.notes

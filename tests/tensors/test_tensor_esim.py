@@ -135,6 +135,7 @@ OPTIONS_TENSOR_V2E = {
     "leak": {**_CLEAN, "leak_rate_hz": 50},
     "leak, jitter, dead time": {"shot_noise_rate_hz": 0, "leak_jitter": 0.3, "leak_rate_hz": 50},
     "shot noise": {**_CLEAN, "shot_noise_rate_hz": 50},
+    "hardly any shot noise": {**_CLEAN, "shot_noise_rate_hz": 0.9},
     "photoreceptor noise": {**_CLEAN, "cutoff_hz": 100, "photoreceptor_noise": True, "shot_noise_rate_hz": 20},
     "defaults": {},
     "noise, causes": _NOISY,

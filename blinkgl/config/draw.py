@@ -12,10 +12,12 @@ the drawn value is what the sequence's own ``config.yaml`` records:
     events: {shares: [{share: 0.8, value: {emulator: v2e}}, {share: 0.2, value: {emulator: voltmeter}}]}
 
 ``shares`` deals its values out instead of rolling dice: among any n sequences that follow one another, each value comes
-up as often as its share says, give or take a few (the additive recurrence of the golden ratio, from a seeded start).
-Its shares have to sum to 1.
+up as often as its share says, give or take a few (an additive recurrence from a seeded start). Its shares have to sum
+to 1. The step of ``events`` is the golden ratio, or of the first path where that has none; the others' steps are square
+roots of primes, so that what one deals is independent of the others.
 
-Each path draws from its own stream (seed, sequence, path), so adding one distribution changes no other draw.
+Each path draws from its own stream (seed, sequence, path), so adding one distribution changes no other draw but those
+of ``shares`` of later paths than another ``shares``.
 """
 
 from __future__ import annotations
@@ -36,6 +38,11 @@ from blinkgl.types.trees import Tree
 
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "weighted", "shares")
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: its multiples modulo 2^64 are spread as evenly as possible
+# Multiples of 1 and of roots of different primes are linearly independent, so that the pairs are spread evenly, too
+# (Weyl); 2^64 times their fractions.
+_STEPS = (_GOLDEN, *(math.isqrt(prime << 128) % 2**64 for prime in (2, 3, 7, 13, 11, 19, 23, 31, 29, 37, 41, 43, 47)))
+_INNER = "#"
+"""Step of the path of a distribution that another one gives."""
 
 
 def is_distribution(node: object) -> bool:
@@ -47,7 +54,28 @@ def draw(tree: object, seed: int, sequence: int) -> Any:
     """Return ``tree`` (plain YAML data) with every distribution replaced by the value drawn for ``sequence``.
 
     Raises ConfigError (with the path) for a malformed distribution."""
-    return _walk(tree, (), lambda path, kind, spec: _draw_one(path, kind, spec, seed, sequence))
+    dealt = sorted({*_shares(tree, ())}, key=lambda path: (path != ("events",), path))
+    steps = {path: _STEPS[k % len(_STEPS)] for k, path in enumerate(dealt)}
+    return _walk(tree, (), lambda path, kind, spec: _draw_one(path, kind, spec, seed, sequence, steps.get(path, 0)))
+
+
+def _shares(node: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Yield the paths at which ``shares`` may be drawn."""
+    if is_distribution(node):
+        kind, spec = next(iter(node.items()))
+        yield from (path,) if kind == "shares" else ()
+        parts = [part.get("value") if isinstance(part, dict) and kind == "shares" else part for part in spec]
+        for value in parts if kind in ("shares", "choice") else ():
+            yield from _shares(value, _within(path, value))
+    else:
+        items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+        for key, value in items:
+            yield from _shares(value, (*path, str(key)))
+
+
+def _within(path: tuple[str, ...], value: object) -> tuple[str, ...]:
+    """Return the path of what a distribution gives: with numbers of its own where that is a distribution, too."""
+    return (*path, _INNER) if is_distribution(value) else path
 
 
 def options(path: tuple[str, ...], node: Tree, between: bool = False) -> list[Any]:
@@ -98,7 +126,7 @@ def _walk(node: Any, path: tuple[str, ...], replace) -> object:
     if is_distribution(node):
         kind, spec = next(iter(node.items()))
         value = replace(path, kind, spec)
-        return _walk(value, path, replace)  # a choice may hold further distributions
+        return _walk(value, _within(path, value), replace)  # a choice may hold further distributions
     if isinstance(node, dict):
         return {key: _walk(value, (*path, str(key)), replace) for key, value in node.items()}
     if isinstance(node, list):
@@ -171,16 +199,18 @@ def _check(path: tuple[str, ...], kind: str, spec: object) -> None:
     except (TypeError, ValueError, KeyError, AttributeError, IndexError):
         ok = False
     if not ok:
-        raise ConfigError(f"not {what}", where=".".join((*path, kind)), value=spec, accepted=accepted)
+        where = ".".join((*(step for step in path if step != _INNER), kind))
+        raise ConfigError(f"not {what}", where=where, value=spec, accepted=accepted)
 
 
-def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> object:
+def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int, step: int) -> object:
+    """step : of ``shares``, 2^64 times the fraction by which it goes on."""
     _check(path, kind, spec)
     key = int.from_bytes(hashlib.sha256("/".join(path).encode()).digest()[:8], "little")
     if kind == "shares":
         # Without the sequence in its key: all sequences continue one series, so that their shares come out.
         start = int(np.random.SeedSequence(seed, spawn_key=(int(Role.PARAMETERS), key)).generate_state(1, np.uint64)[0])
-        return _share_at((start + sequence * _GOLDEN) % 2**64 / 2**64, spec)
+        return _share_at((start + sequence * step) % 2**64 / 2**64, spec)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(sequence), int(Role.PARAMETERS), key)))
     if kind == "choice":
         return spec[int(rng.integers(len(spec)))]

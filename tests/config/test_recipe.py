@@ -171,6 +171,42 @@ def test_shares_are_dealt_out():
     np.testing.assert_allclose([starts.count(k) / 600 for k in "abc"], [0.5, 0.3, 0.2], atol=0.07)  # 3.5 sigma
 
 
+def halves(*values: object) -> dict:
+    return {"shares": [{"share": 1 / len(values), "value": value} for value in values]}
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_shares_deal_independently_of_each_other(seed):
+    """Two in one recipe, three, and one below a value of another: each pair comes up as often as chance says, and each
+    keeps its own shares among any 20 sequences."""
+    tree = {"events": halves("a", "b"), "camera": halves(1, 2), "x": {"y": halves(*"rstu")}}
+    tree["scene"] = halves({"kind": halves("k", "l")}, {"kind": "m"})
+    rows = [draw(tree, seed, n) for n in range(400)]
+    pairs = Counter((row["events"], row["camera"]) for row in rows)
+    assert len(pairs) == 4 and all(85 <= count <= 115 for count in pairs.values())
+    triples = Counter((row["events"], row["camera"], row["x"]["y"]) for row in rows)
+    assert len(triples) == 16 and all(15 <= count <= 35 for count in triples.values())
+    inner = Counter(row["scene"]["kind"] for row in rows)
+    assert abs(inner["m"] - 200) <= 4 and abs(inner["k"] - 100) <= 15
+    for first in range(0, 380, 7):
+        assert 8 <= sum(row["camera"] == 1 for row in rows[first : first + 20]) <= 12
+    # What the events draw does not depend on what else is dealt.
+    assert [row["events"] for row in rows] == [draw({"events": tree["events"]}, seed, n)["events"] for n in range(400)]
+
+
+@pytest.mark.parametrize("outer", ["choice", "shares", "weighted"])
+def test_a_distribution_within_another_has_numbers_of_its_own(outer):
+    inner = [{"integer": [0, 9]}, {"integer": [10, 19]}]
+    spec = {"choice": inner, "shares": halves(*inner)["shares"], "weighted": None}[outer]
+    if outer == "weighted":  # its keys are plain values
+        assert {draw({"n": {"weighted": {"3": 1, "4": 1}}}, 1, k)["n"] for k in range(50)} == {"3", "4"}
+        return
+    counts = Counter(draw({"n": {outer: spec}}, 7, n)["n"] for n in range(2000))
+    assert len(counts) == 20 and max(counts.values()) < 150
+    with pytest.raises(ConfigError, match=r"^n\.integer: not a range"):
+        draw({"n": {"choice": [{"integer": [2, 1]}]}}, 1, 0)
+
+
 @pytest.mark.parametrize(
     "name, counts",
     [

@@ -16,9 +16,9 @@ from blinkgl.dataset.messages import RUN_FOLDER
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import BlinkGLError
-from blinkgl.io.records import open_regular, shown
+from blinkgl.io.records import inside, open_regular, shown
 from blinkgl.sequence_files.index import INDEX, entry, read_index, task_of
-from blinkgl.sequence_files.sequence_dir import MANIFEST
+from blinkgl.sequence_files.sequence_dir import MANIFEST, read_manifest
 from blinkgl.types.trees import Tree
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -123,13 +123,9 @@ def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]
     seen: dict[tuple[str, str], str] = {}
     problems: dict[str, list[str]] = {}
     for name, one in known.items():
-        files, config = _files_of_first(one.manifest), one.config
+        (files, events), config = _of_first(one), one.config
         random_scene = config.frames is None and config.scene.kind == "random"
-        looked = [
-            f
-            for f, tells in (("events.h5", one.manifest["events"] > 0), ("poses.npz", random_scene))
-            if tells and f in files
-        ]
+        looked = [f for f, tells in (("events.h5", events > 0), ("poses.npz", random_scene)) if tells and f in files]
         for file in looked:
             other = seen.setdefault((file, files[file]["sha256"]), name)
             if other == name:
@@ -147,12 +143,14 @@ def twins(known: dict[str, Known], result: Verification) -> dict[str, list[str]]
     return problems
 
 
-def _files_of_first(manifest: Tree) -> Tree:
-    """Return files of a sequence, for a rig of its first camera only."""
-    if not manifest.get("cameras"):
-        return manifest["files"]
-    own = manifest["cameras"][0] + "/"
-    return {name.removeprefix(own): file for name, file in manifest["files"].items() if name.startswith(own)}
+def _of_first(one: Known) -> tuple[Tree, int]:
+    """Return files of a sequence and the number of its events, for a rig of its first camera only."""
+    files = one.manifest["files"]
+    if not one.manifest.get("cameras"):
+        return files, one.manifest["events"]
+    first = one.manifest["cameras"][0]
+    own = {name.removeprefix(f"{first}/"): file for name, file in files.items() if name.startswith(f"{first}/")}
+    return own, read_manifest(inside(one.folder, first))["events"]
 
 
 def against_run(root: Path, folders: list[Path], known: dict[str, Known], result: Verification) -> list[str]:

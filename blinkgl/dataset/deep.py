@@ -10,7 +10,7 @@ from pathlib import Path
 
 from blinkgl.dataset.cross_checks import Known, Verification, guarded, made_with
 from blinkgl.dataset.generate import generate_sequence
-from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.run_folder import RunFolder, whole_set
 from blinkgl.errors import BlinkGLError
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.records import shown
@@ -45,7 +45,7 @@ def made_again(
     if base is None:
         base = "."
         with suppress(BlinkGLError):  # a damaged record has been reported
-            base = (RunFolder(root).read("run.json") or {}).get("base", ".")
+            base = (RunFolder(whole_set(root)).read("run.json") or {}).get("base", ".")
     with tempfile.TemporaryDirectory(prefix="blinkgl-verify-") as scratch:
         try:
             for name, one in chosen.items():

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl.dataset.cross_checks import plan_of
-from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.run_folder import RunFolder, whole_set
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.atomic import output_errors, temporary_beside
 from blinkgl.sequence_files.index import INDEX, entry, made_folders, read_index, sequence_folders, task_of, write_lines
@@ -21,12 +21,14 @@ from blinkgl.sequence_files.sequence_dir import MANIFEST
 _TESTS: dict[str, Callable[[Any, Any], bool]] = {
     "<=": operator.le,
     ">=": operator.ge,
+    "==": operator.eq,
     "!=": operator.ne,
     "=": operator.eq,
     "<": operator.lt,
     ">": operator.gt,
 }
-_CONDITION = re.compile(rf"\s*(\w+)\s*({'|'.join(_TESTS)})\s*(.+?)\s*")
+# A value begins with neither a quotation mark nor a sign of comparison: "=>" and "<>" are none.
+_CONDITION = re.compile(rf"\s*(\w+)\s*({'|'.join(_TESTS)})\s*([^\s<>=!'\"].*?)\s*")
 
 
 def drop(root: str | Path, names: Sequence[str] = (), where: Sequence[str] = (), *, undo: bool = False) -> list[str]:
@@ -34,7 +36,7 @@ def drop(root: str | Path, names: Sequence[str] = (), where: Sequence[str] = (),
 
     names : "train/NAME_000000", or paths of their folders; also of sequences that were set aside.
     where : conditions on the keys of index.jsonl, "events < 1000"; those that meet all of them are removed, too.
-    undo : only take the names from the record; ``generate --resume`` makes the sequences again.
+    undo : only take ``names`` from the record; ``generate --resume`` makes the sequences again.
     Raises AssetError: no data set, no such sequence; ConfigError: a bad condition; OutputError: in use, not
     writable."""
     root, folder = Path(root), RunFolder(Path(root))
@@ -42,6 +44,10 @@ def drop(root: str | Path, names: Sequence[str] = (), where: Sequence[str] = (),
         raise ConfigError("nothing to drop", accepted="names of sequences, or --where 'events < 1000'")
     if not root.is_dir() or (root / MANIFEST).is_file():
         raise AssetError("no data set", where=str(root), accepted="the folder that 'blinkgl generate' wrote")
+    if undo and where:
+        raise ConfigError("not with --undo: the index has no dropped sequences", where="--where", accepted="names")
+    if (whole := whole_set(root)) != root.resolve():
+        raise AssetError("a split of a data set, which keeps the record", where=str(root), accepted=str(whole))
     with folder.locked():
         plan, dropped = plan_of(root), folder.dropped
         here = {made.relative_to(root).as_posix(): made for made in made_folders(root)}
@@ -80,6 +86,11 @@ def _meeting(lines: list[dict[str, object]], where: Sequence[str]) -> Iterator[s
     if None in conditions:
         text = where[conditions.index(None)]
         raise ConfigError("not a condition", where="--where", value=text, accepted="KEY < VALUE, also <= > >= = !=")
+    # Some lines alone have "sensor".
+    known = sorted({key for line in lines for key, value in line.items() if not isinstance(value, (dict, list))})
+    for condition in conditions if lines else ():
+        if condition and condition[1] not in known:
+            raise ConfigError("unknown key", where="--where", value=condition[1], accepted=f"one of {', '.join(known)}")
     for line in lines:
         if all(_met(line, *condition.groups()) for condition in conditions if condition):
             yield task_of(line)
@@ -87,13 +98,11 @@ def _meeting(lines: list[dict[str, object]], where: Sequence[str]) -> Iterator[s
 
 def _met(line: Mapping[str, object], key: str, test: str, text: str) -> bool:
     value, compare = line.get(key), _TESTS[test]
-    if key not in line:
-        raise ConfigError("unknown key", where="--where", value=key, accepted=f"one of {', '.join(sorted(line))}")
     if isinstance(value, str):
-        if test not in ("=", "!="):
+        if test not in ("=", "==", "!="):
             raise ConfigError("is a text", where="--where", value=f"{key} {test}", accepted="= or !=")
         return compare(value, text)
     try:
-        return value is not None and compare(value, float(text))
+        return isinstance(value, (int, float)) and compare(value, float(text))
     except ValueError:
         raise ConfigError("not a number", where="--where", value=text, accepted=f"such as {value}") from None

@@ -79,10 +79,10 @@ def run_dataset(
     mixed : continue although the recipe, the assets or the software have changed since the run began.
     time_limit_s : wall time of one attempt at one sequence; 0: none.
 
-    Raises BlinkGLError when no sequence could be made; only logs are left then, and another recipe may start in
-    ``out``. Raises, before any work: ConfigError and AssetError (recipe, assets), GLError, OutputError (folder of
-    another recipe, in use by another run, cannot be written). Raises during work: OutputError when the disk is full,
-    KeyboardInterrupt for Ctrl-C and SIGTERM; complete sequences stay, and ``resume`` continues.
+    Raises BlinkGLError when no sequence could be made; unless an earlier run began in ``out``, only logs are left then,
+    and another recipe may start there. Raises, before any work: ConfigError and AssetError (recipe, assets), GLError,
+    OutputError (folder of another recipe, in use by another run, cannot be written). Raises during work: OutputError
+    when the disk is full, KeyboardInterrupt for Ctrl-C and SIGTERM; complete sequences stay, and ``resume`` continues.
     """
     executor, listener = executor or Inline(), listener or Listener()
     out = Path(out)

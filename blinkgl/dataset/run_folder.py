@@ -40,7 +40,8 @@ from blinkgl.io.atomic import (
 )
 from blinkgl.io.records import entries_below, inside, parse, read_text, shown
 from blinkgl.machine.posix import fcntl
-from blinkgl.sequence_files.sequence_dir import digest_of, verify_sequence
+from blinkgl.sequence_files.index import INDEX
+from blinkgl.sequence_files.sequence_dir import MANIFEST, digest_of, verify_sequence
 from blinkgl.types.trees import Tree
 
 FORMAT = "blinkgl-run"
@@ -86,6 +87,19 @@ _TABLE = TypeAdapter(dict[str, str])
 _RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE, "dropped.json": _TABLE}
 _RECORDS[CHECKSUMS] = _TABLE
 _COST = TypeAdapter(_Cost)
+
+
+def whole_set(folder: Path) -> Path:
+    """Return the data set of which ``folder`` is a split or a sequence, by its record or its index; the folder itself
+    where there is none. The path is absolute."""
+    here = folder.resolve()
+    # A sequence lies in a split, and a camera of a rig in a sequence.
+    above = here.parents[: 3 if (here / MANIFEST).is_file() else 1]
+    for record in (f"{RUN_FOLDER}/run.json", INDEX):
+        for place in (here, *above):
+            if (place / record).is_file():
+                return place
+    return here
 
 
 class RunFolder:
@@ -148,6 +162,7 @@ class RunFolder:
             self._refuse_links(splits)
             self._fresh = not self.path.exists()
             with self._handle(), locked_folder(self.out):
+                self._went_on = (self.path / "run.json").exists()
                 self._logs = set(self._worker_logs())
                 yield
         finally:
@@ -305,10 +320,13 @@ class RunFolder:
         return [f"{RUN_FOLDER}/{line}" for line in lines]
 
     def forget(self, plan: Plan, keep_logs: bool) -> None:
-        """Undo :meth:`begin` for a run without results. Entries moved to ``damaged/`` stay there."""
+        """Undo :meth:`begin` for a run without results, unless it went on with an earlier one. Entries moved to
+        ``damaged/`` stay there."""
+        if self._went_on:
+            return
         for name in (*_BEGUN, *_ENDED, CHECKSUMS):
             (self.path / name).unlink(missing_ok=True)
-        (self.out / "index.jsonl").unlink(missing_ok=True)
+        (self.out / INDEX).unlink(missing_ok=True)
         if not keep_logs:
             shutil.rmtree(self.path / "logs", ignore_errors=True)
         for folder in (self.path, *(self.out / split for split in plan.tasks.splits)):

@@ -8,10 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from blinkgl.dataset.run_folder import whole_set
+from blinkgl.errors import OutputError
 from blinkgl.io.atomic import refuse_file, write_whole
 from blinkgl.report.charts import histogram, number, png, render, size
 from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
 from blinkgl.sequence_files.index import write_index
+from blinkgl.sequence_files.sequence_dir import MANIFEST
 from blinkgl.types.trees import Tree
 
 _MAX_PICTURE_PX = 360
@@ -26,6 +29,10 @@ def write_report(
     overwrite : replace an existing ``out``. Raises BlinkGLError."""
     own = out is None
     out = Path(root) / "report.html" if out is None else Path(out)
+    if own and ((Path(root) / MANIFEST).is_file() or whole_set(Path(root)) != Path(root).resolve()):
+        raise OutputError(
+            "a page in a sequence or a split would be a foreign file", where=str(root), accepted="--out FILE"
+        )
     refuse_file(out, overwrite or own)
     collected = collect(root, examples=examples)
     if own:

@@ -11,6 +11,7 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.dataset.drop import drop
+from blinkgl.errors import ConfigError
 from blinkgl.sequence_files.index import read_index
 from runs import NAMES, RECIPE, recipe_file, tree
 
@@ -106,6 +107,26 @@ def test_conditions_on_the_index(out):
     assert drop(out, where=["split = test"]) == sorted(NAMES[4:])
 
 
+def test_conditions_on_keys_that_some_lines_have(out):
+    """Lines as of a rig and of causes beside those of single cameras."""
+    index = out / "index.jsonl"
+    lines = [json.loads(line) for line in index.read_text().splitlines()]
+    lines[-1] |= {"sensor": "left", "path": lines[-1]["path"] + "/left", "events_by_cause": {"noise": 3}}
+    rig = lines[-1]["path"].removesuffix("/left")
+    lines[0]["bytes"] = {"of": "somebody"}
+    index.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(ConfigError, match="--where: unknown key .got 'events_by_cause'.; expected one of blinkgl, "):
+        drop(out, where=["events_by_cause < 5"])
+    assert drop(out, where=["bytes > 5", "sensor == left"]) == [rig]
+
+
+def test_a_split_has_no_record_and_is_refused(out, capsys):
+    before = tree(out)
+    assert run(["drop", str(out / "train"), Path(NAMES[0]).name]) == 2
+    assert f"a split of a data set, which keeps the record; expected {out}" in capsys.readouterr().err
+    assert tree(out) == before and not (out / "train/index.jsonl").exists()
+
+
 def test_cut_off_after_the_record(out, monkeypatch, capsys):
     """The folder is still there: verify says so, a run leaves it, and the same command ends it."""
     monkeypatch.setattr("blinkgl.dataset.drop.temporary_beside", lambda path: 1 / 0)
@@ -129,6 +150,9 @@ def test_cut_off_after_the_record(out, monkeypatch, capsys):
         (["--where", "colour = 3"], "--where: unknown key (got 'colour'); expected one of blinkgl, bytes, "),
         (["--where", "events < many"], "--where: not a number (got 'many'); expected such as "),
         (["--where", "split < train"], "--where: is a text (got 'split <'); expected = or !="),
+        (["--where", "events => 3"], "--where: not a condition (got 'events => 3')"),
+        (["--where", "emulator = 'v2e'"], "--where: not a condition (got "),
+        (["--undo", "--where", "events > 0"], "--where: not with --undo: the index has no dropped sequences"),
     ],
 )
 def test_bad_input_changes_nothing(out, words, said, capsys):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from blinkgl.config.run import load_run
+from blinkgl.config.run import RunTemplate, load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import BlinkGLError, ConfigError
@@ -152,3 +152,33 @@ def test_white_of_twelve_bits_in_sixteen_is_asked_for(tmp_path, tartan):
     run_dataset(recipe(tmp_path, tartan), tmp_path / "usual")
     counts = [read_manifest(tmp_path / name / "test/tartan_000000")["events"] for name in ("out", "usual")]
     assert counts[0] == pytest.approx(counts[1], rel=0.02) and counts[1] > 100
+
+
+def test_an_extension_that_fails_keeps_the_records_of_what_is_there(tmp_path, tartan):
+    copy = Path(shutil.copytree(tartan, tmp_path / "copy"))
+    (copy / "P001/image_left/000003_left.png").write_bytes(b"no image")
+    recipe(tmp_path, copy)
+    numbers = [f"groups.tartan.output={{split: test, sequences: 1, first_index: {k}}}" for k in (0, 1)]
+    first, second = (load_run(tmp_path / "recipe.yaml", [override]) for override in numbers)
+    run_dataset(first, tmp_path / "out")
+    before = (tmp_path / "out/index.jsonl").read_bytes(), (tmp_path / "out/.run/costs.jsonl").read_bytes()
+    with pytest.raises(BlinkGLError, match="000003_left.png: cannot decode image"):
+        run_dataset(second, tmp_path / "out", resume=True)
+    after = (tmp_path / "out/index.jsonl").read_bytes(), (tmp_path / "out/.run/costs.jsonl").read_bytes()
+    assert after == before and (tmp_path / "out/test/tartan_000000/manifest.json").is_file()
+    assert list(json.loads((tmp_path / "out/.run/failed.json").read_text())) == ["test/tartan_000001"]
+    # The same failure without an earlier run leaves nothing in the way of another recipe.
+    with pytest.raises(BlinkGLError):
+        run_dataset(second, tmp_path / "new")
+    assert not (tmp_path / "new/.run/run.json").exists()
+
+
+def test_a_split_and_a_sequence_are_made_again_from_the_folder_of_their_run(tmp_path, tartan, monkeypatch):
+    """Relative paths of a recipe start from where it lay, whichever part of the set is verified, and from where."""
+    template = recipe(tmp_path, tartan)
+    template.tree["groups"]["tartan"]["frames"]["folders"] = ["P*"]
+    run_dataset(RunTemplate(template.tree, tartan), tmp_path / "out", num=1)
+    monkeypatch.chdir(tmp_path)
+    for part in ("out", "out/test", "out/test/tartan_000000"):
+        result = verify_dataset(part, deep=1)
+        assert result.clean and len(result.deep) == 1, (part, result.problems)

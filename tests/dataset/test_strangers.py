@@ -340,6 +340,25 @@ def test_a_report_elsewhere_changes_nothing_in_the_set_and_replaces_nothing_unas
     assert run(["report", str(data)]) == 0 and (data / "index.jsonl").is_file()
 
 
+@pytest.mark.parametrize("part", ["train", "train/sequence_000000"])
+def test_a_report_of_a_part_writes_nothing_into_it(one, tmp_path, part):
+    data = one.parents[1]
+    before = sorted(data.rglob("*"))
+    assert "would be a foreign file; expected --out FILE" in said("report", data / part)[0]
+    (data / ".run").rename(tmp_path / "run")  # a set as it is published
+    assert "would be a foreign file" in said("report", data / part)[0]
+    (tmp_path / "run").rename(data / ".run")
+    assert run(["report", str(data / part), "-o", str(tmp_path / "page.html")]) == 0
+    assert sorted(data.rglob("*")) == before and run(["verify", str(data)]) == 0
+
+
+def test_links_where_the_user_stands_are_of_no_concern_to_an_export(one, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here/train").symlink_to(one.parent)
+    monkeypatch.chdir(tmp_path / "here")
+    assert run(["export", str(one.parents[1]), "-o", str(tmp_path / "out"), "--layout", "mvsec"]) == 0
+
+
 def test_an_export_says_what_it_leaves_out(one, tmp_path, capsys):
     half = one.parent / "sequence_000007"
     shutil.copytree(one, half)

@@ -10,6 +10,8 @@ from apart import run_apart
 
 from blinkgl import open_events
 from blinkgl.cli import run
+from blinkgl.errors import ConfigError
+from blinkgl.machine import plugins
 
 MINE = Path(__file__).parents[1] / "examples/plugins"
 
@@ -98,3 +100,19 @@ def test_one_that_cannot_be_loaded_is_a_line(tmp_path, capsys, text, said):
     assert run(["--plugin", str(tmp_path / "mine.py"), "configs"]) == 2
     line = capsys.readouterr().err
     assert said in line and line.startswith("error: ") and line.count("\n") == 1
+
+
+def test_a_file_is_loaded_once_however_its_path_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(plugins, "_PATHS", {})
+    monkeypatch.setattr(plugins, "_LOADED", {})
+    for folder in ("sub", "other"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "once.py").write_text(f"open({str(tmp_path / 'log')!r}, 'a').write('x')\n")
+    (tmp_path / "sub/link.py").symlink_to(tmp_path / "once.py")
+    (tmp_path / "sub/once.py").symlink_to(tmp_path / "once.py")
+    paths = [tmp_path / name for name in ("once.py", "sub/../once.py", "sub/once.py", "sub/link.py")]
+    plugins.load_plugins(paths)
+    assert (tmp_path / "log").read_text() == "x" and plugins.plugin_files() == [str(paths[0])]
+    (tmp_path / "other/once.py").write_text("")
+    with pytest.raises(ConfigError, match="has this name, too"):
+        plugins.load_plugins([tmp_path / "other/once.py"])

@@ -290,7 +290,7 @@ def apply_overrides(tree: Tree, overrides: Sequence[str]) -> Tree:
         for depth, key in enumerate(keys):
             last = depth == len(keys) - 1
             if isinstance(node, list):
-                if not key.isdigit() or int(key) >= len(node):
+                if not key.isdecimal() or int(key) >= len(node):
                     raise ConfigError(
                         "no such list entry",
                         where="--set " + ".".join(keys[: depth + 1]),

@@ -124,8 +124,10 @@ class RayCluster(Executor):
             pass
         finally:
             self._tasks.clear()
+            self._reasons.clear()
             if self._ours:
                 ray.shutdown()
+            self._ours = False
             self._discard_folder()
 
     def _restore_environment(self) -> None:
@@ -323,7 +325,7 @@ def _first_line(error: BaseException) -> str:
 def _reachable(address: str) -> None:
     """Raise ConfigError at once, where Ray itself would try for half a minute."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
+    if not host or not port.isdecimal():
         raise ConfigError(
             "not an address", where="--address", value=address, accepted="host:port, ray://host:port or auto"
         )

@@ -120,12 +120,12 @@ class Local(Executor):
         self._wanted, self._devices, self._cores = workers, devices, cores
         self._processes: list[_Process] = []
         self._selector = selectors.DefaultSelector()
-        self._bad_starts = 0
 
     def open(self, job: Job) -> list[Message]:
-        self._job = job
-        if self._devices is None:
-            self._devices = several_cards(job)
+        self._job, self._bad_starts = job, 0
+        self._selector.close()  # an earlier run has closed it, too
+        self._selector = selectors.DefaultSelector()
+        self._dealt = several_cards(job) if self._devices is None else self._devices
         cores = self._cores or len(os.sched_getaffinity(0))
         # numba and OpenGL read these once, when they are loaded, so they must be in a worker's environment
         # from its start.
@@ -191,7 +191,7 @@ class Local(Executor):
         self._selector.close()
 
     def _start(self, slot: int) -> None:
-        device = self._devices[slot % len(self._devices)] if self._devices else None
+        device = self._dealt[slot % len(self._dealt)] if self._dealt else None
         process = _Process(slot, self._log(slot), self._environment)
         self._processes.append(process)
         self._selector.register(process.channel, selectors.EVENT_READ, process)

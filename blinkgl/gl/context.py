@@ -318,7 +318,7 @@ def _overridden(device: int) -> int:
     text = os.environ.get(DEVICE_VARIABLE)
     if not text:
         return device
-    if not text.isdigit():
+    if not text.isdecimal():
         raise GLError(
             "not a device number",
             where=f"environment variable {DEVICE_VARIABLE}",

@@ -177,6 +177,8 @@ def atomic_folder(final: str | os.PathLike, *, overwrite: bool = False) -> Itera
     final = Path(final)
     if not overwrite:
         refuse_existing(final)
+    if final.name in ("", ".."):  # the current folder cannot be replaced
+        raise OutputError("not the name of a folder", where=str(final), accepted="a new folder name")
     with _appearing(final) as temporary:
         with output_errors(final):
             temporary.mkdir()

@@ -118,7 +118,7 @@ class EvtReader:
         system = fields.get("system_ID", "")
         # A system_ID tells something only where no other integrator is named.
         prophesee = {fields.get(k, "Prophesee") for k in _INTEGRATORS} == {"Prophesee"}
-        usual = _SYSTEMS.get(int(system)) if prophesee and system.isdigit() and len(system) < 10 else None
+        usual = _SYSTEMS.get(int(system)) if prophesee and system.isdecimal() and len(system) < 10 else None
         stated = name or fields.get("evt", "") or (usual[0] if usual else "")
         if not stated:
             raise AssetError(
@@ -128,7 +128,7 @@ class EvtReader:
             )
         self.version = listed(_VERSIONS, stated, "unknown format of events", path, "EVT2, EVT21, EVT3, EVT4")
         order = options.get("endianness") or fields.get("endianness")
-        old = prophesee and system.isdigit() and 0 < int(system[:9]) < _NEWER_SYSTEM
+        old = prophesee and system.isdecimal() and 0 < int(system[:9]) < _NEWER_SYSTEM
         self._upper_first = old if order is None else listed(_UPPER_FIRST, order, "unknown endianness", path)
         self.height, self.width = self._size(fields, options) or (usual[1] if usual else (None, None))
 

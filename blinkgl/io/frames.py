@@ -17,7 +17,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.images import NpzReader, check_npy, numpy_errors, over
 from blinkgl.io.names import Series, series
 from blinkgl.io.reading import NOTHING, Damage, Declared, EventReading, background_of, chosen
-from blinkgl.io.records import inside, shown_names
+from blinkgl.io.records import inside, named, shown_names
 from blinkgl.io.sequence_tables import camera_of
 from blinkgl.io.stills import SUFFIXES as IMAGE, open_stills
 from blinkgl.io.times import NANOSECONDS, Stamps, read_timestamps, stamps_of_array
@@ -203,6 +203,7 @@ def read_any_image(path: Path, background: str | None = None) -> np.ndarray:
 
 
 def _folder(folder: Path, declared: Declared) -> FrameSource:
+    folder = named(folder)  # files beside it are looked for by its name
     pictures = series(folder, IMAGE)
     beside = [folder / name for name in _STAMP_FILES]
     beside += [folder.parent / name for name in ("images.txt", "data.csv", f"{folder.name}.txt")]

@@ -174,6 +174,11 @@ def plain_name(name: str) -> str:
     return name
 
 
+def named(path: Path) -> Path:
+    """Return a path whose last part is a name: "." and ".." as the whole path, any other as it is."""
+    return path if path.name not in ("", "..") else path.resolve()
+
+
 def inside(folder: str | os.PathLike, name: str) -> Path:
     """Return the path of what a file names inside ``folder``, which itself may be a link. Every name of a record that
     becomes a path passes here. Raises AssetError: no plain relative path, or a symbolic link on the way, which could

@@ -350,7 +350,7 @@ def _interval_ms(file: Any, notes: list[str]) -> tuple[float | None, int]:
     """Return the ms between pages that ImageJ's or OME's description states, and OME's number of pictures a time."""
     meta, text = file.imagej_metadata or {}, str(file.pages[0].description or "")
     pixels = dict(re.findall(r'(\w+)="([^"]*)"', next(iter(re.findall(r"<Pixels\b[^>]*>", text)), "")))
-    sizes = {k: int(pixels.get(f"Size{k}", "1")) for k in "CZT" if pixels.get(f"Size{k}", "1").isdigit()}
+    sizes = {k: int(pixels.get(f"Size{k}", "1")) for k in "CZT" if pixels.get(f"Size{k}", "1").isdecimal()}
     channels = sizes.get("C", 1) * (sizes.get("Z", 1) if sizes.get("T", 1) > 1 else 1)
     value, unit = meta.get("finterval") or (1 / float(meta["fps"]) if meta.get("fps") else None), meta.get("tunit", "s")
     if "TimeIncrement" in pixels:

@@ -176,7 +176,7 @@ class TextReader:
     def _heading(self, names: dict[str, str]) -> str | None:
         """Return the unit that the name of t states; take the sizes that faery adds to the names of x and y."""
         sizes = [names[side].partition("@")[2] for side in "xy"]
-        if all(size.isdigit() and len(size) < 10 for size in sizes):
+        if all(size.isdecimal() and len(size) < 10 for size in sizes):
             self.width, self.height = map(int, sizes)
             return "us"
         return named_unit(names["t"])

@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -96,6 +97,7 @@ def run_app(
             announced_compiling(lambda text: print(text, file=sys.stderr)),
             heartbeat.beating(quiet),
         ):
+            _refuse_empty(arguments)
             status = app(arguments, prog_name=program, standalone_mode=False)
         # typer turns KeyboardInterrupt into this status, earlier versions into Abort.
         if status != _CTRL_C:
@@ -112,6 +114,14 @@ def run_app(
             return _interrupted(arguments, resumes)
         answer = _said_of_gone(arguments, gone or {}) if _is_usage_error(error) else None
         return _report(error if answer is None else answer, debug, project)
+
+
+def _refuse_empty(arguments: list[str]) -> None:
+    """Raise ConfigError for an --out without a name, which is the current folder to Python: "$OUT", not set."""
+    pairs = [*pairwise(arguments), *(argument.split("=", 1) for argument in arguments if "=" in argument)]
+    for option, value in pairs:
+        if option in ("--out", "-o") and not value:
+            raise ConfigError("is empty", where=option, value=value, accepted="a name")
 
 
 def _interrupted(arguments: list[str], resumes: str) -> int:

@@ -33,8 +33,8 @@ def load_plugins(files: Iterable[str | os.PathLike] = ()) -> None:
     Raises ConfigError: a file is missing, fails, or has the name of another."""
     started_with = json.loads(os.environ.get(_VARIABLE) or "[]")
     for path in [Path(file).absolute() for file in (*started_with, *files)]:
-        # Workers inherit the variable and are given the files, too: each is loaded once.
-        if _PATHS.get(path.stem) == path:
+        # Workers inherit the variable and are given the files, too: each is loaded once, however its path is written.
+        if path.resolve() in [known.resolve() for known in _PATHS.values()]:
             continue
         if not path.is_file():
             raise ConfigError("no such file", where="--plugin", value=str(path), accepted="a Python file")

@@ -49,17 +49,18 @@ class SlotMaker(Maker):
 
     def make(self, number: int, attempt: int, tell: Any) -> Message:
         """Make this process's slot of this number. Only KeyboardInterrupt and SystemExit are raised."""
-        job, began, made, failures, barren, last, tried = self.job, time.process_time(), 0, 0, 0, "", 0
+        job, began, made, failures, barren, tried = self.job, time.process_time(), 0, 0, 0, 0
+        first = last = ""
         slot = job.slot_of_all(number)
         while made < job.samples and barren < TRIES:
             # Later tries take sequences whose numbers no slot begins with.
             tried, before = tried + 1, made
             index = slot + (tried - 1) * _APART
             group = self._group(slot, tried)
+            name, why = sequence_name(group.template.check().output, index).split("/")[1], ""
             try:
                 self.renew()
                 config = group.template.sequence(index)
-                name = sequence_name(config.output, index).split("/")[1]
                 asked = SequenceRequest(config, index, Path(job.base), labels=False)
                 with simulate_sequence(asked, self.gl) as sequence:
                     wanted, dice = job.samples - made, self._dice(slot, tried, 1)
@@ -70,10 +71,11 @@ class SlotMaker(Maker):
                 message = failed(number, error)
                 if may_pass(error) or message["stop"]:
                     return message  # an error of the machine: another worker tries the same again
-                failures, last = failures + 1, f"{_name_of(group, index)}: {message['error']}"
+                failures, why = failures + 1, message["error"]
+                last = f"{name}: {why}"
             if made == before:
                 barren += 1
-                last = last or f"{_name_of(group, index)}: no window as asked for, with {job.min_events} events"
+                first = first or f"{name}: {why or f'no window as asked for, with {job.min_events} events'}"
         report = {
             "task": number,
             "sequences": tried,
@@ -83,7 +85,7 @@ class SlotMaker(Maker):
         }
         if made == job.samples:
             return {"kind": "done", **report}
-        error = f"{tried} sequences gave {made} of {job.samples} samples; the first that gave none: {last}"
+        error = f"{tried} sequences gave {made} of {job.samples} samples; the first that gave none: {first}"
         return {"kind": "failed", "error": error, "expected": True, "final": True, "stop": False, **report}
 
     def _group(self, slot: int, tried: int) -> Group:
@@ -100,8 +102,3 @@ class SlotMaker(Maker):
 def sample_file(spool: Path, slot: int, item: int) -> Path:
     """Return the path of a sample in the spool folder."""
     return spool / f"{slot:09d}_{item:03d}.npz"
-
-
-def _name_of(group: Group, index: int) -> str:
-    """Return "davis240_000017"."""
-    return f"{group.name or 'sequence'}_{index:06d}"

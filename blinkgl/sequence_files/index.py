@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.records import inside, parse, read_text, shown
+from blinkgl.io.records import inside, named, parse, read_text, shown
 from blinkgl.sequence_files.manifest import HereOrInside
 from blinkgl.sequence_files.sequence_dir import MANIFEST, is_rig_folder, read_manifest
 from blinkgl.types.trees import Tree
@@ -83,10 +83,10 @@ _SOMETIMES = ("events_by_cause", "sensor")
 
 def entry(root: Path, folder: Path) -> Tree:
     """Return a sequence's line. Raises AssetError for a damaged manifest."""
-    manifest = read_manifest(folder)
+    manifest, own = read_manifest(folder), named(folder)
     return {
         "path": folder.relative_to(root).as_posix(),
-        "name": folder.name if "sensor" not in manifest else f"{folder.parent.name}/{folder.name}",
+        "name": own.name if "sensor" not in manifest else f"{named(own.parent).name}/{own.name}",
         **{key: manifest.get(key) for key in _KEYS},
         **{key: manifest[key] for key in _SOMETIMES if key in manifest},
         "bytes": sum(file["bytes"] for file in manifest["files"].values()),

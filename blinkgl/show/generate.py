@@ -22,6 +22,7 @@ from blinkgl.dataset.report import STAGES, SequenceReport, Totals, shares
 from blinkgl.dataset.run import Listener, Outcome, run_dataset
 from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
+from blinkgl.io.records import named
 from blinkgl.layouts.export import refuse_plan
 from blinkgl.machine.terminal import causes_line, clock, plain_column, plain_console, say, size
 from blinkgl.sequence_files.index import made_folders
@@ -55,7 +56,7 @@ def run(
     complete, and all until Ctrl-C. layout : when no sequence is missing, also write them as ``OUT-LAYOUT`` (`blinkgl
     export`). options : resume, mixed and time_limit_s, of the run. Raises their errors, and ConfigError without the
     extra [view]."""
-    exported = f"{out.rstrip('/')}-{layout}"
+    exported = f"{named(Path(out))}-{layout}"
     if layout is not None:
         export.refuse_early(exported, layout)
     template = load_run(config, overrides, seed=seed)
@@ -346,7 +347,7 @@ def _devices(text: str | None) -> list[int] | None:
     if text is None:
         return None
     parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdigit() for part in parts):
+    if not all(part.isdecimal() for part in parts):
         raise ConfigError(
             "not a list of device numbers",
             where="--devices",

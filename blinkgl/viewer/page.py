@@ -17,6 +17,7 @@ from blinkgl.errors import BlinkGLError, printable
 from blinkgl.io.atomic import write_whole
 from blinkgl.io.colour import flow_colour
 from blinkgl.io.images import encode_image
+from blinkgl.io.records import named
 from blinkgl.viewer.server import LocalServer
 from blinkgl.viewer.stage import ASPECT, FOV, LAYERS, OFF, ON, Stage
 from blinkgl.viewer.views import Picture, SequenceView
@@ -41,7 +42,7 @@ class Page:
         self.folders: dict[str, Path] = {}
         self.sequence: SequenceView | None = None
         self.problem: BlinkGLError | None = None
-        self._chosen = ""
+        self._chosen: str | None = None
         self._changed, self._ended = threading.Event(), False
         self._stale = True
         server.gui.main_panel.dock_right()
@@ -51,10 +52,11 @@ class Page:
 
     def add(self, folder: Path) -> None:
         """Add a sequence to choose; the first is shown."""
+        folder = named(folder)
         name = printable(folder.name)
         name = name if name not in self.folders else printable(str(folder))
         self.folders[name] = folder
-        self._chosen = self._chosen or name
+        self._chosen = name if self._chosen is None else self._chosen
         self._stale = True
         self._changed.set()
 
@@ -81,7 +83,7 @@ class Page:
             return
         self._changed.clear()
         try:
-            if self._stale and self._chosen:
+            if self._stale and self._chosen is not None:
                 self._stale = False
                 self._open(self._chosen)
             if self.sequence is not None:
@@ -267,7 +269,7 @@ def _about(sequence: SequenceView) -> str:
 def save(folder: Path, out: Path) -> None:
     """Write a sequence as one HTML file that plays without a server: all pictures on the left, the world and the events
     in space on the right, a legend above. Raises AssetError as :class:`SequenceView`, OutputError."""
-    sequence, server = SequenceView(folder), LocalServer(0)
+    sequence, server = SequenceView(named(folder)), LocalServer(0)
     try:
         stage = Stage(server.scene, sequence, pictures=True)
         begins = server.initial_camera

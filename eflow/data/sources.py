@@ -30,7 +30,7 @@ from blinkgl.io import flow as flow_files
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.hdf5 import dataset, open_hdf5
-from blinkgl.io.records import inside
+from blinkgl.io.records import inside, named
 from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS
 from blinkgl.sequence_files.index import INDEX, read_index
@@ -442,7 +442,7 @@ def open_source(
     dt, protocol, frames, dense : for MVSEC, see :class:`~eflow.data.mvsec.MvsecSource`.
     Raises ConfigError: one of the last three for another data set. AssetError: no data set, or a damaged index. Files
     of single samples are opened when they are read."""
-    root = Path(path)
+    root = named(Path(path))
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
         return MvsecSource(root, dt, protocol, frames, dense)

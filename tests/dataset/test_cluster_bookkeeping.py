@@ -129,6 +129,7 @@ def test_closing(ray, tmp_path, done, forced, ours):
     cluster of one's own ends with its folder."""
     cluster = with_tasks(1, 2)
     cluster._board, cluster._ours, cluster._folder = "board", ours, str(tmp_path / "ray")
+    cluster._reasons = {1: "too slow"}
     (tmp_path / "ray").mkdir()
     ray.done = done
     cluster.close()
@@ -142,6 +143,7 @@ def test_closing(ray, tmp_path, done, forced, ours):
         *([("shutdown",)] if ours else []),
     ]
     assert not cluster._tasks and not (tmp_path / "ray").exists()
+    assert not cluster._reasons and not cluster._ours, "of another run it knows nothing"
 
 
 # --- connecting, and the worker's side --------------------------------------------------------------------------------
@@ -223,7 +225,7 @@ def test_a_worker_looks_before_its_first_task(monkeypatch, environment, assets, 
         assert message == {"kind": "refused", "error": "no OpenGL"}
 
 
-@pytest.mark.parametrize("address", ["host", ":5", "host:port", "ray://host", "host:"])
+@pytest.mark.parametrize("address", ["host", ":5", "host:port", "ray://host", "host:", "host:²"])
 def test_what_is_no_address(address):
     with pytest.raises(BlinkGLError, match="--address: not an address .*; expected host:port, ray://host:port or auto"):
         module._reachable(address)

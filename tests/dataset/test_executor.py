@@ -117,3 +117,15 @@ def test_closing_ends_who_does_not_leave(job, monkeypatch):
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+def test_one_pool_is_of_one_run_after_the_other(job, local, monkeypatch):
+    """Of the second run it keeps nothing of the first: no closed pipes, no failed starts, no cards."""
+    pool, cards = local(1), iter([[4, 5], [6, 7]])
+    monkeypatch.setattr(executor, "several_cards", lambda job: next(cards))
+    for device in (4, 6):
+        assert [m["device"] for m in pool.open(job())] == [device]
+        pool._bad_starts = 2
+        pool.submit(1, 1)
+        assert gathered(pool, "done")[-1]["task"] == 1
+        pool.close()

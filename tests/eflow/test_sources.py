@@ -291,3 +291,12 @@ def test_dsec_without_rectification_map(tmp_path):
     root = dsec_set(tmp_path)
     (root / "thun_00_a/events/left/rectify_map.h5").unlink()
     refused("rectify_map.h5: no rectification map", lambda: open_source(root))
+
+
+def test_the_folder_that_one_stands_in_has_its_name(sets, monkeypatch):
+    for kind, sequence in (("dsec", "**/events/left"), ("blinkflow", "**/forward_flow"), ("blinkgl", "train/*/flow")):
+        folder = next(sets[kind].glob(sequence))
+        folder = folder.parent.parent if kind == "dsec" else folder.parent
+        monkeypatch.chdir(folder)
+        names = [source[0].name for source in (open_source("."), open_source(folder))]
+        assert names[0] == names[1] and folder.name in names[0]

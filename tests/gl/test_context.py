@@ -117,9 +117,10 @@ def test_environment_overrides_the_device(monkeypatch):
     monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", "98")
     with pytest.raises(GLError, match="got 98"):
         create_context("egl", device=0)
-    monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", "first")
-    with pytest.raises(GLError, match="GLCONTEXT_DEVICE_INDEX: not a device number"):
-        create_context("egl", device=0)
+    for text in ("first", "²"):
+        monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", text)
+        with pytest.raises(GLError, match="GLCONTEXT_DEVICE_INDEX: not a device number"):
+            create_context("egl", device=0)
 
 
 def test_auto_falls_back_to_osmesa_and_says_so(monkeypatch):

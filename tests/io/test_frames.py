@@ -168,14 +168,15 @@ def times(path, **given):
     return [t for _, t, _ in open_frames(path, Declared(**given))]
 
 
-def test_times_that_are_named_come_before_those_that_lie_there(tmp_path):
+def test_times_that_are_named_come_before_those_that_lie_there(tmp_path, monkeypatch):
     """A folder's own timestamps.txt, its images.txt, its timestamps.csv, then the parent's images.txt."""
     folder = images(tmp_path / "a")
     written = {"images.txt": (4, tmp_path), "timestamps.csv": (3, folder), "timestamps.txt": (1, folder)}
     written_in_folder = (folder / "images.txt", 2)
+    monkeypatch.chdir(folder)
     for name, (step, where) in written.items():
         (where / name).write_text("".join(f"{0.001 * step * k:.3f} f{k}.png\n" for k in range(3)))
-        assert times(folder) == [0, step * 10**6, 2 * step * 10**6]
+        assert times(folder) == times(".") == [0, step * 10**6, 2 * step * 10**6]
         if name == "timestamps.csv":
             path, step = written_in_folder
             path.write_text(f"t_us,name\n0,f0.png\n{1000 * step},f1.png\n{2000 * step},f2.png\n")

@@ -30,7 +30,7 @@ from eflow.data.sources import read_submission_times
 ABSURD = (
     "1e999", "-1e999", "1e400", "1e308", "-1e308", "1e101", "1e99", "1e-400", "1e-99999", "9" * 400, "9" * 5000,
     "-" + "9" * 5000, "0." + "0" * 400 + "1", "1e99999999999999999999", "1e1000000", "nan", "inf", "-Infinity", "1/0",
-    "0x10", "1_0", "", "٣", "1e", "--1", "1e19", "18446744073709551616", "1e18", "1e25", "4611686018427387904",
+    "0x10", "1_0", "", "٣", "²", "1e", "--1", "1e19", "18446744073709551616", "1e18", "1e25", "4611686018427387904",
 )  # fmt: skip
 """Numbers that Python's own types read as infinite, refuse by exceptions of their own, or compute for minutes."""
 
@@ -188,6 +188,12 @@ def test_options_of_the_command_line_end(tmp_path, number):
             assert abs(t_ns) < 2**62
     except BlinkGLError as error:
         assert "\n" not in str(error)
+
+
+def test_a_header_of_latin_1_may_have_a_digit_that_is_no_number(tmp_path):
+    (tmp_path / "e.raw").write_bytes("% system_ID ²\n% end\n".encode("latin-1"))
+    with pytest.raises(BlinkGLError, match="no system_ID that says them"):
+        open_events(tmp_path / "e.raw")
 
 
 def test_what_a_number_is():

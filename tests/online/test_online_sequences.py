@@ -232,3 +232,19 @@ def test_workers_that_cannot_start_are_named_as_python_names_them(recipe, tmp_pa
         with pytest.raises(ConfigError) as caught:
             list(islice(sequences, 1000))
     assert str(caught.value) == why
+
+
+def test_a_slot_without_samples_says_why_its_first_sequence_gave_none(recipe, monkeypatch):
+    """By the name that `generate` gives its folder."""
+    from blinkgl.online import maker
+
+    count = itertools.count(1)
+
+    def fails(*args, **how):
+        raise AssetError("no such mesh", where=f"pool/{next(count)}.glb")
+
+    monkeypatch.setattr(maker, "simulate_sequence", fails)
+    named = load(recipe, ["output.name=flying"])
+    with OnlineSequences(named, workers=0) as sequences, pytest.raises(ConfigError) as caught:
+        next(iter(sequences))
+    assert "; the first that gave none: flying_000001: pool/1.glb: no such mesh" in str(caught.value)

@@ -129,6 +129,12 @@ def test_sequences_are_chosen_and_come_while_others_are_shown(made):
         assert nodes(page, "/world/cameras/camera", "/world/cameras/left") == ["/world/cameras/left"]
 
 
+def test_the_folder_that_one_stands_in_is_shown_by_its_name(made, monkeypatch):
+    monkeypatch.chdir(made.single)
+    with page_of(Path()) as page:
+        assert list(page.folders) == [made.single.name] == [page.sequence.name]
+
+
 def test_a_damaged_sequence_is_said_on_the_page_and_the_others_stay(made, tmp_path):
     damaged = shutil.copytree(made.single, tmp_path / "damaged")
     with page_of(damaged, made.rig) as page:

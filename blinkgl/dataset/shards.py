@@ -27,11 +27,11 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.errors import AssetError
+from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_folder, output_errors, refuse_existing
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.event_labels import EVENT_LABELS, EventLabelsReader, with_truth
-from blinkgl.io.records import shown
+from blinkgl.io.records import named, shown
 from blinkgl.io.sequence_tables import EXPOSURES, POSES, ExposureLine, picture_file, read_exposures, read_poses
 from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS
@@ -57,18 +57,27 @@ def export_shards(
 
     Labels are in a random order (``seed``) over all sequences of a split, since shards are read sequentially.
     note : called with a line for each sequence that is left out. Raises
-    AssetError (no labels, a damaged sequence), OutputError (an existing folder, disk full)."""
+    AssetError (no labels, a damaged sequence), OutputError (an existing folder, two sequences of one key, disk
+    full)."""
     out = Path(out)
     refuse_existing(out)
     root = data_set(root)
     labels: dict[str, list[tuple[Path, int]]] = {}
+    keys: dict[tuple[str, str], Path] = {}
     for number, folder in enumerate(sequence_folders(root), 1):
         heartbeat.at(f"sequence {number:,}")
         manifest = whole(folder)
-        count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
-        labels.setdefault(manifest.get("split") or "all", []).extend((folder, k) for k in range(count))
+        # A frame camera of a rig may have labels; its samples would have no events.
+        lacks = "events" if "events.h5" not in manifest["files"] else "forward flow"
+        count = 0 if lacks == "events" else sum(map(_FLOW.forms[0].holds, manifest["files"]))
+        split = manifest.get("split") or "all"
+        labels.setdefault(split, []).extend((folder, k) for k in range(count))
         if not count:
-            note(f"{shown(folder.relative_to(root))}: no forward flow")
+            note(f"{shown(folder.relative_to(root))}: no {lacks}")
+        elif (other := keys.setdefault((split, _called(folder, manifest)), folder)) != folder:
+            raise OutputError(
+                "two sequences would have the same keys", where=str(other), value=str(folder), accepted="other names"
+            )
     if not any(labels.values()):
         raise AssetError("no flow labels found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
     written = {}
@@ -87,22 +96,30 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
         path = out / f"{split}-{len(counts):06d}.tar"
         with output_errors(path):
             counts.append(0)
-            with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
+            with tarfile.open(path, "w") as shard:
                 while pending is not None and (counts[-1] == 0 or shard.offset < shard_bytes):
                     for name, data in sample(*pending):
                         # Owner, mode and time keep their defaults: the bytes do not depend on the date.
                         member = tarfile.TarInfo(name)
                         member.size = len(data)
+                        # USTAR's headers hold 100 bytes of a name.
+                        shard.format = tarfile.USTAR_FORMAT if len(name.encode()) <= 100 else tarfile.PAX_FORMAT
                         shard.addfile(member, io.BytesIO(data))
                     counts[-1] += 1
                     pending = next(entries, None)
     return counts
 
 
+def _called(folder: Path, manifest: Tree) -> str:
+    """Return what keys say of a sequence: its name, of a rig's camera with the rig's before it."""
+    own = named(folder)
+    return own.name if "sensor" not in manifest else f"{named(own.parent).name}-{own.name}"
+
+
 def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     """Yield (member name, bytes) of the ``k``-th label of a sequence."""
     manifest = read_manifest(folder)
-    called = folder.name if "sensor" not in manifest else f"{folder.parent.name}-{folder.name}"
+    called = _called(folder, manifest)
     key = f"{called}_{k:06d}"
     count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
     start, end = read_label_times(folder / str(_FLOW.stamps), 2, count)[k]

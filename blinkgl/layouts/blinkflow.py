@@ -18,7 +18,18 @@ import numpy as np
 from blinkgl.config.reader import to_yaml
 from blinkgl.io.flow import encode_flow_npy
 from blinkgl.io.images import encode_npy
-from blinkgl.layouts.layout import BEFORE, Layout, Missing, append, forward_flow, growing, need, new_hdf5, write_bytes
+from blinkgl.layouts.layout import (
+    BEFORE,
+    Layout,
+    Missing,
+    append,
+    forward_flow,
+    growing,
+    need,
+    new_hdf5,
+    sensor_pixels,
+    write_bytes,
+)
 from blinkgl.layouts.source import Source
 
 
@@ -44,7 +55,7 @@ class BlinkFlow(Layout):
     name = "blinkflow"
     about = "BlinkFlow's PyTorch loader, E-FlowFormer's training, eflow"
     size = (480, 640)
-    needs = (forward_flow, _divided_second, _events_before)
+    needs = (forward_flow, _divided_second, _events_before, sensor_pixels)
 
     def folder(self, source: Source) -> str:
         scene, _, number = source.name.rpartition("_")

@@ -9,7 +9,7 @@ from blinkgl.config.run import RunTemplate
 from blinkgl.dataset.plan import Plan
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.io.atomic import atomic_folder
-from blinkgl.io.records import inside
+from blinkgl.io.records import path_inside
 from blinkgl.layouts.blinkflow import BlinkFlow
 from blinkgl.layouts.dsec import Dsec, ERaft
 from blinkgl.layouts.intervals import Intervals
@@ -115,10 +115,16 @@ def _refuse_what_lacks(row: Layout, source: Source) -> None:
 
 
 def _places(row: Layout, sources: list[Source]) -> list[str]:
-    places = [inside("", f"{row.folder(source)}/{source.name}") for source in sources]
+    places = [f"{row.folder(source)}/{source.name}" for source in sources]
+    for place, source in zip(places, sources):
+        try:
+            path_inside(place)
+        except ValueError as error:
+            where = str(source.folder)
+            raise AssetError(f"names {error}", where=where, value=place, accepted="a plain relative path") from None
     if twice := [place for place in places if places.count(place) > 1]:
         raise OutputError(
-            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=str(twice[0])
+            "two sequences would be written to the same place", where=f"layout '{row.name}'", value=twice[0]
         )
     return [row.folder(source) for source in sources]
 

@@ -19,8 +19,9 @@ import numpy as np
 from blinkgl.events.grids import voxel_grid
 from blinkgl.io.columns import windows
 from blinkgl.io.images import encoded
+from blinkgl.io.sequence_tables import EXPOSURES
 from blinkgl.layouts.frames import frames_of, picture, two_frames, write_frames
-from blinkgl.layouts.layout import GZIP, Layout, keep, new_hdf5, write_bytes, write_lines
+from blinkgl.layouts.layout import GZIP, Layout, keep, new_hdf5, sensor_pixels, write_bytes, write_lines
 from blinkgl.layouts.source import Source
 from blinkgl.types.events import Events
 
@@ -37,7 +38,8 @@ class Intervals(Layout):
 
     name = "intervals"
     about = "TimeLens' HybridStorage, BS-ERGB's readers and EvTexture's hdf5 backend"
-    needs = (two_frames,)
+    # Images of a frame camera always have the sensor's pixels.
+    needs = (two_frames, lambda source: None if source.has(EXPOSURES) else sensor_pixels(source))
 
     def write(self, source: Source, folder: Path) -> list[str]:
         frames, own = frames_of(source), folder / source.name

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import DTypeLike
 
+from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.hdf5 import growing_dataset, packing, write_rows
 from blinkgl.layouts.source import Source
@@ -70,6 +71,11 @@ def need(what: str, yaml: str, there: Callable[[Source], object]) -> Need:
 
 forward_flow = need("forward flow", "labels: {flow: [forward]}", lambda source: source.flow_times("forward"))
 images = need("images", "labels: {images: true}", lambda source: source.image_times)
+sensor_pixels = need(
+    "labels in the sensor's pixels, as its events are",
+    "labels: {pixels: sensor}",
+    lambda source: source.camera is None or isinstance(source.camera, PinHole) or not source.rectified,
+)
 BEFORE = "a recording that begins a label interval before the first label", "time: {start: 0}"
 events_before = need(
     *BEFORE, lambda source: not (t := source.flow_times("forward")) or source.start_us <= 2 * t[0][0] - t[0][1]

@@ -16,8 +16,18 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.camera import PinHole
-from blinkgl.layouts.layout import GZIP, Layout, append, growing, images, keep, need, new_hdf5, write_bytes
+from blinkgl.layouts.layout import (
+    GZIP,
+    Layout,
+    append,
+    growing,
+    images,
+    keep,
+    need,
+    new_hdf5,
+    sensor_pixels,
+    write_bytes,
+)
 from blinkgl.layouts.source import Source
 
 LABEL_US, TARGET_US, END_US, STEP_US = 400_000, 900_000, 1_000_000, 10_000
@@ -33,12 +43,6 @@ _samples = need(
     "time: {duration: 1, label_rate: 2}",
     lambda source: _flow_over_half_a_second(source) or not source.image_times or labels_of(source),
 )
-# MultiFlow does not rectify.
-_sensor_pixels = need(
-    "labels in the sensor's pixels",
-    "labels: {pixels: sensor}",
-    lambda source: source.camera is None or isinstance(source.camera, PinHole) or not source.rectified,
-)
 
 
 class MultiFlow(Layout):
@@ -48,7 +52,7 @@ class MultiFlow(Layout):
     about = "bflow's MultiFlow loader (flow at many times after one; folders train and val)"
     size = (384, 512)
     filled = ("train", "val")
-    needs = (_flow_over_half_a_second, images, _samples, _sensor_pixels)
+    needs = (_flow_over_half_a_second, images, _samples, sensor_pixels)
 
     def folder(self, source: Source) -> str:
         return "train" if source.split == "train" else "val"

@@ -19,7 +19,7 @@ import numpy as np
 
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.imu import read_imu
-from blinkgl.layouts.layout import Layout, append, forward_flow, growing, images, keep, new_hdf5
+from blinkgl.layouts.layout import Layout, append, forward_flow, growing, images, keep, new_hdf5, sensor_pixels
 from blinkgl.layouts.source import Source
 
 _ALMOST_NOTHING = np.float32(1e-6)
@@ -31,7 +31,7 @@ class Mvsec(Layout):
     name = "mvsec"
     about = "EV-FlowNet's and later loaders of MVSEC (hdf5 and *_gt_flow_dist.npz), eflow"
     size = (260, 346)
-    needs = (forward_flow, images)
+    needs = (forward_flow, images, sensor_pixels)
 
     def folder(self, source: Source) -> str:
         return source.split
@@ -61,8 +61,8 @@ def _data(source: Source, file: h5py.File, group: str) -> None:
     for k in range(len(taken)):
         append(pictures, source.grey(k)[None])
     keep(file, f"{group}/image_raw_ts", taken * 1e-6)
-    # Images after the last event get its number.
-    keep(file, f"{group}/image_raw_event_inds", np.minimum(first, len(rows) - 1))
+    # Images after the last event get its number, and 0 where there is none.
+    keep(file, f"{group}/image_raw_event_inds", np.minimum(first, max(len(rows) - 1, 0)))
     if source.unit is not None:
         imu = read_imu(source.unit)
         keep(file, f"{group}/imu", np.hstack([imu["acceleration"], imu["rate"]]))

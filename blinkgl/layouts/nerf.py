@@ -17,7 +17,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from blinkgl.io.formats import write_events
 from blinkgl.io.images import encode_npy, encoded
 from blinkgl.io.sequence_tables import EXPOSURE_POSES, EXPOSURES, POSES, read_exposure_poses, read_exposures
 from blinkgl.layouts.frames import Frames, frames_of, two_frames, write_frames
-from blinkgl.layouts.layout import Layout, need, write_bytes, write_lines
+from blinkgl.layouts.layout import Layout, Missing, need, sensor_pixels, write_bytes, write_lines
 from blinkgl.layouts.source import Planned, Source
 from blinkgl.types.events import Events
 
@@ -39,13 +39,16 @@ _exposed = need(
     "images: {}, generated again",
     lambda source: not source.has(EXPOSURES) or source.has(EXPOSURE_POSES),
 )
-_bounded = need(
-    "depth, or boxes of bodies in view, for near and far",
-    "labels: {depth: true}",
-    lambda source: (
-        _poses(source) or source.count("depth") or isinstance(source, Planned) or len(_depths_of_boxes(source))
-    ),
-)
+
+
+def _bounded(source: Source) -> Missing | None:
+    if _poses(source) or isinstance(source, Planned) or next(_depths(source), None) is not None:
+        return None
+    if source.count("depth"):
+        return Missing("something in view, for near and far", "scene: {kind: random}")
+    return Missing("depth, or boxes of bodies in view, for near and far", "labels: {depth: true}")
+
+
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _HOLD = 8
 """Of so many frames the first is of the split test, as LLFF's loader holds out."""
@@ -63,7 +66,8 @@ class Nerf(Layout):
     def write(self, source: Source, folder: Path) -> list[str]:
         frames, camera = frames_of(source), source.camera
         assert camera is not None, "its poses have the intrinsics"
-        if source.rectified and not source.has(EXPOSURES):
+        apart = not source.has(EXPOSURES) and sensor_pixels(source) is not None
+        if apart:
             camera = rectified(camera)
         T_world_cam = _camera_poses(source, frames)
         write_frames(source, frames, folder)
@@ -76,7 +80,7 @@ class Nerf(Layout):
             write_events(folder / name, source.events(), source.height, source.width, t_offset_us=source.start_us)
         for split in ("train", "validation"):
             _event_nerf(source, camera, frames, T_world_cam[:, 1], folder / "eventnerf" / split)
-        return [f"{source.name}: {line}" for line in _notes(camera, frames)]
+        return [f"{source.name}: {line}" for line in _notes(camera, frames, apart)]
 
 
 def _camera_poses(source: Source, frames: Frames) -> np.ndarray:
@@ -165,12 +169,22 @@ def _llff(source: Source, camera: CameraModel, T_world_cam: np.ndarray) -> np.nd
     right, down, forward, place = (T_world_cam[:, :3, k] for k in range(4))
     size = np.broadcast_to([camera.height, camera.width, camera.fx], place.shape)
     matrices = np.stack([down, right, -forward, place, size], axis=2).reshape(len(place), 15)
-    depths = _depths_of_boxes(source)
-    if count := source.count("depth"):
-        maps = (source.value("depth", k) for k in range(count))
-        depths = np.concatenate([[np.min(d), np.max(d)] for d in (m[np.isfinite(m)] for m in maps) if d.size])
+    depths = np.concatenate([*_depths(source)])
     bounds = np.broadcast_to([depths.min(), depths.max()], (len(place), 2))
     return np.concatenate([matrices, bounds], axis=1)
+
+
+def _depths(source: Source) -> Iterator[np.ndarray]:
+    """Yield the least and the largest depth of each depth label that shows something, else those of boxes, of which
+    there may be none either."""
+    seen = False
+    for k in range(source.count("depth")):
+        depth = source.value("depth", k)
+        if (hit := depth[np.isfinite(depth)]).size:
+            seen = True
+            yield np.array([hit.min(), hit.max()])
+    if not seen and len(boxes := _depths_of_boxes(source)):
+        yield boxes
 
 
 def _depths_of_boxes(source: Source) -> np.ndarray:
@@ -203,8 +217,9 @@ def _event_nerf(source: Source, camera: CameraModel, frames: Frames, T_world_cam
         write_bytes(folder / f"rgb/{k:06d}.png", file.read_bytes())
 
 
-def _notes(camera: CameraModel, frames: Frames) -> list[str]:
-    """Return what the formats cannot say of this sequence."""
+def _notes(camera: CameraModel, frames: Frames, apart: bool) -> list[str]:
+    """Return what the formats cannot say of this sequence.   apart : whether its frames are rectified and its events
+    are not."""
     middle = np.allclose(_intrinsics(camera)[2:], [camera.width / 2, camera.height / 2], atol=0.01)
     steps = np.diff(frames.t_us)
     # p1, p2 and k3 of radtan, and any lens of another kind.
@@ -213,6 +228,7 @@ def _notes(camera: CameraModel, frames: Frames) -> list[str]:
         (not middle or not np.isclose(camera.fx, camera.fy) or camera.coefficients,
          "poses_bounds.npy has one focal length, its principal point in the middle and no lens"),
         (steps.max() - steps.min() > 2, "EventNeRF's loader takes frames to be evenly spaced, and these are not"),
+        (apart, "its frames are rectified, its events in the sensor's pixels (labels: {pixels: sensor})"),
         (unknown, "EventNeRF's loader knows k1 and k2 of radtan alone"),
         ((camera.width, camera.height) != _EVENTNERF_SIZE,
          f"EventNeRF's loader expects 346x260 px, and this is {camera.width}x{camera.height}"),

@@ -24,7 +24,7 @@ import numpy as np
 
 from blinkgl.io.images import encoded
 from blinkgl.io.sequence_tables import TRACKS, read_tracks
-from blinkgl.layouts.layout import Layout, Missing, append, growing, images, need, new_hdf5, write_bytes
+from blinkgl.layouts.layout import Layout, Missing, append, growing, images, need, new_hdf5, sensor_pixels, write_bytes
 from blinkgl.layouts.source import Source
 
 _tracks = need("point tracks", "tracks: {points: 256}", lambda source: source.has(TRACKS))
@@ -92,7 +92,7 @@ class EventKubric(Layout):
     name = "eventkubric"
     about = "ETAP's EventKubric loader (after its prepare_event_representations.py)"
     size = (512, 512)
-    needs = (images, _times)
+    needs = (images, _times, sensor_pixels)
 
     def write(self, source: Source, folder: Path) -> list[str]:
         start_us = source.image_times[0]

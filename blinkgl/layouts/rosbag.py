@@ -24,7 +24,7 @@ from blinkgl.camera import PinHole
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.imu import read_imu
 from blinkgl.io.ros import FLOW, event_array, typestore
-from blinkgl.layouts.layout import Layout
+from blinkgl.layouts.layout import Layout, sensor_pixels
 from blinkgl.layouts.source import Source
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ class RosBag(Layout):
 
     name = "rosbag"
     about = "ROS 1 (rosbag, rqt_bag, rpg_dvs_ros), rosbags, evlib and what reads ESIM's bags"
+    needs = (sensor_pixels,)
 
     def folder(self, source: Source) -> str:
         return source.split
@@ -72,7 +73,7 @@ def _camera(source: Source, topic: str, store: Typestore) -> Iterator[Iterator[M
     """Yield the streams of one camera, each in order of time."""
     yield _events(source, f"{topic}/events")
     flows = source.flow_times("forward")
-    times = source.image_times or [a for a, _ in flows]
+    times = _label_times(source)
     yield (
         (t * 1000, f"{topic}/camera_info", *_camera_info(source, t, store)) for t in times if source.camera is not None
     )
@@ -83,6 +84,13 @@ def _camera(source: Source, topic: str, store: Typestore) -> Iterator[Iterator[M
     yield ((t * 1000, f"{topic}/depthmap", _IMAGE, make(t, "32FC1", source.value("depth", k))) for k, t in deep)
     moving = enumerate(times[: source.count("velocity") or len(flows)])
     yield ((t * 1000, f"{topic}/optic_flow", FLOW, _flow(source, k, t, store)) for k, t in moving)
+
+
+def _label_times(source: Source) -> list[int]:
+    """Return the times of the labels, µs, from whatever says them."""
+    stamped = [source.image_times, *([a for a, _ in source.flow_times(towards)] for towards in ("forward", "backward"))]
+    posed = [int(t) // 1000 for t in source.poses.get("t_ns", ())[1:]]  # the first is of the sequence's start
+    return next((times for times in (*stamped, source.interval_times, posed) if times), [])
 
 
 def _events(source: Source, topic: str) -> Iterator[Message]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from blinkgl.camera import CameraModel, PinHole
 from blinkgl.config.camchain import read_camchain
+from blinkgl.config.over_time import track_times
 from blinkgl.config.reader import read_table
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.verify import files_of_sequence, times_of
@@ -23,7 +24,7 @@ from blinkgl.io.images import read_image
 from blinkgl.io.imu import H5 as IMU
 from blinkgl.io.intervals import intervals_in
 from blinkgl.io.reading import listed
-from blinkgl.io.records import inside
+from blinkgl.io.records import inside, named
 from blinkgl.io.sequence_tables import POSES, TRACKS, read_poses, read_tracks
 from blinkgl.io.times import read_label_times
 from blinkgl.labels import LABELS, Form
@@ -55,7 +56,7 @@ class Source:
     ) -> Source:
         """Open a sequence. Raises AssetError: no sequence, or files are missing or cut."""
         manifest = whole(folder)
-        return cls(folder, manifest, name or folder.name, beside, folder if IMU in manifest["files"] else unit)
+        return cls(folder, manifest, name or named(folder).name, beside, folder if IMU in manifest["files"] else unit)
 
     @property
     def split(self) -> str:
@@ -217,11 +218,11 @@ def _of_sensors(folder: Path) -> Source:
     if not cameras:
         raise AssetError("a rig without an event camera", where=str(folder))
     unit = next((inside(folder, name) for name, one in tables.items() if "imu" in one["records"]), None)
-    one, other = cameras[0], tables[cameras[0]]["pair"]
+    one, other, name = cameras[0], tables[cameras[0]]["pair"], named(folder).name
     if other not in cameras:
-        return Source.open(inside(folder, one), folder.name, unit=unit)
+        return Source.open(inside(folder, one), name, unit=unit)
     left, right = (one, other) if tables[one]["baseline"] > 0 else (other, one)
-    return Source.open(inside(folder, left), folder.name, inside(folder, right), unit)
+    return Source.open(inside(folder, left), name, inside(folder, right), unit)
 
 
 @dataclass(frozen=True)
@@ -250,10 +251,10 @@ class Planned(Source):
 
     @property
     def track_times(self) -> list[int]:
-        tracks, times = self.config.tracks, self._label_us
-        if tracks is None or tracks.rate is None:
-            return times
-        return [round(t) for t in np.arange(times[0], times[-1] + 1, 1e6 / tracks.rate)]
+        tracks, time = self.config.tracks, self.config.time
+        if tracks is None:
+            return []
+        return [t // 1000 for t in track_times(tracks.rate, time.label_times_ns[0], time.t1_ns, time.interval_ns)]
 
     def interval_ns(self, k: int) -> np.ndarray:
         return np.array(LABELS["flow_intervals"].intervals(self.config.labels), np.int64)

@@ -17,6 +17,7 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.deep import differences
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.records import SEAL
@@ -209,3 +210,20 @@ def test_a_sensor_with_a_camera_and_an_inertial_unit_writes_both(tmp_path):
     assert "events.h5" in files and set(files) < {path.name for path in made["with"].iterdir()}
     assert len(open_events(made["with"] / "events.h5").read()) > 0
     assert (made["with"] / "events.h5").read_bytes() == (made["without"] / "events.h5").read_bytes()
+
+
+def test_a_first_camera_that_sees_no_event_makes_no_twins_and_one_without_events_no_samples(tmp_path):
+    sensors = [
+        {"name": "frames", "images": {"rate": 20}, "labels": {"flow": ["forward"]}},
+        {"name": "blind", "events": {"contrast_threshold": 5.0, "threshold_sigma": 0}},
+        {"name": "eye", "events": {}},
+    ]
+    recipe = {**TINY, "labels": {**TINY["labels"], "flow": ["forward"]}, "output": {"sequences": 2}}
+    for name, rig in (("twins", sensors[1:]), ("shards", sensors[:1] + sensors[2:])):
+        run_dataset(load_run(recipe_file(tmp_path, **recipe, sensors=rig)), tmp_path / name)
+    counts = [read_manifest(path)["events"] for path in sorted((tmp_path / "twins/train").glob("*/blind"))]
+    result = verify_dataset(tmp_path / "twins")
+    assert counts == [0, 0] and result.clean and not any("same events" in note for note in result.notes)
+    notes = []
+    written = export_shards(tmp_path / "shards", tmp_path / "out", note=notes.append)
+    assert notes == [f"train/sequence_{k:06d}/frames: no events" for k in range(2)] and sum(written["train"]) == 2

@@ -3,6 +3,7 @@
 import io
 import itertools
 import json
+import shutil
 import tarfile
 
 import cv2
@@ -15,6 +16,7 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.layouts import export_layout
 from runs import recipe_file
 
 
@@ -79,12 +81,16 @@ def test_webdataset_reads_them(data, tmp_path):
     assert {f"{s['__key__']}.{ending}": s[ending] for s in samples for ending in s if ending[0] != "_"} == dict(written)
 
 
-def test_bad_input(data, tmp_path):
+def test_bad_input(data, tmp_path, monkeypatch):
     with pytest.raises(AssetError, match="no flow labels"):
         export_shards(tmp_path, tmp_path / "x")
     export_shards(data / "train", tmp_path / "a")
     with pytest.raises(OutputError, match="output folder exists"):
         export_shards(data, tmp_path / "a")
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    with pytest.raises(OutputError, match=r"^\.: not the name of a folder; expected a new folder name"):
+        export_shards(data, ".")
 
 
 def test_a_groups_class_is_in_its_manifests_and_shards_alone(tmp_path, capsys):
@@ -101,3 +107,31 @@ def test_a_groups_class_is_in_its_manifests_and_shards_alone(tmp_path, capsys):
     capsys.readouterr()
     assert run(["verify", str(tmp_path / "out")]) == 2
     assert "class is other, config.yaml says None" in capsys.readouterr().out
+
+
+def test_names_of_any_length_and_sequences_of_one_name(data, tmp_path):
+    """A USTAR header has room for 100 bytes; a key is of one sequence."""
+    name = "n" * 100 + "_000000"
+    for folder in (f"a/{name}", "b/fly_000000", "c/fly_000000"):
+        shutil.copytree(data / "train/fly_000000", tmp_path / folder)
+    export_shards(tmp_path / "a", tmp_path / "long")
+    export_shards(tmp_path / "b", tmp_path / "usual")
+    long, usual = (members(tmp_path / folder, "train") for folder in ("long", "usual"))
+    renamed = {n.replace("fly_000000", name): content for n, content in usual if not n.endswith(".json")}
+    assert {n: content for n, content in long if not n.endswith(".json")} == renamed
+    (tmp_path / "both").mkdir()
+    for part in "bc":
+        (tmp_path / part).rename(tmp_path / "both" / part)
+    with pytest.raises(OutputError, match=r"b/fly_000000: two sequences would have the same keys .*c/fly_000000"):
+        export_shards(tmp_path / "both", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_folder_that_one_stands_in_has_its_name(data, tmp_path, monkeypatch):
+    monkeypatch.chdir(data / "train/fly_000001")
+    export_shards(".", tmp_path / "shards")
+    assert {name.partition(".")[0] for name, _ in members(tmp_path / "shards", "train")} == {
+        f"fly_000001_{k:06d}" for k in range(4)
+    }
+    export_layout(".", tmp_path / "dsec", "dsec")
+    assert [path.name for path in (tmp_path / "dsec/train").iterdir()] == ["fly_000001"]

@@ -2,15 +2,22 @@
 common/event.py and image_sequence.py), EVREAL's converter of BS-ERGB, and EvTexture's Hdf5Backend
 with the voxel grids of its DataPreparation.md. No reader here imports blinkgl."""
 
+import itertools
+
 import cv2
 import h5py
 import numpy as np
 import pytest
+import yaml
 
 from blinkgl.cli import run
-from blinkgl.layouts import export_layout
+from blinkgl.config.run import load_run
+from blinkgl.layouts import LAYOUTS, Source, export_layout
+from blinkgl.layouts.export import refuse_plan
+from blinkgl.layouts.mvsec import _data
+from blinkgl.layouts.source import Planned
 from loaders import DsecEvents
-from test_layouts import HEIGHT, RECIPE, WIDTH, generate
+from test_layouts import HEIGHT, LENS, RECIPE, WIDTH, generate
 
 BASE = {k: v for k, v in RECIPE.items() if k not in ("tracks", "imu", "labels")}
 RECIPES = {
@@ -119,3 +126,48 @@ def test_recorded_frames_have_intervals_and_a_file_of_events_has_not(tmp_path, c
         "with frames: {folders: […]} makes one of recorded frames\n"
     )
     assert not (tmp_path / "none").exists()
+
+
+IN_SENSOR_PIXELS = {"blinkflow", "mvsec", "multiflow", "eventkubric", "rosbag", "intervals"}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_events_in_sensor_pixels_have_no_rectified_labels_beside_them(tmp_path, layout):
+    """DSEC's loaders rectify the events; TAP-Vid has none, and nerf says it."""
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(LENS))
+    for pixels, camera in itertools.product(("rectified", "sensor"), (False, True)):
+        overrides = [f"labels.pixels={pixels}", *(["images={rate: 20, exposure_us: 1000}"] if camera else [])]
+        planned = Planned.of(load_run(tmp_path / "recipe.yaml", overrides).sequence(0), tmp_path)
+        lacks = "labels: {pixels: sensor}" in [missing.yaml for missing in LAYOUTS[layout].missing(planned)]
+        taken = layout in IN_SENSOR_PIXELS and not (camera and layout == "intervals")
+        assert lacks == (pixels == "rectified" and taken), (pixels, camera)
+
+
+def test_track_times_of_a_plan_are_those_that_a_run_writes(tmp_path):
+    """EventKubric's 96 images and tracks in 2 s, also at a rate of the same times."""
+    changes = {
+        "time": {"duration": 2, "label_rate": 47.5},
+        "labels": {"images": True},
+        "timeline": {"kind": "uniform", "fps": 60},
+    }
+    for tracks in ({"points": 9}, {"points": 9, "rate": 47.5}):
+        recipe = {**RECIPE, **changes, "tracks": tracks}
+        (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(recipe))
+        refuse_plan(load_run(tmp_path / "recipe.yaml"), None, "eventkubric")
+    recipe["time"]["duration"] = 0.2
+    sequence = generate(tmp_path / "made", recipe) / "train/sequence_000000"
+    planned = Planned.of(load_run(tmp_path / "made/recipe.yaml").sequence(0), tmp_path)
+    assert planned.track_times == np.load(sequence / "tracks.npz")["t_us"].tolist()
+
+
+def test_mvsec_numbers_no_event_where_there_is_none(made, tmp_path):
+    """Of a camera that is blind an image's event is the first, not the last of nothing."""
+
+    class Blind(Source):
+        def events(self, chunk=0):
+            return iter([])
+
+    source = Blind.open(made[1])
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        _data(source, file, "left")
+        assert set(file["left/image_raw_event_inds"][...].tolist()) <= {0}

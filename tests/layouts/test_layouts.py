@@ -1,6 +1,7 @@
 """`blinkgl export --layout`: what other people's loaders ask for, restated in loaders.py, and what they then hold."""
 
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -20,7 +21,7 @@ from blinkgl.io.formats import open_events
 from blinkgl.io.imu import read_imu
 from blinkgl.io.reading import EventReading
 from blinkgl.io.sequence_tables import read_tracks
-from blinkgl.layouts import LAYOUTS, dsec, export as exporting, export_layout, point_tracks
+from blinkgl.layouts import LAYOUTS, Source, dsec, export as exporting, export_layout, point_tracks
 from blinkgl.layouts.source import Planned, sources_of
 from loaders import (
     blinkflow_sequence,
@@ -482,6 +483,19 @@ def test_rosbag_of_a_stereo_rig_and_of_bare_events(stereo, bare, tmp_path):
         assert file.notes == []
         same([getattr(file.read(), k) for k in "xytp"], read_events(stereo / "left/events.h5"))
     assert export_layout(bare, tmp_path / "bare", "rosbag").said == ()
+
+
+def test_rosbag_of_depth_alone_has_its_labels_times(data, sequence, tmp_path):
+    """Without pictures and flow the times are those of backward flow, else of the poses."""
+    pytest.importorskip("rosbags.rosbag1", reason="optional extra [formats]")
+    source, labels = Source.open(sequence), label_times(sequence)[:, 0] * 1000
+    for gone in (("images", "flow/forward"), ("images", "flow")):
+        files = {name: about for name, about in source.manifest["files"].items() if not name.startswith(gone)}
+        LAYOUTS["rosbag"].write(replace(source, manifest={**source.manifest, "files": files}), tmp_path)
+        topics = messages(tmp_path / "sequence_000000.bag")
+        (tmp_path / "sequence_000000.bag").unlink()
+        assert [t for t, _ in topics["/cam0/depthmap"]] == labels.tolist()
+        assert [t for t, _ in topics["/cam0/camera_info"]][: len(labels)] == labels.tolist()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

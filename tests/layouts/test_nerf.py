@@ -180,3 +180,25 @@ def test_what_is_missing_is_named_and_nothing_is_written(tmp_path, capsys):
     with pytest.raises(AssetError, match=r"takes depth, or boxes of bodies .* 'labels: \{depth: true\}'"):
         export_layout(data, tmp_path / "out", "nerf")
     assert not (tmp_path / "out").exists()
+
+
+def test_bounds_where_depth_labels_show_nothing(tmp_path):
+    """Those of the box of the only body, 3.5 to 4.5 in front of the camera; without it, a line."""
+    sequence = generate(tmp_path / "data", RECIPES["labels"]) / "train/sequence_000000"
+    for path in (sequence / "depth").glob("*.npy"):
+        np.save(path, np.full_like(np.load(path), np.inf))
+    export_layout(sequence, tmp_path / "out", "nerf")
+    bounds = np.load(tmp_path / "out/train/sequence_000000/poses_bounds.npy")[:, 15:]
+    np.testing.assert_allclose(bounds, np.tile([3.5, 4.5], (len(bounds), 1)), atol=1e-9)
+    manifest = sequence / "manifest.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "objects": []}))
+    with pytest.raises(AssetError, match=r"takes something in view, for near and far, .* 'scene: "):
+        export_layout(sequence, tmp_path / "none", "nerf")
+
+
+def test_rectified_frames_have_the_camera_without_its_lens_and_events_that_are_said(tmp_path):
+    recipe = {**RECIPES["lens"], "labels": {**RECIPES["lens"]["labels"], "pixels": "rectified"}}
+    notes = export_layout(generate(tmp_path / "data", recipe), tmp_path / "out", "nerf").said
+    assert any("its frames are rectified, its events in the sensor's pixels" in line for line in notes)
+    for k, (_, pixels) in enumerate(from_colmap(tmp_path / "out/train/sequence_000000/sparse/0"), 1):
+        np.testing.assert_allclose(pixels, true_px(0.1 * k), atol=1e-6)

@@ -312,6 +312,8 @@ def _keys(base: EmulatorConfig, fixed: Iterable[str]) -> list[str]:
     if not base.fitted:
         raise ConfigError("this emulator has no parameters to fit", where="emulator", value=base.emulator)
     fixed = set(fixed)
+    if unknown := sorted(fixed - set(type(base).model_fields)):
+        raise ConfigError("no such parameter", where="--set", value=unknown[0], accepted=", ".join(base.fitted))
     if "threshold_ratio" in fixed:
         raise ConfigError(
             "the two thresholds are fitted separately, not by their ratio",

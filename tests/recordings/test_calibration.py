@@ -309,3 +309,9 @@ def test_events_of_a_hot_pixel_are_counted_whole(each):
     events = Events(*(np.full(n, k, np.uint16) for k in (5, 6)), np.arange(n) * 10, np.ones(n, np.uint8))
     got = sums(events, clip_of_still(events, (16, 16)), 0, 8)
     assert got.both.sum() == got.both[6 * 16 + 5] == n and got.still.sum() == n
+
+
+def test_a_parameter_that_is_not_there_cannot_be_kept(tmp_path):
+    recording = still_recording(tmp_path, shot_noise_rate_hz=3.0)
+    with pytest.raises(ConfigError, match=r"--set: no such parameter \(got 'contrast_treshold'\)"):
+        calibrate(recording, still=True, starts=1, fixed=["contrast_treshold"])

@@ -11,6 +11,7 @@ import skimage.data
 
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig
+from blinkgl.errors import EventDataError
 from blinkgl.events import Events
 from blinkgl.io.frames import open_frames
 from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
@@ -348,3 +349,22 @@ def test_the_frame_camera_of_a_sequence_says_what_it_is(tmp_path, noise):
 def test_the_distance_of_codes_is_that_of_256(levels, dtype):
     """Of linear codes it is 1/255 everywhere, however many of them lie between black and white."""
     assert Decoder("linear", levels).code_distance(dtype)(0.5) * 255 == pytest.approx(1, rel=1e-3)
+
+
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint8, 255), (np.uint16, 1023), (np.uint16, 65535)])
+def test_codes_at_the_declared_white_are_at_an_end(tmp_path, capsys, dtype, white):
+    """Half of the pixels are clipped, whatever code is white; a tenth below it none is."""
+    for top, said in ((white, True), (round(0.9 * white), False)):
+        frames = np.random.default_rng(0).integers(white // 4, white // 2, (6, 48, 64)).astype(dtype)
+        frames[:, :24] = top
+        np.save(tmp_path / "v.npy", frames)
+        words = ["--white-level", str(white)] if white == 1023 else ["--range", "full"]
+        line = ["simulate", str(tmp_path / "v.npy"), "--fps", "100", *words, "--out", str(tmp_path / "e.h5")]
+        assert run([*line, "--overwrite"]) == 0
+        assert ("50 % of the codes are at an end" in capsys.readouterr().out) == said
+
+
+@pytest.mark.parametrize("dtype", [np.uint32, np.uint64, np.int32])
+def test_other_integers_are_refused_before_anything_is_made_of_them(dtype):
+    with pytest.raises(EventDataError, match=r"unsupported pixel type .*expected uint8, uint16 or float"):
+        events_of(np.zeros((3, 8, 8), dtype))

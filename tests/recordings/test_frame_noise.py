@@ -368,3 +368,28 @@ def test_codes_at_the_declared_white_are_at_an_end(tmp_path, capsys, dtype, whit
 def test_other_integers_are_refused_before_anything_is_made_of_them(dtype):
     with pytest.raises(EventDataError, match=r"unsupported pixel type .*expected uint8, uint16 or float"):
         events_of(np.zeros((3, 8, 8), dtype))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--fps", "10"], ["--gamma", "2.2"], ["--white-level", "9"], ["--range", "full"], ["--timestamps", "nothing.txt"],
+     ["--background", "black"], ["--frames-time-unit", "us"], ["--frame-delay-ms", "3"]],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_what_is_declared_of_frames_needs_frames(tmp_path, capsys, options):
+    np.savez(
+        tmp_path / "e.npz", t_us=np.arange(2000) * 10, x=np.ones(2000, int), y=np.ones(2000, int), p=np.ones(2000, int)
+    )
+    for command in (
+        ["compare", str(tmp_path / "e.npz")],
+        ["calibrate", str(tmp_path / "e.npz"), "--still", "--out", str(tmp_path / "o.yaml")],
+    ):
+        assert run([*command, *options]) == 2
+        said = capsys.readouterr().err
+        assert f"{options[0]}: there are no frames; expected --frames, or nothing of frames" in said
+    np.save(tmp_path / "v.npy", scene(6, 2.0).astype(np.float32)[:, :4, :4])
+    assert run(["compare", str(tmp_path / "e.npz")]) == 0
+    assert (
+        run(["compare", str(tmp_path / "e.npz"), "--size", "4x4", "--frames", str(tmp_path / "v.npy"), "--fps", "300"])
+        == 0
+    )

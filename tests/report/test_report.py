@@ -238,3 +238,11 @@ def test_options_of_null_are_found_in_the_sequences():
     into: list[Parameter] = []
     _walk("run", {"a": {"choice": [None, 5]}, "b": {"choice": [1, 2]}}, (), [{"a": None, "b": 1}, {"a": 5}], into)
     assert [(one.path, one.values) for one in into] == [("a", [None, 5]), ("b", [1])]
+
+
+@pytest.mark.parametrize(
+    ("value", "short", "bytes_"),
+    [(9999, "9999", "0.01 MB"), (999_400, "999 k", "0.999 MB"), (999_600, "1 M", "1 MB"), (999.6e6, "1 G", "1 GB")],
+)
+def test_numbers_are_short_at_every_unit(value, short, bytes_):
+    assert charts.number(value) == short and charts.size(value) == bytes_

@@ -101,7 +101,7 @@ def simulate(
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     keep_noise: Annotated[bool, typer.Option("--keep-noise", help="Make events of the frames' noise, too.")] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the emulator.")] = 0,
     preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no summary.")] = False,

@@ -10,6 +10,7 @@ Reading one cannot execute code.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -232,8 +233,9 @@ def keep_best(run: Path, model: FlowModel, ema: dict[str, Tensor] | None, step: 
     """Write the weights, averaged if they are, to ``run/best.safetensors`` if ``score``, the mean over validation sets
     of the AEE as a share of zero flow's, is lower than that of the file there."""
     path = run / "best.safetensors"
-    # `not <` instead of `>=`: a score of NaN never replaces weights.
-    if path.is_file() and not score < float(read_tensors(path)[1].get("score", "inf")):
+    best = float(read_tensors(path)[1].get("score", "inf")) if path.is_file() else math.inf
+    # `not <` instead of `>=`: a score of NaN never replaces weights. Any other replaces those with a score of NaN.
+    if path.is_file() and not score < (math.inf if math.isnan(best) else best):
         return
     with atomic_file(path) as temporary:
         about = {**metadata_of(model), "step": str(step), "score": repr(score)}

@@ -28,7 +28,6 @@ def _pairs(file: EventFile, asked: WindowsAsked) -> Iterator[StreamWindow]:
         return
     if (ends := infer.ends_of(file)) is None:
         return
-    start, end = asked.limits(ends[0])
-    first, last = max(ends[0], start or ends[0]), min(ends[1], end or ends[1])
+    first, last = asked.within(ends)
     # Of a length still to be found those that are looked at first: half of a long recording would fill the memory.
     yield from infer.at_places(file, asked.span_us or min(infer.FIRST_US, max((last + 1 - first) // 2, 1)), first, last)

@@ -31,6 +31,7 @@ from eflow.cli_arguments import (
     WindowMs,
     WindowsAsked,
     answerer,
+    check_outputs,
     grouped,
     network_of,
     one_of,
@@ -142,18 +143,20 @@ def evaluate(
     """Score a network or a method on a data set. Zero flow and global motions fitted to the truth are scored beside it.
     Samples with an empty window are left out and counted."""
     from blinkgl.machine.terminal import plain_console
-    from eflow.data.sources import open_source
+    from eflow.data.sources import open_source, refuse_of_mvsec
     from eflow.evaluate import evaluate as score, show
 
-    model = answerer(checkpoint, options)
+    model = answerer(checkpoint, options, refine=refine)
     console = plain_console(stderr=True)
+    of_mvsec = {"dt": dt, "protocol": protocol, "frames": ranges_of(frames), "dense": dense}
     if dataset.endswith((".yaml", ".yml")):
+        refuse_of_mvsec(**of_mvsec)
         with console.status("rendering"):
             source = rendered(dataset, window_ms, limit)
     elif window_ms is not None:
         raise ConfigError("needs a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
     else:
-        source = open_source(dataset, dt=dt, protocol=protocol, frames=ranges_of(frames), dense=dense)
+        source = open_source(dataset, **of_mvsec)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -196,6 +199,7 @@ def predict(
     from eflow.choice import AUTO, chosen
     from eflow.flow_of_file import show_flows
 
+    check_outputs(asked, outputs)
     if len(names) > 2:
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
     name, events = [AUTO, *names][-2:]

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from eflow.data.sources import Part
     from eflow.models import FlowModel
 
+ROTATION = "contrast-rotation"
 Answer = Annotated[
     str,
     typer.Argument(
@@ -113,7 +114,7 @@ class Answering:
     views: Views = None
     focal: Annotated[
         float | None,
-        typer.Option(min=1e-3, help="Focal length in px; contrast-rotation needs it.", show_default=False),
+        typer.Option(min=1e-3, help=f"Focal length in px; {ROTATION} needs it.", show_default=False),
     ] = None
 
 
@@ -154,6 +155,14 @@ class WindowsAsked:
             raise ConfigError(
                 "not a window length", where="--window-ms", value=self.window_ms, accepted="milliseconds, or auto"
             )
+        for option, value in (("--start-ms", self.start_ms), ("--end-ms", self.end_ms)):
+            if self.whole and value is not None:
+                raise ConfigError(
+                    "the whole file has no limits",
+                    where=option,
+                    value=value,
+                    accepted="--window-ms instead of --whole",
+                )
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -176,6 +185,11 @@ class WindowsAsked:
         """Return the limits, µs, of a file whose first event is at ``first`` µs."""
         start, end = (None if ms is None else first + round(ms * 1000) for ms in (self.start_ms, self.end_ms))
         return start, end
+
+    def within(self, ends: tuple[int, int]) -> tuple[int, int]:
+        """Return the first and the last µs inside the limits, of a file whose first and last event are at ``ends``."""
+        start, end = self.limits(ends[0])
+        return max(ends[0], ends[0] if start is None else start), min(ends[1], ends[1] if end is None else end - 1)
 
 
 @dataclass(frozen=True)
@@ -212,6 +226,15 @@ class Outputs:
     video: Annotated[str | None, typer.Option(help="Also write a video (.mp4) of events and flow.")] = None
 
 
+def check_outputs(asked: WindowsAsked, outputs: Outputs) -> None:
+    """Raise ConfigError for an option of files that are not written."""
+    for option, wanted in (("--npy", outputs.npy), ("--at-events", outputs.at_events)):
+        if wanted and not outputs.out:
+            raise ConfigError("no folder to write to", where=option, accepted="--out FOLDER")
+    if asked.shares != (1.0,) and not outputs.out and not outputs.video:
+        raise ConfigError("nothing is written", where="--at", value=asked.at, accepted="--out or --video")
+
+
 @dataclass(frozen=True)
 class Sampling:
     """How windows are taken from rendered sequences; keys of :class:`eflow.config.SourceConfig`."""
@@ -227,17 +250,22 @@ class Sampling:
     )
 
 
-def answerer(name: str, options: Answering) -> FlowModel | Method:
+def answerer(name: str, options: Answering, *, refine: bool = False) -> FlowModel | Method:
     """Return the method of that name, or the trained network, on a GPU if there is one.
 
+    refine : whether the flow of a network is asked to be refined.
     Raises ConfigError: it lacks one of the options. AssetError: no such network."""
-    if name not in METHODS or Path(name).exists():
-        if options.focal is not None:
-            raise ConfigError(
-                "only a method uses it", where="--focal", value=options.focal, accepted=", ".join(METHODS)
-            )
+    network = name not in METHODS or Path(name).exists()
+    if options.focal is not None and (network or name != ROTATION):
+        raise ConfigError("only a rotation uses it", where="--focal", value=options.focal, accepted=ROTATION)
+    if network:
         return network_of(name, iterations=options.iterations, warm_start=options.warm_start)
-    of_networks = {"--iterations": options.iterations, "--warm-start": options.warm_start, "--views": options.views}
+    of_networks = {
+        "--iterations": options.iterations,
+        "--warm-start": options.warm_start,
+        "--views": options.views,
+        "--refine": refine,
+    }
     for option, value in of_networks.items():
         if value:
             raise ConfigError(f"{name} is not a network", where=option, value=value)

@@ -116,6 +116,13 @@ class EFlowFormerConfig(_Refined):
         "null: none",
     )
 
+    @rule("quick", "trunk", "input.normalise")
+    def _quick(quick: bool, trunk: tuple[int, int, int] | None, normalise: str):
+        if quick and trunk is not None and trunk[2] % 2:
+            raise Refused("not widths", where="trunk", value=list(trunk), accepted="an even last width with quick")
+        if quick and normalise == "all":  # quick weighs cells by their events, and without events a cell is 0 no more
+            raise Refused("not with quick", where="input.normalise", value=normalise, accepted="nonzero or none")
+
 
 class EvFlowNetConfig(Config):
     """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
@@ -197,6 +204,11 @@ class AugmentConfig(Config):
             raise Refused("not a range", where="scale", value=list(scale), accepted="[low, high] within [-3, 3]")
 
 
+_OF_FOLDERS = ("format", "dt")
+_OF_RECIPES = ("set", "workers", "samples", "uses", "window_ms", "min_events", "max_flow", "min_density")
+"""Keys of a source that is a folder, and of one that is rendered."""
+
+
 class SourceConfig(Config):
     """One data set: a folder, a recipe that is rendered during training, or a share of the training folders."""
 
@@ -255,6 +267,13 @@ class SourceConfig(Config):
                 value=online,
                 accepted="recipe: FILE with online: true, or the folder that blinkgl generate made of it as path",
             )
+
+    @rule("path", "recipe", *_OF_FOLDERS, *_OF_RECIPES)
+    def _of_one_kind(path, recipe, *values):
+        for key, value in zip(_OF_FOLDERS + _OF_RECIPES, values, strict=True):
+            has, kind = (path, "a folder (path)") if key in _OF_FOLDERS else (recipe, "a recipe")
+            if has is None and value != SourceConfig.model_fields[key].default:
+                raise Refused(f"only for {kind}", where=key, value=value)
 
     @rule("window_ms")
     def _ordered(window_ms: tuple[float, float] | None):

@@ -31,29 +31,31 @@ def show_flows(
     count, still, before, speeds = 0, 0, None, []
     with contextlib.ExitStack() as opened:
         writers: list[Writer] = []
+        folder = None
         if outputs.out:
-            folder = flow_folder(outputs.out, npy=outputs.npy, at_events=outputs.at_events)
-            writers.append(opened.enter_context(folder))
+            folder = opened.enter_context(flow_folder(outputs.out, npy=outputs.npy, at_events=outputs.at_events))
+            writers.append(folder)
         if outputs.video:
             fps = min(20.0, 1e6 / span) * len(asked.shares)  # windows per second of video: real time, but at most 20
             writers.append(opened.enter_context(flow_video(outputs.video, *infer.sensor_of(file), fps)))
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
-            flow = flow * np.float32(factor)
             count += 1
             still += not flow.any()
-            if flow.any() and len(window.new):
+            if flow.any() and np.isfinite(flow).all() and len(window.new):
                 speeds.append(float(np.median(np.hypot(*flow[window.new.y, window.new.x].T))))
+            flow = flow * np.float32(factor)
+            begin = window.new.t0 if factor == 1 else window.old.t0
             say(
-                f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
+                f"t {begin} us  {len(window.old) + len(window.new)} events  mean speed "
                 f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
             # Flow at a time within the window: the events until then, and the flow so far, for which the flow of the
             # window before tells the velocity at the beginning.
             for share in asked.shares if writers else ():
-                end = window.new.t0 + round(share * (window.new.t1 - window.new.t0))
-                to_end = replace(window, new=replace(window.new, t1=end))
+                end = begin + round(share * (window.new.t1 - begin))
+                to_end = replace(window, new=replace(window.new, t0=begin, t1=end))
                 for writer in writers:
                     writer.add(Answer(to_end, infer.within(flow, before, share), tensor))
             before = flow
@@ -66,7 +68,9 @@ def show_flows(
     if still:
         say(f"  {still} of {count} flows are zero: too few events, or nothing moves")
     if isinstance(predictor.model, FlowModel) and speeds:
-        _propose_longer(file, predictor, span, speeds, asked.whole, say)
+        _propose_longer(file, predictor, span, speeds, asked, say)
+    if folder is not None and folder.lost:
+        say(f"  {folder.lost} flows beyond ±256 px are not valid in the PNGs, which cannot hold them (--npy can)")
     for why, windows in predictor.unsharpened.items():
         say(f"  {windows} of {count} flows have the network's own length: {why} (--no-refine for all)")
     for path in filter(None, (outputs.out, outputs.video)):
@@ -74,7 +78,12 @@ def show_flows(
 
 
 def _propose_longer(
-    file: EventFile, predictor: Predictor, span: int, speeds: list[float], whole: bool, say: Callable[[str], None]
+    file: EventFile,
+    predictor: Predictor,
+    span: int,
+    speeds: list[float],
+    asked: WindowsAsked,
+    say: Callable[[str], None],
 ) -> None:
     """Say that the flow of most windows is too short for the networks, and which window is long enough. speeds : px a
     window."""
@@ -83,15 +92,15 @@ def _propose_longer(
         return
     where = f"below {infer.SHORTEST_PX:g} px, where the networks of the package are wrong by a third or more"
     line = f"  {short} of {len(speeds)} flows are {where}"
-    ends = infer.ends_of(file)
+    first, last = asked.within(infer.ends_of(file) or (0, -1))
     # A network of two windows needs both of them inside the recording.
-    longest = 0 if ends is None or whole else (ends[1] + 1 - ends[0]) // len(predictor.reads)
+    longest = 0 if asked.whole else (last + 1 - first) // len(predictor.reads)
     # Longer in the ratio of the lengths: the motion is taken to go on.
     fitting = min(round(span * infer.LIKELY_PX / max(float(np.median(speeds)), 1e-3)), longest)
     # Three digits, rounded down: of a longer window than the recording there is none.
     fitting -= fitting % 10 ** max(len(str(fitting)) - 3, 0)
     if fitting > 1.2 * span:
-        say(f"{line}: try --window-ms {fitting / 1000:.3g}")
+        say(f"{line}: try --window-ms {fitting / 1000:.15g}")
     else:
         say(f"{line}; this recording is too short for longer windows")
 
@@ -108,11 +117,12 @@ def _windows(
     if first is None:
         raise BlinkGLError("holds no events", where=str(file.path))
     if (span := asked.span_us) is None:
-        span, longest = infer.likely_span(file, predictor, reads)
+        part = asked.within(infer.ends_of(file) or (first, first))
+        span, longest = infer.likely_span(file, predictor, reads, part)
         say(f"windows of {span / 1000:g} ms")
         if span == longest:
             say(f"  the longest window of this recording: motion in it is below {infer.LIKELY_PX:g} px")
-        _second_opinion(file, predictor, span, first + (longest - span) * len(reads) // 2, say)
+        _second_opinion(file, predictor, span, part[0] + (longest - span) * len(reads) // 2, say)
     start, end = asked.limits(first)
     return infer.windows(file, span, start_us=start, end_us=end, reads=reads), span, 1.0
 

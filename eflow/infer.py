@@ -132,7 +132,7 @@ def windows(
             if pending.t[0] > t + JUMP * span_us:
                 raise EventDataError(
                     f"event times jump by {(int(pending.t[0]) - t) * 1e-6:.6g} s",
-                    where=f"{file.path}, {(t - start_us) / 1000:g} ms after the first",
+                    where=f"{file.path}, {(t - start_us) / 1000:.15g} ms after the first",
                     accepted="--end-ms before the jump or --start-ms after it",
                 )
             yield StreamWindow.of(pending, t - span_us, t, t + span_us)
@@ -141,6 +141,8 @@ def windows(
             t += span_us
         if end_us is not None and last >= end_us:
             return
+        # Of the events before the first window the last ones stay, so that a silent one is no jump of the clock.
+        pending = pending.window(min(t - span_us, last), last + 1)
     if t is not None and last + 1 >= t + span_us and (end_us is None or t + span_us <= end_us):
         yield StreamWindow.of(pending, t - span_us, t, t + span_us)
 
@@ -159,14 +161,15 @@ def likely_span(
     file: EventFile,
     predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]],
     reads: Sequence[str] = SIDES,
+    ends: tuple[int, int] | None = None,
 ) -> tuple[int, int]:
     """Return (Δ, longest possible Δ) in µs, where Δ is the time in which motion is about :data:`LIKELY_PX`.
 
     The speed is the median of the predictor's own flow at pixels with events, at three places of the recording; Δ is
     changed until that speed fits it, or until the flow no longer grows with it. Δ is at least 1 ms and at most half of
-    the recording, or all of it if the predictor ``reads`` only the new window. Raises EventDataError: no events, or
-    none at those places."""
-    if (ends := ends_of(file)) is None:
+    the recording, or all of it if the predictor ``reads`` only the new window. ends : the first and the last µs of the
+    part of the recording that counts; None: all of it. Raises EventDataError: no events, or none at those places."""
+    if ends is None and (ends := ends_of(file)) is None:
         raise EventDataError("holds no events", where=str(file.path))
     first, last = ends
     longest = max((last + 1 - first) // (2 if "old" in reads else 1), 1000)
@@ -183,7 +186,7 @@ def likely_span(
                 where=str(file.path),
                 accepted="--window-ms in milliseconds instead of auto",
             )
-        speed = max(float(np.median(speeds)), 1e-3)
+        speed = max(1e-3, float(np.median(speeds)))  # in this order, NaN is 1e-3
         # In windows that are too long for a network its flow no longer grows with them, which would ask for still
         # longer ones: the last length stays for which it grew at least by half of what the length did. Where hardly
         # anything moves this says nothing.

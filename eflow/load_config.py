@@ -26,9 +26,7 @@ def load_train_config(
     recipes to render during training) and ``optim.minutes``; relative to the working folder. path : None: only those
     and the overrides; images are then not scaled, which would need a crop.
     Raises ConfigError: missing file, bad YAML, unknown key, bad value; without a file, no model or no data."""
-    tree = {} if path is None else read_table(path)
-    if path is None and not any(text.partition("=")[0].startswith("data.augment") for text in overrides):
-        tree = {"data": {"augment": {"scale_probability": 0}}}
+    tree = {"data": {"augment": {"scale_probability": 0}}} if path is None else read_table(path)
     if model is not None:
         tree = {**tree, "model": model}
     if data:
@@ -38,9 +36,9 @@ def load_train_config(
             else {"path": str(Path(p).resolve())}
             for p in data
         ]
-        tree = {**tree, "data": {**(tree.get("data") or {}), "train": sets}}
+        tree = _laid_over(tree, "data", "train", sets)
     if minutes is not None:
-        tree = {**tree, "optim": {**(tree.get("optim") or {}), "minutes": minutes}}
+        tree = _laid_over(tree, "optim", "minutes", minutes)
     path = Path("train.yaml" if path is None else path)
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p is unchanged
     tree = apply_overrides(tree, overrides)
@@ -61,6 +59,12 @@ def load_train_config(
             "init_from": _start(config.init_from, absolute),
         }
     )
+
+
+def _laid_over(tree: dict, section: str, key: str, value: object) -> dict:
+    """Return the tree with a value in a section; as it is where that is no table, which the validation refuses."""
+    table = tree.get(section) or {}
+    return {**tree, section: {**table, key: value}} if isinstance(table, dict) else tree
 
 
 def _start(init_from: str | None, absolute: Callable[[str], str]) -> str | None:

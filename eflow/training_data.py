@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from blinkgl.config.run import derived_seed
 from blinkgl.errors import AssetError, ConfigError
-from eflow.config import TrainConfig
+from eflow.config import SourceConfig, TrainConfig
 from eflow.data.dataset import FlowDataset, Key, Mixture, collate, evenly, is_endless
 from eflow.data.sources import Source, open_source, parts_of
 from eflow.infer import predict
@@ -73,7 +74,8 @@ def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, Fl
     """Return (name, set, indices of the samples to score) for every set of ``data.validate_on``."""
     sets = []
     folders = [s for s in config.data.train if s.path is not None]
-    for s, share in ((s, held.share) for held in config.data.validate_on for s in (folders if held.share else [held])):
+    held = [(s, one.share) for one in config.data.validate_on for s in (folders if one.share else [one])]
+    for title, (s, share) in zip(titles([s for s, _ in held]), held, strict=True):
         if s.path is None:
             from eflow.data.online import held as rendered
 
@@ -83,9 +85,18 @@ def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, Fl
         if share is not None:
             source = parts_of(source, share, s.path or "")[1]
         dataset = FlowDataset([source], model.representation, empty=config.data.empty, reads=model.reads)
-        title = Path(s.path or str(s.recipe)).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
         sets.append((title, dataset, evenly(len(dataset), config.data.validate_samples)))
     return sets
+
+
+def titles(sets: list[SourceConfig]) -> list[str]:
+    """Return the name of every set in the log, each another: that of its folder or recipe; of equal ones with the
+    folder above, and with a number where that is the same, too."""
+    places = [Path(os.path.abspath(s.path or str(s.recipe))) for s in sets]
+    ends = [f"_dt{s.dt}" if s.dt != 1 else "" for s in sets]
+    names = [(p.name if p.is_dir() else p.stem) + end for p, end in zip(places, ends, strict=True)]
+    longer = [f"{p.parent.name}/{n}" if names.count(n) > 1 else n for p, n in zip(places, names, strict=True)]
+    return [name if longer.count(name) == 1 else f"{name}#{k}" for k, name in enumerate(longer, 1)]
 
 
 def check_truth(dataset: FlowDataset, mixture: Mixture, validation: list[tuple[str, FlowDataset, list[int]]]) -> None:

@@ -19,7 +19,7 @@ from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.flow import write_flow_png
 from blinkgl.io.images import encode_image, encode_npy
 from blinkgl.io.video import VideoWriter
-from eflow.data.window import RawSample, StreamWindow
+from eflow.data.window import RawSample, StreamWindow, hit_pixels
 from eflow.types import Flow, Grid, Mask, Numbers, Picture
 
 _STEADY = 0.95
@@ -58,19 +58,20 @@ def flow_folder(final: str | os.PathLike, *, npy: bool = False, at_events: bool 
 
 
 class FlowWriter:
-    """Writes windows into the folder of :func:`flow_folder`. lines : of its time stamps."""
+    """Writes windows into the folder of :func:`flow_folder`. lines : of its time stamps.   lost : number of flows that
+    a PNG cannot hold and that are not valid there."""
 
     def __init__(self, folder: Path, final: Path, npy: bool, at_events: bool):
         self._folder, self._final, self.npy, self.at_events = folder, final, npy, at_events
-        self.lines = ["# from_timestamp_us, to_timestamp_us"]
+        self.lines, self.lost = ["# from_timestamp_us, to_timestamp_us"], 0
 
     def add(self, answer: Answer) -> None:
         """Write one window. Raises OutputError."""
         name, flow = f"{len(self.lines) - 1:06d}", answer.flow.astype(np.float32, copy=False)
-        valid, near = np.all(np.isfinite(flow), axis=-1), near_events(answer.events)
+        valid, near = np.all(np.isfinite(flow), axis=-1), near_events(answer)
         if self.at_events:
             valid &= near
-        write_flow_png(self._folder / f"{name}.png", flow, valid)
+        self.lost += write_flow_png(self._folder / f"{name}.png", flow, valid)
         with output_errors(self._final):
             if self.npy:
                 values = np.where(valid[..., None], flow, np.float32(np.nan)) if self.at_events else flow
@@ -105,7 +106,7 @@ class FlowVideo:
 
     def add(self, answer: Answer) -> None:
         """Draw one window. Raises OutputError."""
-        window, near = answer.pair.new, near_events(answer.events)
+        window, near = answer.pair.new, near_events(answer)
         # Times may be Unix times; captions count from the first window.
         self._began = window.t0 if self._began is None else self._began
         caption = f"{(window.t1 - window.t0) / 1000:g} ms at {(window.t0 - self._began) / 1e6:.3f} s"
@@ -144,9 +145,10 @@ def events_of(tensor: Grid) -> Picture:
     return event_colour(np.stack([level(-tensor), level(tensor)]))
 
 
-def near_events(tensor: Grid) -> Mask:
-    """Return the pixels of an event tensor (C, H, W) with an event within ``NEAR_PX``, (H, W) bool."""
-    hit = (tensor != 0).any(axis=0).astype(np.uint8)
+def near_events(answer: Answer) -> Mask:
+    """Return the pixels with an event of the new window within ``NEAR_PX``, (H, W) bool."""
+    # Of the events: in a tensor that is normalised over all cells those without events are not 0.
+    hit = hit_pixels([answer.pair.new], *answer.flow.shape[:2]).astype(np.uint8)
     return cv2.dilate(hit, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
 
 

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 import blinkgl
 from blinkgl.config.run import RunTemplate
-from blinkgl.errors import BlinkGLError
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.front.sections import labels_tree
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.scene.build import build_scene
 from tests.scene.gltf_files import GltfBuilder, arm_file
@@ -505,3 +506,15 @@ def test_a_scene_that_grows_checks_each_body_once(monkeypatch):
     assert max(checked) == 1
     assert grown.tree == blinkgl.Scene(blinkgl.Camera(64, 48), bodies, fog=(0.1, 0.2), gravity=(0, 0, -1)).tree
     assert grown.template().tree["scene"]["objects"][29]["name"] == "cuboid#29"
+
+
+@pytest.mark.parametrize(("options", "said"), [({"world": 0}, "world: not a whole number"), ({"rank": 1}, "rank: ")])
+def test_no_processes_are_not_one(options, said):
+    with pytest.raises(ConfigError, match=said):
+        blinkgl.OnlineSequences("demo", **options)
+
+
+def test_numbers_of_numpy_and_beyond_all_floats():
+    assert labels_tree([np.float32(0.5), np.float64(0.25)])["flow"] == [0.25, 0.5]
+    with pytest.raises(ConfigError, match="not a finite number"):
+        blinkgl.read_trajectory("way.txt", rate=10**400)

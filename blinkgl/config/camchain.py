@@ -66,11 +66,13 @@ _COLMAP: dict[str, tuple[str | None, str]] = {
 class Calibrated:
     """A camera of a calibration file. camera : its model.   T_cam_before : (4, 4) float64 rigid, from the axes of the
     previous camera of the chain to its own (Kalibr's T_cn_cnm1).   T_cam_imu : (4, 4) rigid, from the inertial unit's
-    axes to its own; None where they are not given."""
+    axes to its own.   T_body_cam : (4, 4) rigid, from its own axes to the body's (EuRoC's T_BS). None: not
+    given."""
 
     camera: CameraModel
     T_cam_before: np.ndarray | None = None
     T_cam_imu: np.ndarray | None = None
+    T_body_cam: np.ndarray | None = None
 
 
 def read_camchain(path: str | Path) -> dict[str, Calibrated]:
@@ -111,7 +113,10 @@ def read_camchain(path: str | Path) -> dict[str, Calibrated]:
         before = None if matrix is None else _rigid(matrix, f"{where}: {name}.{key}")
         unit = next((k for k in ("T_cam_imu", "T_imu_cam") if tables[name].get(k) is not None), None)
         T = None if unit is None else _rigid(tables[name][unit], f"{where}: {name}.{unit}")
-        cameras[name] = Calibrated(one.camera, before, np.linalg.inv(T) if T is not None and unit == "T_imu_cam" else T)
+        T = np.linalg.inv(T) if T is not None and unit == "T_imu_cam" else T
+        body = next((key for key in _ON_BODY if key in tables[name]), None)
+        placed = None if body is None else _place(tables[name], body, f"{where}: {name}")
+        cameras[name] = Calibrated(one.camera, before, T, placed)
     rectified_ = {name: _camera(tables[name], f"{where}: {name}", "camera_matrix") for name in names if name not in raw}
     return cameras | rectified_
 
@@ -214,17 +219,23 @@ def read_place_on_body(path: str | Path) -> np.ndarray:
     ConfigError."""
     tree = _tree(read_text(path), str(path))
     tables = [tree, *(value for value in tree.values() if isinstance(value, dict))]
-    names = ("T_BS", "T_body_sensor", "T_imu_cam", "T_cam_imu")
+    names = (*_ON_BODY, "T_imu_cam", "T_cam_imu")
     place = next(((table, key) for table in tables for key in names if key in table), None)
     if place is None:
         accepted = "T_BS, T_body_sensor, T_cam_imu or T_imu_cam"
         raise ConfigError("no place on a body", where=str(path), value=sorted(map(str, tree))[:5], accepted=accepted)
-    table, key = place
+    return _place(*place, str(path))
+
+
+_ON_BODY = "T_BS", "T_body_sensor"
+
+
+def _place(table: Mapping[str, Any], key: str, where: str) -> np.ndarray:
     matrix = table[key]
     data = matrix.get("data") if isinstance(matrix, dict) else matrix
     if isinstance(data, list) and len(data) == 16:
         data = [data[k : k + 4] for k in range(0, 16, 4)]
-    T = rigid_matrix(_rigid(data, f"{path}: {key}"))
+    T = rigid_matrix(_rigid(data, f"{where}: {key}"))
     return np.linalg.inv(T) if key == "T_cam_imu" else T
 
 

@@ -204,7 +204,8 @@ def calibrated(camera: object, base: Path) -> Any:
 
 def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, object]:
     """Return what the calibration of a sensor's ``camera:`` says of places and the table does not: ``place`` on the
-    rig, whose origin is the file's first camera, and ``imu`` with its position and rotation. Raises ConfigError."""
+    rig, whose origin is the file's first camera, or EuRoC's body, and ``imu`` with its position and rotation. Raises
+    ConfigError."""
     from scipy.spatial.transform import Rotation
 
     from blinkgl.config.camchain import read_camchain
@@ -221,6 +222,8 @@ def placed_by_calibration(table: Mapping[str, object], base: Path) -> dict[str, 
             T = np.asarray(link) @ T
         # T leads from the first camera to this one; the place on the rig is the way back.
         keys["place"] = {"matrix": np.linalg.inv(T).tolist()}
+    elif "place" not in table and (T := chain[number][1].T_body_cam) is not None:
+        keys["place"] = {"matrix": T.tolist()}
     imu, place = table.get("imu"), chain[number][1].T_cam_imu if chain else None
     if isinstance(imu, dict) and place is not None and not {"position", "rotation"} & set(imu):
         turned = Rotation.from_matrix(place[:3, :3]).as_euler("xyz", degrees=True)

@@ -176,9 +176,12 @@ class _TwoThresholds(EmulatorConfig):
                 data = {**data, missing: float(data.get(basis, default)) * float(ratio)}
             except (TypeError, ValueError, OverflowError):
                 return data
-        threshold = data.get("contrast_threshold")
-        if cls.spread is not None and "threshold_sigma" not in data and isinstance(threshold, int | float):
-            data = {**data, "threshold_sigma": cls.spread * threshold or cls.model_fields["threshold_sigma"].default}
+        if cls.spread is not None and "threshold_sigma" not in data and data.get("contrast_threshold") is not None:
+            try:
+                sigma = cls.spread * float(data["contrast_threshold"])  # YAML reads 1e-1 as text
+            except (TypeError, ValueError, OverflowError):
+                return data
+            data = {**data, "threshold_sigma": sigma or cls.model_fields["threshold_sigma"].default}
         return data
 
     @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")

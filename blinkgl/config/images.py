@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -229,10 +230,12 @@ def exposure_starts(images: ImagesConfig, t0_ns: int, t1_ns: int, rows: int) -> 
     exposure."""
     lasts_ns = round(NS_PER_US * (images.longest_us + readout_us(rows, images.row_us)))
     if images.rate is None:
-        return [round(NS_PER_S * t) for t in images.times or ()]
+        starts = [round(NS_PER_S * t) for t in images.times or ()]
+        # A nanosecond: each of these is rounded.
+        return [start for start in starts if t0_ns - 1 <= start <= t1_ns - lasts_ns + 1]
     # 1e-9, so that rounding does not lose an exposure that just fits.
-    count = int(((t1_ns - t0_ns - lasts_ns) * images.rate) / NS_PER_S + 1e-9) + 1
-    return [t0_ns + round(k * NS_PER_S / images.rate) for k in range(count)]
+    count = math.floor(((t1_ns - t0_ns - lasts_ns) * images.rate) / NS_PER_S + 1e-9) + 1
+    return [t0_ns + round(k * NS_PER_S / images.rate) for k in range(max(count, 0))]
 
 
 def check_images(

@@ -39,6 +39,14 @@ def check_rigid(matrix: object, where: str) -> None:
         )
 
 
+def are_rigid(matrices: np.ndarray) -> np.ndarray:
+    """Return (N,) bool: which of (N, 4, 4) numbers :func:`check_rigid` accepts, and are finite."""
+    T = np.asarray(matrices, np.float64)
+    R, last = T[:, :3, :3], np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0)
+    off = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0)
+    return np.isfinite(T).all(axis=(1, 2)) & (last < 1e-9) & (off < _RIGID) & (np.linalg.det(R) > 0)
+
+
 def rigid_matrix(matrix: object) -> np.ndarray:
     """Return a valid matrix (:func:`check_rigid`) as (4, 4) float64 with its rounded rotation made exact."""
     T = np.array(matrix, np.float64)

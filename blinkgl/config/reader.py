@@ -227,7 +227,8 @@ class _Dumper(yaml.SafeDumper):
 # ---------------------------------------------------------------------------------------------------------------------
 # Plain trees of configurations as read from YAML, and operations on them: merging, and changes in several places.
 
-_TAGS = ("kind", "emulator")
+_TAGS = {"kind": ("random", "displacement", "spline"), "emulator": ("esim",)}
+"""Keys that say of which kind a table is, and the kinds of tables without them: of scene, timeline, motions; events."""
 _WHOLE = ("sensor",)
 """Keys whose tables are replaced as a whole: a sensor is not mixed from two."""
 
@@ -239,10 +240,15 @@ def merge(common: object, own: object) -> Any:
         isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
     )
     # Keys of one kind mean nothing to another.
-    if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
+    if not both or any(_kinds_differ(common, own, tag) for tag in _TAGS):
         return copy.deepcopy(own)
     laid = {key: copy.deepcopy(value) if key in _WHOLE else merge(common.get(key), value) for key, value in own.items()}
     return {**copy.deepcopy(common), **laid}
+
+
+def _kinds_differ(common: Tree, own: Tree, tag: str) -> bool:
+    usual = tag not in common and own.get(tag) in _TAGS[tag]
+    return tag in own and own[tag] != common.get(tag) and not usual
 
 
 def each_option(node: Any, change: Callable[[object], object]) -> object:

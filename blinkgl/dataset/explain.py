@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -157,16 +157,22 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
         sharing = max(sum(events for *_, events in cameras), 1)
         frames = costs[0].frames // sharing
         rate = costs[0].events / sharing * 1e9 / (scene.t1_ns - scene.t0_ns)
+        told = []
         for number, name, own, events in cameras:
-            own, seen = own.model_copy(update={"preview": config.preview}), scene.seen_by(number)
+            # The preview is the rig's: a sensor's own configuration has none.
+            whole, seen = own.model_copy(update={"preview": config.preview}), scene.seen_by(number)
             with Renderer(gl, seen, config.render) as renderer:
                 one = Explanation(scene=_describe(renderer.scene, renderer, config), frames=frames)
                 if events:
-                    _passes(own, seen, renderer, rate, one)
-                elif own.images is not None:
-                    one.passes.append(_frame_camera(own.images, renderer, seen))
-                _left_out(own, seen, one)
-            _join(result, name, one)
+                    _passes(whole, seen, renderer, rate, one)
+                else:
+                    _frames_alone(own, seen, renderer, one)
+                _left_out(whole, seen, one)
+            told.append((name, one))
+        units = [one for one in config.sensors or () if not one.sees]
+        _join(result, told, units)
+        for unit in units:
+            _over_time(config.model_copy(update={"imu": unit.imu, "tracks": None}), scene, result, f"{unit.name}: ")
         # What only making it shows, such as motion too fast for the shortest step.
         if notes := [line for line in costs[0].notes if line not in (*scene.log, *scene.omissions)]:
             result.scene["when made"] = "; ".join(notes)
@@ -182,14 +188,24 @@ def _priced(result: Explanation, costs: list[Cost], config: SequenceConfig, dura
     return result
 
 
-def _join(result: Explanation, name: str, one: Explanation) -> None:
-    """Add the explanation of one camera to those of the cameras before it; all sensors have the same times."""
-    prefix = f"{name}: " if name else ""
-    same = {key: value for key, value in result.scene.items() if one.scene.get(key) == value}
-    result.scene |= {key if key in same or not prefix else prefix + key: v for key, v in one.scene.items()}
-    result.passes += [replace(p, name=prefix + p.name) for p in one.passes]
-    result.left_out += [pair for pair in one.left_out if pair not in result.left_out]
-    result.frames = max(result.frames, one.frames)
+def _join(result: Explanation, told: list[tuple[str, Explanation]], units: Sequence[object]) -> None:
+    """Add the explanations of a sequence's cameras, by name: what is said of all once, the rest with the name.
+
+    units : the rig's inertial units, which stand alone."""
+    scenes, absent = ([*one.scene.items()] for _, one in told), (one.left_out for _, one in told)
+    of_all, out_of_all = _shared([*scenes]), _shared([*absent])
+    result.scene |= of_all
+    result.left_out += [(what, why) for what, why in out_of_all if not (units and what == "inertial unit")]
+    for name, one in told:
+        prefix = f"{name}: " if name else ""
+        result.scene |= {prefix + key: value for key, value in one.scene.items() if (key, value) not in of_all}
+        result.left_out += [(prefix + what, why) for what, why in one.left_out if (what, why) not in out_of_all]
+        result.passes += [replace(p, name=prefix + p.name) for p in one.passes]
+        result.frames = max(result.frames, one.frames)
+
+
+def _shared(rows: Sequence[list[tuple[str, str]]]) -> list[tuple[str, str]]:
+    return [row for row in rows[0] if all(row in others for others in rows)]
 
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path, cost: Cost, result: Explanation) -> float:
@@ -335,12 +351,20 @@ def _pictures(config: SequenceConfig, duration: float, result: Explanation) -> N
         result.add("preview", f"{config.preview.rate:g} pictures per simulated second", pictures)
 
 
-def _over_time(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
+def _frames_alone(config: SequenceConfig, scene: Scene, renderer: Renderer, result: Explanation) -> None:
+    """Add what a camera without events draws."""
+    _pictures(config, 0.0, result)
+    _over_time(config, scene, result)
+    if config.images is not None:
+        result.passes.append(_frame_camera(config.images, renderer, scene))
+
+
+def _over_time(config: SequenceConfig, scene: Scene, result: Explanation, prefix: str = "") -> None:
     """Add the inertial unit and the point tracks."""
     if config.imu is not None:
         count = imu_count(config.imu.rate, scene.t0_ns, scene.t1_ns)
         words = f"{count} measurements at {config.imu.rate:g} Hz, {'noisy and ' if config.imu.noisy else ''}ideal"
-        result.add("inertial unit", words, count)
+        result.add(f"{prefix}inertial unit", words, count)
     if config.tracks is not None:
         ends = config.time.label_times_ns[0], config.time.t1_ns, config.time.interval_ns
         moments = track_times(config.tracks.rate, *ends)

@@ -106,7 +106,7 @@ def number(
         + [f"at least {least:g}"] * (least > -math.inf)
         + [f"at most {most:g}"] * (most < math.inf)
     )
-    real = isinstance(value, (numbers.Real, np.number)) and not isinstance(value, bool) and math.isfinite(value)
+    real = isinstance(value, (numbers.Real, np.number)) and not isinstance(value, bool) and _is_finite(value)
     if not real or not least <= float(value) <= most or not float(value) > above:
         raise ConfigError(
             "out of range" if real else "not a finite number",
@@ -115,6 +115,13 @@ def number(
             accepted=" ".join(["a number", " and ".join(bounds)]).strip(),
         )
     return float(value)
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
+        return False
 
 
 def whole(value: object, where: str, least: int, most: int) -> int:

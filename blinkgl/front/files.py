@@ -94,14 +94,18 @@ def read_trajectory(
 def write_trajectory(path: str | os.PathLike, t_ns: np.ndarray, poses: np.ndarray) -> None:
     """Write poses (N, 4, 4) at t_ns (N,) whole ns as TUM's text, t x y z qx qy qz qw. A sequence's
     ``poses.npz`` has them as ``t_ns`` and ``T_world_cam``. Raises OutputError, ConfigError."""
+    from blinkgl.config.poses import are_rigid
+    from blinkgl.front.poses import Pose
     from blinkgl.io import trajectories
 
     times = check.array(t_ns, "t_ns", (None,), "an array (N,) of whole ns")
     placed = check.array(poses, "poses", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
-    if times.dtype.kind not in "iu" or (np.diff(times) <= 0).any():
+    if times.dtype.kind not in "iu" or (times[1:] <= times[:-1]).any():
         raise ConfigError(
             "times do not increase", where="t_ns", value=times[:3].tolist(), accepted="whole ns, in order"
         )
+    for k in np.flatnonzero(~are_rigid(placed)):
+        Pose.from_matrix(placed[k], f"poses[{k}]")  # names what is wrong with it
     trajectories.write_trajectory(check.path(path, "path"), times, placed.astype(np.float64))
 
 

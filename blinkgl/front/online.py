@@ -81,7 +81,9 @@ class OnlineSequences(Closing):
     ):
         template = source if isinstance(source, RunTemplate) else load(source)
         seed = check.seed(seed)
-        share = share_of_process() if rank is None and world is None else Share(rank or 0, world or 1)
+        share = Share(rank or 0, 1 if world is None else world)
+        if rank is None and world is None:
+            share = share_of_process()
         world = check.whole(share.world, "world", 1, 1_000_000)
         rank = check.whole(share.rank, "rank", 0, world - 1)
         if kind not in CUTS:

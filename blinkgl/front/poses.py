@@ -99,6 +99,8 @@ class Pose(Piece):
         """Return the pose of T_world_body or T_world_cam, (4, 4): from the body's axes to the world's, z up; a camera's
         are x right, y down, z forward. Raises ConfigError: not rigid."""
         matrix = check.array(T, where, (4, 4), "an array (4, 4)")
+        if not np.isfinite(matrix).all():
+            raise ConfigError("holds NaN or infinity", where=where, value=np.round(matrix, 6).tolist())
         with placed(where):
             check_rigid(check.plain(matrix), where)
         from scipy.spatial.transform import Rotation
@@ -142,7 +144,8 @@ class Keyframes(Piece):
         :meth:`Pose.from_matrix`. Raises ConfigError."""
         times = check.array(times_s, "Keyframes.from_arrays.times_s", (None,), "an array (N,), s")
         poses = check.array(T, "Keyframes.from_arrays.T", (len(times), 4, 4), f"an array ({len(times)}, 4, 4)")
-        if not (np.diff(times) > 0).all():
+        # Compared, not subtracted: unsigned numbers would wrap.
+        if not (times[1:] > times[:-1]).all():
             raise ConfigError(
                 "times do not increase",
                 where="Keyframes.from_arrays.times_s",
@@ -175,7 +178,9 @@ class Trajectory(Piece):
         there = check.path(file, "Trajectory.file").expanduser().absolute()
         tree = check.given(file=there, **keys)
         if isinstance(T_body_sensor, (str, os.PathLike)):
-            tree["T_body_sensor"] = os.fspath(check.path(T_body_sensor, "Trajectory.T_body_sensor").absolute())
+            tree["T_body_sensor"] = os.fspath(
+                check.path(T_body_sensor, "Trajectory.T_body_sensor").expanduser().absolute()
+            )
         elif T_body_sensor is not None:
             place = check.array(T_body_sensor, "Trajectory.T_body_sensor", (4, 4), "a file, or an array (4, 4)")
             tree["T_body_sensor"] = check.plain(place)

@@ -43,7 +43,8 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 
 
 class Settings(TypedDict, total=False):
-    """Values that replace those of a run's source; :func:`blinkgl.record` describes them. None keeps the source's."""
+    """Values that replace those at the top level of a run's source; a group's own come before them
+    (``groups``). :func:`blinkgl.record` describes them. None keeps the source's."""
 
     emulator: Section | None
     sensor: str | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, get_args, get_origin
@@ -72,7 +73,7 @@ def label_names(labels: Sequence[str | float]) -> set[str | float]:
 
 def is_interval(label: object) -> bool:
     """Whether a label is the interval of a flow, s; ``labels.flow`` checks which ones are valid."""
-    return isinstance(label, (int, float)) and not isinstance(label, bool)
+    return isinstance(label, numbers.Real) and not isinstance(label, bool)
 
 
 def labels_tree(labels: Sequence[str | float]) -> Tree:

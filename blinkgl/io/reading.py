@@ -220,3 +220,19 @@ class Declared:
 
 
 NOTHING = Declared()
+
+
+def refuse_without_frames(declared: Declared, gamma: object, delay: object) -> None:
+    """Raise ConfigError where something is declared of frames, and there are none."""
+    options = {
+        "--fps": declared.fps,
+        "--timestamps": declared.timestamps,
+        "--frames-time-unit": declared.time_unit,
+        "--white-level": declared.white_level,
+        "--range": declared.range,
+        "--background": declared.background,
+        "--gamma": gamma,
+        "--frame-delay-ms": delay,
+    }
+    if given := [name for name, value in options.items() if value is not None]:
+        raise ConfigError("there are no frames", where=", ".join(given), accepted="--frames, or nothing of frames")

@@ -17,7 +17,7 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.reading import AS_FILE, NOTHING, Damage, Declared, EventReading
+from blinkgl.io.reading import AS_FILE, NOTHING, Damage, Declared, EventReading, refuse_without_frames
 from blinkgl.recordings.clip import (
     PLAIN,
     Clip,
@@ -147,6 +147,8 @@ def calibrate(
     _keys(base, fixed)
     if still and frames is not None:
         raise ConfigError("a still scene needs no frames", where="--still", accepted="either of the two")
+    if still:
+        refuse_without_frames(declared, reading.codes.gamma, reading.delay_ms)
     if progress:
         progress("reading", 0.0)
     stream, size, notes = read_recording(recording, events, least=LEAST_EVENTS)
@@ -312,6 +314,8 @@ def _keys(base: EmulatorConfig, fixed: Iterable[str]) -> list[str]:
     if not base.fitted:
         raise ConfigError("this emulator has no parameters to fit", where="emulator", value=base.emulator)
     fixed = set(fixed)
+    if unknown := sorted(fixed - set(type(base).model_fields)):
+        raise ConfigError("no such parameter", where="--set", value=unknown[0], accepted=", ".join(base.fitted))
     if "threshold_ratio" in fixed:
         raise ConfigError(
             "the two thresholds are fitted separately, not by their ratio",

@@ -20,7 +20,7 @@ from blinkgl.io.columns import windows
 from blinkgl.io.formats import ENDINGS, EventFile, ending_of, kind_of_files, open_events
 from blinkgl.io.frames import CALLED, open_frames
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
-from blinkgl.io.reading import AS_FILE, NOTHING, Declared, EventReading
+from blinkgl.io.reading import AS_FILE, NOTHING, Declared, EventReading, refuse_without_frames
 from blinkgl.machine.kernels import kernel
 
 IEI_EDGES_US = np.logspace(0, 7, 71)
@@ -197,6 +197,8 @@ def compare(
     """
     if b is not None and frames is None and not _is_event_file(Path(b), declared.stream):
         b, frames = None, b
+    if frames is None:
+        refuse_without_frames(declared, gamma, frame_delay_ms or None)
     files = [open_events(p, reading).sized() for p in ((a,) if b is None else (a, b))]
     spans = [_span(f) for f in files]
     shifts = [s[0] if zero_time else 0 for s in spans]

@@ -75,9 +75,11 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
 
     The curve is the declared one, else the file's, else sRGB for video, else that of the sensor's own frames for grey
     integers of its size, else sRGB for integers and linear for floats. Black and white are declared, else the file's,
-    else the ends of the type, or 0 and 1 of floats. Raises ConfigError: unknown curve, a white
-    level beyond the type's codes."""
+    else the ends of the type, or 0 and 1 of floats. Raises ConfigError: unknown curve, a white level beyond the type's
+    codes. EventDataError: another type."""
     integers, notes = first.dtype.kind == "u", []
+    if integers and first.dtype not in (np.uint8, np.uint16):
+        raise _unsupported(first.dtype, "the frames")
     gamma, assumed = checked_gamma(codes.gamma), None
     if gamma is None:
         gamma = codes.transfer
@@ -110,6 +112,10 @@ def meaning(first: np.ndarray, codes: Codes) -> Meaning:
         scale = 2.0 ** (round(np.log2(white + 1)) - 8) if integers else white / 255
         levels = (16 * scale, 235 * scale) if codes.range == "limited" else (0.0, white)
     return Meaning(Decoder(gamma, levels), assumed, levels[1] if levels else None, notes)
+
+
+def _unsupported(dtype: np.dtype, where: str) -> EventDataError:
+    return EventDataError("unsupported pixel type", where=where, value=str(dtype), accepted="uint8, uint16 or float")
 
 
 class Decoder:
@@ -156,9 +162,7 @@ class Decoder:
             _luma_by_table(np.ascontiguousarray(frame), table, LUMA, out)
             return out
         if frame.dtype.kind != "f":
-            raise EventDataError(
-                "unsupported pixel type", where=name, value=str(frame.dtype), accepted="uint8, uint16 or float"
-            )
+            raise _unsupported(frame.dtype, name)
         frame = np.asarray(frame, np.float32)
         low, high = frame.min(), frame.max()
         if not (low >= 0 and high < np.inf):  # NaN fails both

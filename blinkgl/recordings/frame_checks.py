@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,7 +20,8 @@ class FrameChecks:
     def __init__(self) -> None:
         self._brightness: list[float] = []
         self._codes: np.ndarray | None = None
-        self._clipped = self._repeated = 0.0
+        """How often each code was seen; None: no integers."""
+        self._repeated = 0.0
         self._top = 0.0
         self._last: np.ndarray | None = None
 
@@ -32,9 +34,9 @@ class FrameChecks:
         self._brightness.append(float(sparse.mean()) / white)
         self._top = max(self._top, float(sparse.max()))
         if sparse.dtype.kind == "u":
-            self._codes = np.zeros(white + 1, bool) if self._codes is None or len(self._codes) <= white else self._codes
-            self._codes[sparse] = True
-            self._clipped += float(np.mean((sparse == 0) | (sparse == white)))
+            before = np.zeros(0, np.int64) if self._codes is None else self._codes
+            self._codes = np.bincount(sparse.ravel(), minlength=max(white + 1, len(before)))
+            self._codes[: len(before)] += before
         self._repeated += self._last is not None and np.array_equal(sparse, self._last)
         self._last = sparse
 
@@ -49,9 +51,10 @@ class FrameChecks:
                 bits = int(self._top).bit_length()
                 where = f"16-bit codes up to {self._top:,.0f}, where 65,535 is white"
                 yield f"{where}: --white-level {2**bits - 1} for {bits} bits"
-            if self._clipped > _CLIPPED * count:
-                share = 100 * self._clipped / count
-                yield f"{share:.0f} % of the codes are at an end: what moves there makes no events"
+            top = len(self._codes) - 1 if white is None else min(math.ceil(white), len(self._codes) - 1)
+            clipped = (self._codes[0] + self._codes[top:].sum()) / self._codes.sum()
+            if clipped > _CLIPPED:
+                yield f"{100 * clipped:.0f} % of the codes are at an end: what moves there makes no events"
             if (different := int(np.count_nonzero(self._codes))) <= _FEW_CODES:
                 yield f"frames of {different} different codes: each step from one to the next makes events at once"
         if count > 4 and _REPEATED[0] < self._repeated / (count - 1) < _REPEATED[1]:

@@ -39,7 +39,7 @@ ENDINGS = {"bin": ".bin", "npz": ".npz", "npy": ".npy"}
 def read_path(path: str | Path) -> np.ndarray:
     """Return the points of a CSV with the heading ``t,x,y``, (n, 3) float64: s, px, px. Raises AssetError: unreadable;
     ConfigError: another heading, no number, one point, times that do not increase."""
-    with input_errors(path), open(path, encoding="utf-8", newline="") as file:
+    with input_errors(path), open(path, encoding="utf-8-sig", newline="") as file:
         rows = [[field.strip() for field in row] for row in csv.reader(file) if row]
     try:
         points = np.array([[float(exact(field)) for field in row] for row in rows[1:]])
@@ -152,18 +152,23 @@ class Still:
         return f"{self.label}/{self.file.stem}{ending}".removeprefix("/")
 
 
+def _shown(folder: Path) -> list[Path]:
+    """Return what a folder holds, sorted, without the hidden entries that programs leave (``._a.png``)."""
+    return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+
+
 def stills_of(folder: Path, classes: bool) -> list[Still]:
     """Return the pictures of a folder, sorted; with ``classes`` those of its folders, each of which is a class. Raises
     AssetError: there are none; OutputError: two whose clips would have one name."""
     accepted = "a folder of one folder of pictures per class" if classes else "pictures, or --classes-from folders"
     if not folder.is_dir():
         raise AssetError("no such folder", where=str(folder), accepted=accepted)
-    places = sorted(place for place in folder.iterdir() if place.is_dir()) if classes else [folder]
+    places = [place for place in _shown(folder) if place.is_dir()] if classes else [folder]
     with input_errors(folder):
         stills = [
             Still(file, place.name if classes else "", number if classes else -1)
             for number, place in enumerate(places)
-            for file in sorted(place.iterdir())
+            for file in _shown(place)
             if file.suffix.lower() in IMAGE
         ]
     if not stills:

@@ -375,7 +375,8 @@ def file_to_events(
     frames = open_frames(source, declared)
     height, width = (frames.height, frames.width) if size is None else size
     report = SimulationReport(notes=frames.notes)
-    codes = replace(use.codes, white_level=declared.white_level, range=declared.range)
+    white, limits = declared.white_level, declared.range
+    codes = replace(use.codes, white_level=white or use.codes.white_level, range=limits or use.codes.range)
     use = replace(use, codes=codes.of(frames), keep_noise=use.keep_noise or frames.exact)
     if (height, width) != (frames.height, frames.width):
         report.fitting = Fitting((frames.height, frames.width), (height, width))

@@ -81,7 +81,7 @@ def sums(events: Events, clip: Clip, first: int, stop: int, against: GroupSums |
     height, width = clip.size
     count = stop - first
     group = groups(clip.size)
-    total = np.zeros((count, height * width, 2), np.int16)
+    total = np.zeros((count, height * width, 2), np.int32)  # a hot pixel has more than 2^15 in minutes
     isi = np.zeros((GROUPS, 2, ISI_BINS), np.int64)
     span_us = int(clip.edges_us[first]), int(clip.edges_us[stop])
     part = events.window(*span_us)

@@ -95,15 +95,16 @@ def number(value: float) -> str:
     """Return three significant digits, thousands as k, M, G."""
     if not np.isfinite(value):
         return "-"
-    for limit, suffix in ((1e9, " G"), (1e6, " M"), (1e4, " k")):
-        if abs(value) >= limit:
-            return f"{value / (1e3 if suffix == ' k' else limit):.3g}{suffix}"
+    # From where three digits of the unit below would be four.
+    for least, unit, suffix in ((999.5e6, 1e9, " G"), (999.5e3, 1e6, " M"), (1e4, 1e3, " k")):
+        if abs(value) >= least:
+            return f"{value / unit:.3g}{suffix}"
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def size(count: float) -> str:
     """Return bytes as "12.3 MB"."""
-    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"
+    return f"{count / 1e9:.3g} GB" if count >= 999.5e6 else f"{count / 1e6:.3g} MB"
 
 
 # ---------------------------------------------------------------------------------------------------------------------

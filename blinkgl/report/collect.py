@@ -41,6 +41,10 @@ class Example:
     pictures: list[tuple[str, np.ndarray]]
 
 
+RANGES = ("uniform", "log_uniform", "normal", "integer")
+"""Kinds of distributions of numbers between the last two of their parameters."""
+
+
 @dataclass
 class Parameter:
     """A distribution of the recipe, and the values of the sequences."""
@@ -254,9 +258,9 @@ def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], int
     if is_distribution(node):
         # A distribution is a table of one key, its kind.
         kind, spec = next(iter(node.items()))
-        values = [v for v in (_at(c, path) for c in configs) if v is not None]
-        if kind in ("uniform", "log_uniform", "integer"):
-            into.append(Parameter(group, ".".join(path), kind, spec, values))
+        values = [v for v in (_at(c, path) for c in configs) if v is not _MISSING]
+        if kind in RANGES:
+            into.append(Parameter(group, ".".join(path), kind, spec, [v for v in values if v is not None]))
             return
         options = [part["value"] for part in spec] if kind == "shares" else list(spec)
         # Plain options are counted as values; tables are counted by the option that fits, and may hold distributions in
@@ -294,8 +298,11 @@ def _at(config: object, path: tuple[str, ...]) -> Any:
         elif isinstance(config, dict) and key in config:
             config = config[key]
         else:
-            return None
+            return _MISSING
     return config
+
+
+_MISSING = object()
 
 
 def _fits(value: Any, option: Any) -> bool:
@@ -303,9 +310,7 @@ def _fits(value: Any, option: Any) -> bool:
     range."""
     if is_distribution(option):
         kind, spec = next(iter(option.items()))
-        return kind not in ("uniform", "log_uniform", "integer") or (
-            value is not None and float(spec[0]) <= value <= float(spec[1])
-        )
+        return kind not in RANGES or (isinstance(value, (int, float)) and float(spec[-2]) <= value <= float(spec[-1]))
     if not isinstance(option, dict) or not isinstance(value, dict):
         return isinstance(option, list) or value == option
     return all(key in value and _fits(value[key], inner) for key, inner in option.items())

@@ -12,9 +12,10 @@ from blinkgl.dataset.run_folder import whole_set
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import refuse_file, write_whole
 from blinkgl.report.charts import histogram, number, png, render, size
-from blinkgl.report.collect import Collected, Example, Parameter, collect, task_of
+from blinkgl.report.collect import RANGES, Collected, Example, Parameter, collect, task_of
 from blinkgl.sequence_files.index import write_index
 from blinkgl.sequence_files.sequence_dir import MANIFEST
+from blinkgl.types.numbers import is_number
 from blinkgl.types.trees import Tree
 
 _MAX_PICTURE_PX = 360
@@ -121,9 +122,10 @@ def _parameter(p: Parameter) -> Tree:
         "count": len(p.values),
         "counts": None,
     }
-    if p.kind not in ("uniform", "log_uniform", "integer"):
+    if p.kind not in RANGES:
         return {**shown, "counts": _counts(p)}
-    low, high = (float(v) for v in p.spec)
+    # A normal distribution has its mean and its deviation before the two ends.
+    low, high = (float(v) for v in p.spec[-2:])
     values = np.array(p.values, float)
     whole = p.kind == "integer"
     bins, span = (min(int(high - low) + 1, 40), (low - 0.5, high + 0.5)) if whole else (20, (low, high))
@@ -149,18 +151,25 @@ def _coverage(values: np.ndarray, low: float, high: float, kind: str) -> tuple[s
     return f"{hit} of 10 tenths {span} hit", int(((scaled < -1e-9) | (scaled > 1 + 1e-9)).sum())
 
 
+def _name(value: object) -> str:
+    """Return a value as the recipe and a sequence's own file both name it: 60, 60.0 and "6e1" are one."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return f"{float(str(value)):.12g}" if is_number(str(value)) else str(value)
+
+
 def _counts(p: Parameter) -> list[tuple[str, float, float | None]]:
-    counted = Counter(str(v) for v in p.values)
+    counted = Counter(map(_name, p.values))
     expected: defaultdict[str, float] = defaultdict(float)
     if p.kind == "shares":
         for part in p.spec:
-            expected[str(part["value"])] += float(part["share"])
+            expected[_name(part["value"])] += float(part["share"])
     elif p.kind == "weighted":
         total = sum(float(w) for w in p.spec.values())
-        expected |= {str(k): float(w) / total for k, w in p.spec.items()}
+        expected |= {_name(k): float(w) / total for k, w in p.spec.items()}
     else:
         for value in p.spec:
-            expected[str(value)] += 1 / len(p.spec)
+            expected[_name(value)] += 1 / len(p.spec)
     return [(key, counted[key], share * len(p.values)) for key, share in expected.items()]
 
 

@@ -54,7 +54,9 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
     inside."""
     folders: list[Path] = []
     for number, pattern in enumerate(config.folders):
-        matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
+        # A name that is there is no pattern, and nothing of the run's own place is one.
+        literal, places = resolve(pattern, base), str(resolve(pattern, Path(glob.escape(str(base)))))
+        matches = [literal] if literal.is_dir() else sorted(p for p in map(Path, glob.glob(places)) if p.is_dir())
         if not matches:
             raise ConfigError(
                 "no such folder",

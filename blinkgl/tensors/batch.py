@@ -283,7 +283,7 @@ class Batch(ABC):
                 "time stamps must increase, by at most 17 minutes",
                 where=f"environment {k}, frame {self._clock[k, 2]}",
                 value=f"{times[k]} ns",
-                accepted=f"more than {before[k]} ns" if started[k] else "less than 2^61 ns",
+                accepted=f"{before[k] + 1} to {before[k] + MAX_INTERVAL_NS} ns" if started[k] else "less than 2^61 ns",
             )
         # Avoids a division by an interval that does not exist.
         length = np.where(started, times - before, 1)
@@ -396,11 +396,12 @@ def voxel_grid(events: TensorEvents, t0_us: PerEnv, t1_us: PerEnv, bins: int) ->
     start, end = (value[env] if isinstance(value, Tensor) else int(value) for value in (t0_us, t1_us))
     last = bins - 1
     length: PerEnv = end - start
-    length = length.to(torch.float64) if isinstance(length, Tensor) else length
+    # A window without length has no bins: nothing of it counts, as below.
+    length = length.clamp(min=1).to(torch.float64) if isinstance(length, Tensor) else max(length, 1)
     place = (events.t - start).to(torch.float64) * (last / length)
     lower = place.to(torch.int64).clamp(0, last)
     weight = (place - lower).to(torch.float32)
-    inside = (events.t >= start) & (events.t <= end)
+    inside = (events.t >= start) & (events.t <= end) & torch.as_tensor(end > start, device=events.t.device)
     # Events outside the span add 0.
     sign = torch.where(events.p > 0, 1.0, -1.0) * inside
     # Both shares of an event are adjacent: a cell then adds them in the order of events, as the numba loop does.

@@ -108,7 +108,8 @@ class DeviceEsim(_OnDevice, Esim):
 
 class DeviceV2e(_OnDevice, V2e):
     """:class:`~blinkgl.events.v2e.V2e` on a torch device. A step in which the CPU would cut events by
-    ``max_events_per_step`` raises EventDataError, because files must be the same on both."""
+    ``max_events_per_step`` raises EventDataError, because files must be the same on both; the emulator cannot go on
+    after it."""
 
     _batch_kind = TensorV2e
 

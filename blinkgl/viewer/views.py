@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +87,18 @@ class CameraView:
         return 0 if self._events is None else self._events.count
 
     def label(self, t_us: int) -> int:
-        """Return the number of the last label at or before a time; the first one before that."""
+        """Return the number of the last label at or before a time; the first one before that. The last image may have
+        no labels of its own: it keeps those before it."""
+        return min(self._image(t_us), self._last_label)
+
+    def _image(self, t_us: int) -> int:
         return max(int(np.searchsorted(self._label_us, t_us, side="right")) - 1, 0)
+
+    @cached_property
+    def _last_label(self) -> int:
+        last = len(self._label_us) - 1
+        files = [label.forms[0].file for name, label in LABELS.items() if name != "images"]
+        return next((k for k in (last, last - 1) if any(self.source.has(file(k)) for file in files)), last)
 
     # ---- pictures ------------------------------------------------------------------------------------------------
 
@@ -108,7 +119,7 @@ class CameraView:
 
     def _frame(self, t_us: int) -> list[Picture]:
         """Return the image at the last label's time, with the objects' boxes and the tracks of points over it."""
-        k = self.label(t_us)
+        k = self._image(t_us)
         has_image, boxes = self.source.has(LABELS["images"].forms[0].file(k)), self._boxes(k)
         if not has_image and boxes is None and self.tracks is None:
             return []

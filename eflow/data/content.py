@@ -9,12 +9,13 @@ from pathlib import Path
 
 from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError
+from blinkgl.io.flow import READ_ENDINGS
 from eflow.checkpoint import find_weights
 from eflow.config import SourceConfig, TrainConfig
 from eflow.data.dataset import evenly
 from eflow.data.folders import below
 
-_ENDINGS = {".h5", ".hdf5", ".npz", ".npy", ".png", ".txt", ".csv", ".json", ".yaml"}
+_ENDINGS = {".h5", ".hdf5", ".npz", ".txt", ".csv", ".json", ".yaml", *READ_ENDINGS}
 _OPENED, _END = 256, 1 << 16
 """Files of which both ends are read, and the bytes of each: those of a small set whole, of a large one a sample."""
 
@@ -49,7 +50,7 @@ def _of_files(root: Path) -> str:
     """Return a digest of the names below ``root`` and sizes of all data files, and of both ends of evenly spaced ones.
     Of a recording of MVSEC ``root`` is one of its files."""
     beside = sorted(root.parent.glob(root.name.removesuffix("data.hdf5") + "*"))
-    files = [p for p in (below(root, "*") if root.is_dir() else beside) if p.suffix in _ENDINGS and p.is_file()]
+    files = [p for p in (below(root, "*") if root.is_dir() else beside) if p.suffix.lower() in _ENDINGS and p.is_file()]
     base, digest, opened = root if root.is_dir() else root.parent, hashlib.sha256(), set(evenly(len(files), _OPENED))
     for k, path in enumerate(files):
         name, size = path.relative_to(base).as_posix(), path.stat().st_size

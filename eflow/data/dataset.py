@@ -53,8 +53,8 @@ class Mixture:
     sizes : number of samples of each source. None: the source is endless
     (:class:`~eflow.data.online.OnlineSource`); its samples are used once, in order, and :data:`ENDLESS` of them count
     as an epoch.
-    weights : relative share of each source in an epoch. An epoch has as many samples as all sources together. Every
-    pass over a source has a new random order.
+    weights : relative share of each source in an epoch, at least one sample unless it is 0. An epoch has as many
+    samples as all sources together. Every pass over a source has a new random order.
     """
 
     def __init__(self, sizes: list[int | None], weights: list[float], seed: int):
@@ -67,6 +67,10 @@ class Mixture:
         counts = np.floor(share).astype(int)
         for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
             counts[i] += 1  # largest remainders: the counts add up to the total
+        # The counts of all epochs are the same, so that a source whose share is below half a sample was never drawn.
+        for i in np.flatnonzero((counts == 0) & (share > 0)):
+            counts[counts.argmax()] -= 1
+            counts[i] = 1
         self.counts = [int(c) for c in counts]
         self._epochs: Recent[int, list[Key]] = Recent(1)
         self._orders: Recent[tuple[int, int], list[int]] = Recent(1)

@@ -107,7 +107,8 @@ class MvsecSource:
     protocol : of :data:`PROTOCOLS`; at "flow" the windows of a sample are between time stamps i - 1, i, i + 1 of the
     flow.   frames : ranges [first, end) of images or flow fields to score, in place of the protocol's.   dense : score
     pixels without events, too.
-    Raises AssetError: no sequence, or one without the frames that the protocol scores. EventDataError: bad dt.
+    Raises AssetError: no sequence, none with a sample, or one without the frames that the protocol scores.
+    EventDataError: bad dt.
     ConfigError: unknown protocol."""
 
     has_backward = False
@@ -148,6 +149,10 @@ class MvsecSource:
                     accepted=" and ".join(f"{a} to {b - 1}" for a, b in ranges),
                 )
             self._index += [(s, i) for i in scored]
+        if not self._index:
+            raise AssetError(
+                "no image whose windows the ground truth covers", where=str(root), accepted="flow at the images' times"
+            )
 
     def _stamps(self, s: _MvsecSequence) -> Times:
         return s.image_us if self.protocol.at == "images" else s.flow_us

@@ -88,7 +88,8 @@ def open_online(
 
 
 def held(s: SourceConfig, count: int) -> Part:
-    """Render ``count`` samples of a recipe's test groups into memory. Raises as :func:`open_online`."""
-    with open_online(s, 0, split="test") as source:
+    """Render ``count`` samples of a recipe's test groups into memory, each another whatever its ``uses`` say. Raises as
+    :func:`open_online`."""
+    with open_online(s.model_copy(update={"uses": 1}), 0, split="test") as source:
         samples = [source[n] for n in range(count)]
     return Part(samples, range(count), all(sample.backward is not None for sample in samples))

@@ -16,8 +16,9 @@ from __future__ import annotations
 import csv
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence as SequenceOf, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Protocol
@@ -316,8 +317,16 @@ def find_dsec(root: Path) -> list[Sequence]:
             continue
         if rectify is not None and not rectify.is_file():
             raise AssetError("no rectification map beside the events", where=str(rectify))
-        sequences.append(Sequence(folder.name, folder.name, events, entries, rectify))
-    return sequences
+        sequences.append((folder, Sequence(folder.name, folder.name, events, entries, rectify)))
+    return _distinct(sequences, root)
+
+
+def _distinct(sequences: list[tuple[Path, Sequence]], root: Path) -> list[Sequence]:
+    """Return the sequences of folders below ``root``; those of the same name are called by their paths there, as a
+    scene of that name is."""
+    count = Counter(s.name for _, s in sequences)
+    called = lambda s, path: replace(s, name=path, scene=path if s.scene == s.name else s.scene)
+    return [called(s, os.path.relpath(folder, root)) if count[s.name] > 1 else s for folder, s in sequences]
 
 
 def find_blinkflow(root: Path) -> list[Sequence]:
@@ -335,10 +344,9 @@ def find_blinkflow(root: Path) -> list[Sequence]:
         entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in files.items() if i > 0)
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
         name = "/".join(parts[-2:])
-        sequences.append(
-            Sequence(name, parts[-2] if len(parts) > 1 else name, folder / "events_left/events.h5", entries)
-        )
-    return sequences
+        scene = parts[-2] if len(parts) > 1 else name
+        sequences.append((folder, Sequence(name, scene, folder / "events_left/events.h5", entries)))
+    return _distinct(sequences, root)
 
 
 def numbered(folder: Path, ending: str) -> dict[int, Path]:
@@ -440,20 +448,27 @@ def open_source(
     """Open the data set at ``path``.
 
     dt, protocol, frames, dense : for MVSEC, see :class:`~eflow.data.mvsec.MvsecSource`.
-    Raises ConfigError: one of the last three for another data set. AssetError: no data set, or a damaged index. Files
-    of single samples are opened when they are read."""
+    Raises ConfigError: one of them for another data set. AssetError: no data set, or a damaged index. Files of single
+    samples are opened when they are read."""
     root = named(Path(path))
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":
         return MvsecSource(root, dt, protocol, frames, dense)
-    for name, value, default in (("protocol", protocol, "all"), ("frames", frames, ()), ("dense", dense, False)):
-        if value != default:
-            raise ConfigError("only for MVSEC", where=name, value=value, accepted="a data set in the layout of MVSEC")
+    refuse_of_mvsec(dt=dt, protocol=protocol, frames=frames, dense=dense)
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
     if kind == "windows":
         return PoolSource(root)
-    source = FolderSource({"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[kind](root))
+    find = {"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[kind]
+    source = FolderSource(find(Path(os.path.abspath(root))))  # folders name the sequences, and `.` has no name
     if not len(source):
         raise AssetError(f"no {kind} sequence with flow labels", where=str(root))
     return source
+
+
+def refuse_of_mvsec(*, dt: int, protocol: str, frames: tuple[tuple[int, int], ...], dense: bool) -> None:
+    """Raise ConfigError if one of these options of MVSEC is asked of another data set."""
+    options = {"dt": (dt, 1), "protocol": (protocol, "all"), "frames": (frames, ()), "dense": (dense, False)}
+    for name, (value, default) in options.items():
+        if value != default:
+            raise ConfigError("only for MVSEC", where=name, value=value, accepted="a data set in the layout of MVSEC")

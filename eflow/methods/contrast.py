@@ -254,7 +254,8 @@ class ContrastMaximisation:
     def __call__(self, old: Window, new: Window, height: int, width: int) -> Flow:
         """Return the flow over the new window, see :class:`eflow.methods.Method`."""
         cloud = _Cloud.of([old, new], height, width)
-        span = 2.0  # windows: the search is for the flow over both, the result is that over the new one
+        # The search is for the flow over both windows, the result is that over the new one.
+        span = (new.t1 - old.t0) / (new.t1 - new.t0)
         make = self._family(height, width)
         field = make(cloud.x, cloud.y)
         maxima = [self._from(cloud, field, start) for start in self._starts(cloud, field)]

@@ -51,8 +51,9 @@ def toward_dominant(flow: Flow, hit: Mask) -> Flow:
     """Return the flow (H, W, 2) px with each vector drawn towards the dominant motion: by a share of
     1 / (1 + (distance / d)²), where d is :data:`NEAR` of that motion's median length, times 1 where all of the flow is
     nearly affine, falling to 0 where it is not (:data:`AFFINE`, :data:`OTHER`). What moves its own way is far off and
-    stays. hit : (H, W) pixels with events; of fewer than :data:`LEAST_PIXELS` the flow is returned as it is."""
-    if np.count_nonzero(hit) < LEAST_PIXELS:
+    stays. hit : (H, W) pixels with events; of fewer than :data:`LEAST_PIXELS`, and with NaN or infinity anywhere, the
+    flow is returned as it is."""
+    if np.count_nonzero(hit) < LEAST_PIXELS or not np.isfinite(flow).all():
         return flow
     affine, off = dominant_motion(flow, hit)
     alone = np.clip((OTHER - off) / (OTHER - AFFINE), 0, 1)

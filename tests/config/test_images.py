@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from blinkgl.config.images import check_images
+from blinkgl.config.images import check_images, exposure_starts
 from blinkgl.config.problems import Refused
 from blinkgl.config.run import load_run
 from blinkgl.dataset.report import config_yaml
@@ -102,3 +102,14 @@ def test_an_exposure_as_long_as_the_sequence_fits(exposure_us):
     check_images(1e-3, None, float(exposure_us), 0.0, 0.0, exposure_us * 1e-6)
     with pytest.raises(Refused, match="no exposure fits"):
         check_images(1e-3, None, float(exposure_us), 0.0, 0.0, (exposure_us - 1) * 1e-6)
+
+
+def test_no_exposure_starts_where_none_fits(tmp_path):
+    """Of a window shorter than an exposure, and of times outside a window."""
+    images = read(tmp_path, images={"rate": 30, "exposure_us": 20_000}).sequence(0).images
+    count = lambda span_ms: len(exposure_starts(images, 0, round(span_ms * 1e6), 1))
+    assert [count(ms) for ms in (0, 10, 19.999, 20, 53.3, 53.4)] == [0, 0, 0, 1, 1, 2]
+    listed = read(tmp_path, images={"times": [0.1, 0.2], "exposure_us": 20_000}).sequence(0).images
+    starts = lambda a, b: exposure_starts(listed, round(a * 1e9), round(b * 1e9), 1)
+    assert starts(0, 1) == [10**8, 2 * 10**8] and starts(0.15, 1) == [2 * 10**8] and starts(0, 0.21) == [10**8]
+    assert starts(0.1, 0.12) == [10**8] and starts(0.101, 0.119) == []

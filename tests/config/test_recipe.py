@@ -354,3 +354,30 @@ def test_the_normal_distribution():
     for bad in ([1, 2], [0, 1, 1, 2], [0, 0, -1, 1], [0, 1, -1, "x"]):
         with pytest.raises(ConfigError, match="not a normal distribution"):
             draw({"c": {"normal": bad}}, 0, 0)
+
+
+def test_naming_the_kind_that_a_table_has_anyway_changes_nothing(tmp_path):
+    """In a group, and over a scene from another file: tables of the default kind are merged with those that name it."""
+    (tmp_path / "world.yaml").write_text(yaml.safe_dump({"scene": {"objects": {"count": 3}, "background": 0.7}}))
+    common = {"events": {"contrast_threshold": 0.4}, "timeline": {"max_px": 0.25}, "scene": {"from": "world.yaml"}}
+    common["scene"]["camera_motion"] = {"speed": [1, 2]}
+    own = {"events": {"refractory_us": 100}, "timeline": {"min_step_us": 100}}
+    named = {
+        key: {**table, **tag}
+        for (key, table), tag in zip(own.items(), ({"emulator": "esim"}, {"kind": "displacement"}))
+    }
+    named["scene"] = {"kind": "random", "camera_motion": {"kind": "spline", "rotation_rate": [3, 4]}}
+    other = {"events": {"emulator": "v2e"}, "timeline": {"kind": "uniform"}}
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump({**common, "groups": {"a": own, "b": named, "c": other}}))
+    a, b, c = (group.template.sequence(0) for group in load_run(tmp_path / "r.yaml").groups)
+    assert (a.events, a.timeline) == (b.events, b.timeline) and a.events.contrast_threshold == 0.4
+    assert (b.scene.objects.count, b.scene.background, b.scene.camera_motion.speed) == (3, 0.7, (1, 2))
+    assert c.events.contrast_threshold != 0.4 and c.timeline.kind == "uniform"
+
+
+@pytest.mark.parametrize("text", ["1e-1", "'0.1'", "0.1"])
+def test_a_threshold_written_as_text_has_its_spread(tmp_path, text):
+    """YAML 1.1 reads 1e-1 as text, which numbers may be."""
+    (tmp_path / "r.yaml").write_text(f"events: {{contrast_threshold: {text}}}\n")
+    events = load_run(tmp_path / "r.yaml").sequence(0).events
+    assert events.contrast_threshold == 0.1 and events.threshold_sigma == pytest.approx(0.0105)

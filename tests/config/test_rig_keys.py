@@ -222,3 +222,20 @@ def test_a_camera_beside_an_inertial_unit_stays():
 def test_a_key_that_would_not_be_used_is_refused(keys, said):
     line = refused(f"sensors: [{{name: right}}, {{name: left, {keys}}}]")
     assert f"sensors.1.{said}; expected events: {{}} beside it, or without this key" in line
+
+
+def test_cameras_of_euroc_are_where_their_files_say(tmp_path):
+    """T_BS is the camera's pose on the body; a ``place`` of the recipe's own comes first."""
+    for k, x in ((0, 0.0), (1, 0.11)):
+        (tmp_path / f"cam{k}.yaml").write_text(
+            f"T_BS: {{cols: 4, rows: 4, data: [0,-1,0,{x}, 1,0,0,0.02, 0,0,1,0, 0,0,0,1]}}\nresolution: [752, 480]\n"
+            "camera_model: pinhole\nintrinsics: [458.7, 457.3, 367.2, 248.4]\n"
+            "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
+        )
+    cameras = [{"name": f"c{k}", "camera": {"calibration": f"cam{k}.yaml"}} for k in (0, 1)]
+    cameras.append({**cameras[1], "name": "own", "place": {"position": [5, 0, 0]}})
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump({"sensors": cameras}))
+    places = [one.place.T for one in load_run(tmp_path / "r.yaml").sequence(0).sensors]
+    for T, position in zip(places, ([0, 0.02, 0], [0.11, 0.02, 0])):
+        np.testing.assert_allclose(T[:3], [[0, -1, 0, position[0]], [1, 0, 0, 0.02], [0, 0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(places[2][:3, 3], [5, 0, 0])

@@ -252,3 +252,22 @@ def test_the_error_of_the_setting_is_that_of_the_measured_suite(tmp_path, qualit
         quality=quality
     )
     assert "not measured" in words(timeline={"kind": "uniform", "fps": 77})
+
+
+def test_a_rig_says_once_what_all_cameras_have_and_the_rest_by_name(tmp_path):
+    sensors = [
+        {"name": "ev", "events": {"emulator": "esim"}, "labels": {"flow": [], "images": False, "depth": True}},
+        {"name": "fr", "images": {"rate": 30}, "labels": {"flow": ["forward"]}},
+        {"name": "unit", "imu": {"rate": 200}},
+    ]
+    told = explain(template(tmp_path, sensors=sensors, labels={}))
+    names = [one.name for one in told.passes]
+    assert {"ev: event frames", "ev: labels", "fr: labels", "fr: frame camera", "unit: inertial unit"} <= set(names)
+    assert "fr: event kernel" not in names and len(names) == len(set(names))
+    left = [what for what, _ in told.left_out]
+    assert len(left) == len(set(left)) and not any("inertial unit" in what for what in left)
+    assert "fr: depth" in left and not {"depth", "ev: depth"} & set(left) and "normals" in left
+    assert "triangles" in told.scene and not any(key.endswith(": triangles") for key in told.scene)
+    one, two = (explain(template(tmp_path, rig=name)) for name in (None, "stereo"))
+    assert [what for what, _ in two.left_out if not what.startswith(("left: ", "right: "))]
+    assert len(two.left_out) < 1.5 * len(one.left_out)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from blinkgl.errors import AssetError  # noqa: E402
-from eflow.checkpoint import load_model, metadata_of, read_state, write_tensors  # noqa: E402
+from eflow.checkpoint import keep_best, load_model, metadata_of, read_state, read_tensors, write_tensors  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 
 
@@ -41,3 +42,12 @@ def test_states_without_a_step(tmp_path, step):
     (tmp_path / "state.json").write_text(json.dumps({"format": "eflow-1", "step": step}))
     with pytest.raises(AssetError, match="state.json: damaged"):
         read_state(tmp_path)
+
+
+def test_the_best_weights_after_a_score_of_nan(tmp_path):
+    model = build_model(model_config({"name": "ev_flownet", "width": 4}))
+    kept = []
+    for step, score in enumerate((math.nan, math.nan, 0.5, math.nan, 0.7, 0.3)):
+        keep_best(tmp_path, model, None, step, score)
+        kept.append(int(read_tensors(tmp_path / "best.safetensors")[1]["step"]))
+    assert kept == [0, 0, 2, 2, 2, 5]

@@ -95,3 +95,31 @@ def test_an_empty_start_without_a_network_is_a_missing_network(tmp_path):
     path.write_text('init_from: ""\ndata: {train: [{path: set}], crop: [64, 64]}\n', encoding="utf-8")
     with pytest.raises(ConfigError, match="model: is required; expected a table of keys"):
         load_train_config(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "said"),
+    [
+        ("data: [1]", {"data": ["set"]}, "data: not a table of keys (got [1])"),
+        (
+            "data: {train: [{path: set}], crop: [64, 64]}\noptim: 3",
+            {"minutes": 5},
+            "optim: not a table of keys (got 3)",
+        ),
+    ],
+)
+def test_a_section_that_is_no_table(text, options, said, tmp_path):
+    path = tmp_path / "train.yaml"
+    path.write_text(f"model: {{name: ev_flownet}}\n{text}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_train_config(path, **options)
+    assert str(caught.value).startswith(said)
+
+
+def test_without_a_file_nothing_is_scaled_unless_asked_for():
+    model, data = {"name": "ev_flownet"}, ["set"]
+    augment = load_train_config(None, ["data.augment.horizontal_flip=0"], model=model, data=data).data.augment
+    assert (augment.horizontal_flip, augment.scale_probability) == (0, 0)
+    own = ["data.augment.scale_probability=0.2", "data.crop=[64,64]"]
+    assert load_train_config(None, own, model=model, data=data).data.augment.scale_probability == 0.2
+    assert load_train_config(None, ["data.augment=null"], model=model, data=data).data.augment is None

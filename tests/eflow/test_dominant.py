@@ -72,3 +72,9 @@ def test_a_few_pixels_say_nothing():
 def test_silent_and_still():
     nothing = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     assert not toward_dominant(nothing, everywhere()).any()
+
+
+def test_flow_that_is_not_finite_is_left():
+    flow = np.ones((HEIGHT, WIDTH, 2), np.float32)
+    flow[3, 4, 0] = np.nan
+    assert toward_dominant(flow, everywhere()) is flow

@@ -294,7 +294,18 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
         (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is not a network (got True)"),
         (["contrast-affine", "E", "--views", "4"], "error: --views: contrast-affine is not a network (got 4)"),
         (["NETWORK", "E", "--views", "3"], "error: --views: unknown choice (got '3'); expected 1, 4, 8"),
-        (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method uses it (got 200.0); expected contrast-"),
+        (["NETWORK", "E", "--focal", "200"], "error: --focal: only a rotation uses it (got 200.0); expected contrast-"),
+        (
+            ["contrast-affine", "E", "--focal", "200"],
+            "error: --focal: only a rotation uses it (got 200.0); expected con",
+        ),
+        (
+            ["NETWORK", "E", "--whole"],
+            "error: --end-ms: the whole file has no limits (got 200.0); expected --window-ms",
+        ),
+        (["NETWORK", "E", "--npy"], "error: --npy: no folder to write to; expected --out FOLDER"),
+        (["NETWORK", "E", "--at-events"], "error: --at-events: no folder to write to; expected --out FOLDER"),
+        (["NETWORK", "E", "--at", ".5"], "error: --at: nothing is written (got '.5'); expected --out or --video"),
     ],
 )
 def test_methods_refuse_what_they_cannot(network, arguments, says, tmp_path, capsys):
@@ -365,6 +376,48 @@ def test_submit_blinkflow(network, tmp_path):
         data = archive.read("scene_a/seq_0/100_200.flo")
     assert int.from_bytes(data[:4], "little") == 2502002 and len(data) == 12 + 8 * 120 * 160
     assert submit.decode(data).shape == (19200, 2)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["SET", "--refine"], "--refine: contrast-affine is not a network (got True)"),
+        (["SET", "--dt", "4"], "dt: only for MVSEC (got 4); expected a data set in the layout of MVSEC"),
+        (["r.yaml", "--dt", "4"], "dt: only for MVSEC (got 4)"),
+        (["r.yaml", "--protocol", "e-raft"], "protocol: only for MVSEC (got 'e-raft')"),
+        (["r.yaml", "--frames", "1-2"], "frames: only for MVSEC (got ((1, 3),))"),
+        (["r.yaml", "--dense"], "dense: only for MVSEC (got True)"),
+    ],
+)
+def test_scoring_refuses_options_that_it_would_not_use(data, words, says, capsys):
+    assert run(["evaluate", "contrast-affine", *(str(data) if word == "SET" else word for word in words)]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {says}")
+
+
+def test_one_flow_of_a_whole_file_has_the_times_of_all_of_it(refined, monkeypatch, tmp_path, capsys):
+    """A network of two windows says the motion of the second half, here 1.5 px, which is short for it."""
+    events = moving_events(128, 144, 0, 2 * SPAN)
+    write_events(tmp_path / "e.h5", events, 128, 144)
+    half = lambda self, window: (np.full((128, 144, 2), (1.5, 0), np.float32), np.zeros((2, 128, 144), np.float32))
+    monkeypatch.setattr(infer.Predictor, "__call__", half)
+    out = tmp_path / "flow"
+    assert run(["predict", refined, str(tmp_path / "e.h5"), "--whole", "--at", ".5,1", "--out", str(out), "--npy"]) == 0
+    first, last = int(events.t[0]), int(events.t[-1])
+    ends = [first + round((last + 1 - first) / 2), last + 1]
+    assert (out / "timestamps.txt").read_text().splitlines()[1:] == [f"{first}, {end}" for end in ends]
+    assert [np.load(out / f"npy/00000{k}.npy")[9, 9, 0] for k in (0, 1)] == pytest.approx([1.5, 3], rel=1e-4)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"t {first} us") and "  1 of 1 flows are below 2 px" in lines[1]
+
+
+def test_flow_beyond_dsecs_range_is_counted(network, monkeypatch, tmp_path, capsys):
+    flow = np.zeros((64, 72, 2), np.float32)
+    flow[3, :5], flow[4, :2] = (256, 0), (0, -256)  # -256 is the last that the PNG holds
+    monkeypatch.setattr(infer.Predictor, "__call__", lambda *_: (flow, np.zeros((2, 64, 72), np.float32)))
+    write_events(tmp_path / "e.h5", moving_events(64, 72, 0, 3 * SPAN), 64, 72)
+    command = ["predict", network, str(tmp_path / "e.h5"), "--window-ms", "140", "--out", str(tmp_path / "flow")]
+    assert run(command) == 0
+    assert "  10 flows beyond ±256 px are not valid in the PNGs" in capsys.readouterr().out, "five in two windows"
 
 
 def test_a_silent_window(network, tmp_path, capsys):

@@ -245,6 +245,30 @@ def test_refused_sizes(name, size, message):
         predict(model, batch_for(model, 1, 24, 24))
 
 
+@pytest.mark.parametrize("features", [48, 112, 176])
+def test_heads_divide_the_features(features):
+    model = build(name="eflowformer", size="tiny", features=features, iterations=1).eval()
+    assert model(batch_for(model, 1, 64, 64)).flow.shape == (1, 2, 64, 64)
+
+
+def test_heads_of_the_sizes_as_published():
+    heads = lambda **tree: {layer.local.heads for layer in build(name="eflowformer", layers=1, **tree).layers}
+    assert [heads(size=size) for size in ("base", "small", "tiny")] == [{8}, {4}, {4}]
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"trunk": [8, 8, 9]}, r"model.trunk: not widths \(got \[8, 8, 9\]\); expected an even last width"),
+        ({"input": {"normalise": "all"}}, r"model.input.normalise: not with quick \(got 'all'\)"),
+    ],
+)
+def test_what_quick_cannot_be(keys, said):
+    with pytest.raises(BlinkGLError, match=said):
+        model_config({"name": "eflowformer", "quick": True, **keys})
+    assert build(name="eflowformer", size="tiny", layers=1, **keys)
+
+
 def test_loss_by_hand():
     valid = torch.tensor([[[True, True, False]]])
     target = torch.tensor([[[[1.0, 2.0, float("nan")]], [[0.0, 0.0, float("nan")]]]])

@@ -19,7 +19,7 @@ from blinkgl.online.job import MIX  # noqa: E402
 from eflow.checkpoint import newest  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.data.dataset import Mixture, StepSampler  # noqa: E402
-from eflow.data.online import open_online  # noqa: E402
+from eflow.data.online import held, open_online  # noqa: E402
 from eflow.load_config import load_train_config  # noqa: E402
 from eflow.train import train  # noqa: E402
 from small_recipe import RECIPE, asked, said  # noqa: E402
@@ -60,6 +60,11 @@ def test_a_sample_is_used_again_and_again_far_apart_and_then_dropped(recipe, mon
         with pytest.raises(EventDataError, match="taken"):
             source[0]
         assert source.stream.peek(whole - uses * apart)  # kept for one distance more than its last use
+
+
+def test_samples_to_validate_with_are_used_once(recipe):
+    samples = held(asked(recipe, window_ms=(5, 30), uses=4), 6)
+    assert len({said(samples[k]) for k in range(6)}) == 6
 
 
 def test_ranks_take_their_own_streams_one_sample_after_the_other():
@@ -198,6 +203,10 @@ def test_trains_without_files_and_resumes_exactly(tmp_path, recipe, monkeypatch,
         ({"path": "a", "online": True}, "a folder is not rendered"),
         ({"recipe": "b", "online": True, "window_ms": [100, 5]}, "window_ms"),
         ({"recipe": "b.yaml", "online": True, "workers": 0}, "loader processes do not render"),
+        ({"recipe": "b.yaml", "online": True, "dt": 4}, "data.train.0.dt: only for a folder (path) (got 4)"),
+        ({"path": "a", "uses": 4}, "data.train.0.uses: only for a recipe (got 4)"),
+        ({"path": "a", "window_ms": [5, 50]}, "data.train.0.window_ms: only for a recipe (got (5.0, 50.0))"),
+        ({"path": "a", "set": ["a.b=c"]}, "data.train.0.set: only for a recipe"),
     ],
 )
 def test_sources_that_make_no_sense(tmp_path, source, said):

@@ -39,6 +39,14 @@ def test_every_sample_once_per_epoch_in_a_new_order():
     assert [again.key(n) for n in (30, 2, 13)] == [epochs[2][6], epochs[0][2], epochs[1][1]]  # any order of asking
 
 
+def test_a_source_of_a_small_share_is_drawn_in_every_epoch():
+    mixture = Mixture([3, 3, 20], [1, 0.001, 0.001], seed=0)
+    for epoch in range(3):
+        sources = [key.source for key in mixture.epoch(epoch)]
+        assert [sources.count(k) for k in range(3)] == [24, 1, 1]
+    assert Mixture([3, 3], [1, 0], seed=0).counts == [6, 0]
+
+
 def equal(a: dict, b: dict) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) if torch.is_tensor(a[k]) else a[k] == b[k] for k in a)
 

@@ -188,8 +188,17 @@ def test_what_is_asked_of_mvsec_alone(tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             open_source(root, **options)
+    with pytest.raises(ConfigError, match="dt: only for MVSEC"):
+        open_source(blinkgl_set(tmp_path / "d", sequences=1, labels=1), dt=4)
     with pytest.raises(ConfigError, match="protocol: only for MVSEC"):
         open_source(blinkgl_set(tmp_path / "b", sequences=1, labels=1), protocol="e-raft")
+
+
+def test_mvsec_whose_flow_is_of_another_time(tmp_path):
+    path = mvsec_set(tmp_path) / "indoor_flying1_gt_flow_dist.npz"
+    stored = dict(np.load(path))
+    np.savez(path, **{**stored, "timestamps": stored["timestamps"] + 100})
+    refused("no image whose windows the ground truth covers", lambda: open_source(tmp_path))
 
 
 def test_propagation_through_successive_fields():
@@ -260,6 +269,44 @@ def test_a_sequence_that_is_being_written_is_no_data_yet(tmp_path, make):
     (temporary_beside(root / "next.h5")).symlink_to(root / "gone")
     source = open_source(root)
     assert [source[k].name for k in range(len(source))] == names and content_of(config) == content
+
+
+@pytest.mark.parametrize("ending", [".flo", ".pfm", ".flo5", ".PNG"])
+def test_other_labels_are_another_content(tmp_path, ending):
+    label = tmp_path / f"set/flow/forward/000000{ending}"
+    label.parent.mkdir(parents=True)
+    config = load_train_config(config_file(tmp_path, tmp_path / "set"))
+    digests = []
+    for data in (b"1", b"2"):
+        label.write_bytes(data)
+        digests.append(content_of(config))
+    assert digests[0] != digests[1]
+
+
+def test_recordings_of_one_name_are_two(tmp_path):
+    for day, names in (("mon", ("rec", "own")), ("tue", ("rec",))):
+        dsec_set(tmp_path / "dsec" / day, names, labels=1)
+    source = open_source(tmp_path / "dsec")
+    assert [source[k].name for k in range(3)] == ["own/000002", "mon/rec/000002", "tue/rec/000002"]
+    assert [source[k].scene for k in range(3)] == ["own", "mon/rec", "tue/rec"]
+    root = blinkflow_set(tmp_path / "blinkflow", labels=2)
+    shutil.copytree(root / "test", root / "train")
+    source = open_source(root)
+    assert [source[k].name for k in range(2)] == [f"{split}/scene_a/seq_0/000001" for split in ("test", "train")]
+    assert source[0].scene == source[1].scene == "scene_a"
+
+
+@pytest.mark.parametrize(
+    ("kind", "folder", "name"),
+    [
+        ("blinkgl", "train/seq_000000", "seq_000000/000000"),
+        ("dsec", "thun_00_a", "thun_00_a/000002"),
+        ("blinkflow", "test/scene_a/seq_0", "scene_a/seq_0/000001"),
+    ],
+)
+def test_a_sequence_opened_from_inside_has_its_name(sets, monkeypatch, kind, folder, name):
+    monkeypatch.chdir(sets[kind] / folder)
+    assert open_source(".")[0].name == name
 
 
 def test_folders_without_data(tmp_path):

@@ -16,7 +16,10 @@ from blinkgl import cli  # noqa: E402
 from blinkgl.errors import AssetError  # noqa: E402
 from blinkgl.io.flow import encode_flo  # noqa: E402
 from eflow.cli import run  # noqa: E402
+from eflow.config import TrainConfig  # noqa: E402
 from eflow.data.sources import open_source, parts_of  # noqa: E402
+from eflow.models import build_model  # noqa: E402
+from eflow.training_data import validate, validation_sets  # noqa: E402
 from flow_data import blinkgl_set, mvsec_set  # noqa: E402
 
 FAST = (
@@ -162,3 +165,25 @@ def test_nan_of_given_flow_is_not_valid(tmp_path):
         np.save(data / f"clip/flow/forward/{k:06d}.npy", flow)
     with pytest.raises(AssetError, match=r"000000\.npy: flow is NaN or infinite at pixel \(0, 0\) and marked valid"):
         open_source(data)[0]
+
+
+def test_validation_sets_of_one_name_have_scores_of_their_own(tmp_path):
+    """Folders of one name are called by the one above, too; those listed twice by numbers."""
+    places = [blinkgl_set(tmp_path / k, 2, 1, 64, 64, False) / "train" for k in "ab"]
+    (tmp_path / "set.v1").symlink_to(places[0])
+
+    def names(train, held) -> list[str]:
+        tree = {"model": {"name": "ev_flownet", "width": 4}, "data": {"crop": [64, 64], "train": train}}
+        tree["data"]["validate_on"] = held
+        config = TrainConfig(**tree)
+        model = build_model(config.model)
+        sets = validation_sets(config, model)
+        scores = validate(model, None, sets, "fp32")
+        assert list(scores) == [f"{name}/{kind}" for name, *_ in sets for kind in ("AEE", "zero")]
+        return [name for name, *_ in sets]
+
+    a, b, v1 = ({"path": str(p)} for p in (*places, tmp_path / "set.v1"))
+    assert names([a], [a]) == ["train"]
+    assert names([a], [v1, b, a]) == ["set.v1", "b/train", "a/train"]
+    assert names([a], [a, b, a]) == ["a/train#1", "b/train", "a/train#3"]
+    assert names([a, b], [{"share": 0.3}]) == ["a/train", "b/train"]

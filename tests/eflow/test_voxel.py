@@ -5,8 +5,9 @@ import pytest
 
 from blinkgl.errors import EventDataError
 from eflow.data.representation import CountsAndTimes, CountSlices, VoxelGrid
-from eflow.data.window import Window
+from eflow.data.window import StreamWindow, Window
 from eflow.ops import voxel
+from eflow.writers import Answer, near_events
 
 H, W = 13, 17
 
@@ -80,3 +81,11 @@ def test_counts_against_a_histogram():
     slice_ = (w.t - w.t0) * 5 // (w.t1 - w.t0)
     expected, _ = np.histogramdd(np.stack([slice_, w.p, w.y, w.x], 1), bins=[np.arange(n + 1) for n in (5, 2, H, W)])
     np.testing.assert_array_equal(counts, expected)
+
+
+def test_pixels_near_events_whatever_the_tensor_says():
+    """A grid that is normalised over all cells is nowhere 0."""
+    one = Window(*(np.array([v], d) for v, d in ((6, "u2"), (5, "u2"), (5, "i8"), (1, "u1"))), 0, 10)
+    grid = VoxelGrid(5, "all")(one, H, W)
+    near = near_events(Answer(StreamWindow(0, one, one), np.zeros((H, W, 2), np.float32), grid))
+    assert (grid != 0).all() and near.sum() == 49 and near[2:9, 3:10].all()

@@ -99,6 +99,7 @@ ELSEWHERE = {
     "another --out, or --resume after it has ended": "dataset/test_faults.py",
     "pictures, or --classes-from folders": "recordings/test_saccades.py",
     "--frames, or --still for a static scene": "recordings/test_calibration.py",
+    "--frames, or nothing of frames": "recordings/test_frame_noise.py",
 }
 """Texts whose remedy does not read a file -> the test that runs the option."""
 

@@ -300,3 +300,18 @@ def test_tiles_of_a_clip_are_shown_in_rows():
     assert shown[::TILE_PX, ::TILE_PX].tolist() == [[0, 1, 2], [3, 4, 0]]
     whole = np.ones((3 * TILE_PX, 2 * TILE_PX))
     assert mosaic(whole) is whole
+
+
+@pytest.mark.parametrize("each", [40_000, 75_000])
+def test_events_of_a_hot_pixel_are_counted_whole(each):
+    """In every eighth of a recording more of one polarity than 16 bits hold."""
+    n = 8 * each
+    events = Events(*(np.full(n, k, np.uint16) for k in (5, 6)), np.arange(n) * 10, np.ones(n, np.uint8))
+    got = sums(events, clip_of_still(events, (16, 16)), 0, 8)
+    assert got.both.sum() == got.both[6 * 16 + 5] == n and got.still.sum() == n
+
+
+def test_a_parameter_that_is_not_there_cannot_be_kept(tmp_path):
+    recording = still_recording(tmp_path, shot_noise_rate_hz=3.0)
+    with pytest.raises(ConfigError, match=r"--set: no such parameter \(got 'contrast_treshold'\)"):
+        calibrate(recording, still=True, starts=1, fixed=["contrast_treshold"])

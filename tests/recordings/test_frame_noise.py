@@ -11,6 +11,7 @@ import skimage.data
 
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig
+from blinkgl.errors import EventDataError
 from blinkgl.events import Events
 from blinkgl.io.frames import open_frames
 from blinkgl.recordings.clip import FrameReading, clip_of_frames, read_recording, timed_frames
@@ -348,3 +349,47 @@ def test_the_frame_camera_of_a_sequence_says_what_it_is(tmp_path, noise):
 def test_the_distance_of_codes_is_that_of_256(levels, dtype):
     """Of linear codes it is 1/255 everywhere, however many of them lie between black and white."""
     assert Decoder("linear", levels).code_distance(dtype)(0.5) * 255 == pytest.approx(1, rel=1e-3)
+
+
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint8, 255), (np.uint16, 1023), (np.uint16, 65535)])
+def test_codes_at_the_declared_white_are_at_an_end(tmp_path, capsys, dtype, white):
+    """Half of the pixels are clipped, whatever code is white; a tenth below it none is."""
+    for top, said in ((white, True), (round(0.9 * white), False)):
+        frames = np.random.default_rng(0).integers(white // 4, white // 2, (6, 48, 64)).astype(dtype)
+        frames[:, :24] = top
+        np.save(tmp_path / "v.npy", frames)
+        words = ["--white-level", str(white)] if white == 1023 else ["--range", "full"]
+        line = ["simulate", str(tmp_path / "v.npy"), "--fps", "100", *words, "--out", str(tmp_path / "e.h5")]
+        assert run([*line, "--overwrite"]) == 0
+        assert ("50 % of the codes are at an end" in capsys.readouterr().out) == said
+
+
+@pytest.mark.parametrize("dtype", [np.uint32, np.uint64, np.int32])
+def test_other_integers_are_refused_before_anything_is_made_of_them(dtype):
+    with pytest.raises(EventDataError, match=r"unsupported pixel type .*expected uint8, uint16 or float"):
+        events_of(np.zeros((3, 8, 8), dtype))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--fps", "10"], ["--gamma", "2.2"], ["--white-level", "9"], ["--range", "full"], ["--timestamps", "nothing.txt"],
+     ["--background", "black"], ["--frames-time-unit", "us"], ["--frame-delay-ms", "3"]],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_what_is_declared_of_frames_needs_frames(tmp_path, capsys, options):
+    np.savez(
+        tmp_path / "e.npz", t_us=np.arange(2000) * 10, x=np.ones(2000, int), y=np.ones(2000, int), p=np.ones(2000, int)
+    )
+    for command in (
+        ["compare", str(tmp_path / "e.npz")],
+        ["calibrate", str(tmp_path / "e.npz"), "--still", "--out", str(tmp_path / "o.yaml")],
+    ):
+        assert run([*command, *options]) == 2
+        said = capsys.readouterr().err
+        assert f"{options[0]}: there are no frames; expected --frames, or nothing of frames" in said
+    np.save(tmp_path / "v.npy", scene(6, 2.0).astype(np.float32)[:, :4, :4])
+    assert run(["compare", str(tmp_path / "e.npz")]) == 0
+    assert (
+        run(["compare", str(tmp_path / "e.npz"), "--size", "4x4", "--frames", str(tmp_path / "v.npy"), "--fps", "300"])
+        == 0
+    )

@@ -10,7 +10,7 @@ from scipy.integrate import dblquad
 
 from blinkgl.cli import run
 from blinkgl.io.formats import open_events
-from blinkgl.recordings.saccades import SACCADES, Clips, linear_light, positions
+from blinkgl.recordings.saccades import SACCADES, Clips, linear_light, positions, read_path, stills_of
 from blinkgl.recordings.simulation import emulator_config
 
 IDEAL = ["--set", "threshold_sigma=0"]
@@ -212,3 +212,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, options, con
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
+
+
+def test_hidden_files_and_folders_are_no_pictures_and_no_classes(tmp_path):
+    for place in ("cat/a.png", "dog/b.png", ".ipynb_checkpoints/a.png", "dog/._b.png"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / place), np.zeros((4, 4), np.uint8))
+    found = [(one.label, one.number, one.file.name) for one in stills_of(tmp_path, classes=True)]
+    assert found == [("cat", 0, "a.png"), ("dog", 1, "b.png")]
+
+
+def test_a_path_of_a_spreadsheet_begins_with_a_mark(tmp_path):
+    (tmp_path / "p.csv").write_text("t,x,y\n0,0,0\n1,2,3\n", encoding="utf-8-sig")
+    assert read_path(tmp_path / "p.csv").tolist() == [[0, 0, 0], [1, 2, 3]]

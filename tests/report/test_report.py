@@ -16,8 +16,8 @@ from blinkgl.config.run import load_run
 from blinkgl.dataset.run import run_dataset
 from blinkgl.report import charts
 from blinkgl.report.charts import histogram
-from blinkgl.report.collect import Parameter, collect
-from blinkgl.report.page import _counts
+from blinkgl.report.collect import Parameter, _walk, collect
+from blinkgl.report.page import _counts, _parameter
 
 RECIPE = {
     "seed": 5,
@@ -217,3 +217,32 @@ def test_bars_of_counts_stand_apart_and_are_labelled_by_counts():
 def test_expected_counts_add_up_to_those_drawn(kind, spec):
     rows = _counts(Parameter("run", "output.label", kind, spec, ["b", "a", "b", "b", "b", "b", "b", "b"]))
     assert sorted(rows) == [("a", 1, pytest.approx(2.0)), ("b", 7, pytest.approx(6.0))]
+
+
+def test_numbers_are_counted_however_they_are_written():
+    """A sequence's own file has 60.0 where the recipe has 60, and null is an option like another."""
+    spec = [60, 8e-1, None, True, "60 Hz"]
+    rows = _counts(Parameter("run", "a", "choice", spec, [60.0, 0.8, 0.8, None, True, "60 Hz"]))
+    assert {name: count for name, count, _ in rows} == {"60": 1, "0.8": 2, "null": 1, "true": 1, "60 Hz": 1}
+    assert sum(share for *_, share in rows) == pytest.approx(6)
+
+
+def test_a_normal_distribution_is_a_range():
+    spec, values = [0.2, 0.03, 0.1, 0.3], [0.18, 0.21, 0.22, 0.31]
+    shown = _parameter(Parameter("run", "events.contrast_threshold", "normal", spec, values))
+    assert shown["counts"] is None and shown["outside"] == 1 and (shown["histogram"].left, shown["histogram"].right)
+    assert "of [0.1, 0.3]" in shown["coverage"]
+
+
+def test_options_of_null_are_found_in_the_sequences():
+    into: list[Parameter] = []
+    _walk("run", {"a": {"choice": [None, 5]}, "b": {"choice": [1, 2]}}, (), [{"a": None, "b": 1}, {"a": 5}], into)
+    assert [(one.path, one.values) for one in into] == [("a", [None, 5]), ("b", [1])]
+
+
+@pytest.mark.parametrize(
+    ("value", "short", "bytes_"),
+    [(9999, "9999", "0.01 MB"), (999_400, "999 k", "0.999 MB"), (999_600, "1 M", "1 MB"), (999.6e6, "1 G", "1 GB")],
+)
+def test_numbers_are_short_at_every_unit(value, short, bytes_):
+    assert charts.number(value) == short and charts.size(value) == bytes_

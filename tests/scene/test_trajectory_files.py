@@ -11,6 +11,7 @@ from blinkgl import (
     AssetError,
     Camera,
     ConfigError,
+    Keyframes,
     Primitive,
     Scene,
     Trajectory,
@@ -493,3 +494,27 @@ def test_a_file_of_times_that_is_not_there_is_named(tmp_path):
     (tmp_path / "poses.txt").write_text(KITTI, encoding="utf-8")
     with pytest.raises(AssetError, match="nosuch.txt: no such file; expected a file of times, or rate: in Hz"):
         trajectories.read_trajectory(tmp_path / "poses.txt", trajectories.PoseFile(times=tmp_path / "nosuch.txt"))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint64, np.int64])
+def test_times_that_fall_are_refused_of_any_type(tmp_path, dtype):
+    """Differences of unsigned numbers wrap."""
+    times, poses = np.array([3, 2, 1], dtype), np.tile(np.eye(4), (3, 1, 1))
+    with pytest.raises(ConfigError, match="times do not increase"):
+        write_trajectory(tmp_path / "t.txt", times, poses)
+    with pytest.raises(ConfigError, match="times do not increase"):
+        Keyframes.from_arrays(times, poses)
+    write_trajectory(tmp_path / "t.txt", times[::-1], poses)
+
+
+@pytest.mark.parametrize("what", ["scaled", "mirrored", "nan", "nan place", "last row"])
+def test_poses_that_are_not_rigid_are_not_written(tmp_path, what):
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    place, value = {
+        "scaled": ((1, slice(3), slice(3)), 2 * np.eye(3)), "mirrored": ((1, 0, 0), -1), "nan": ((1, 0, 0), np.nan),
+        "nan place": ((1, 0, 3), np.nan), "last row": ((1, 3, 0), 1),
+    }[what]  # fmt: skip
+    poses[place] = value
+    with pytest.raises(ConfigError, match=r"poses\[1\]|poses: "):
+        write_trajectory(tmp_path / "t.txt", np.arange(3), poses)
+    assert not (tmp_path / "t.txt").exists()

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from blinkgl.config.frames import FramesConfig
 from blinkgl.config.run import load_run
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.sequence import GroundTruth, simulate_sequence
+from blinkgl.sequence.recorded import matching_folders
 from blinkgl.sequence.request import SequenceRequest
 from tests.refusals import refusal
 
@@ -165,3 +167,13 @@ def test_one_folder_serves_every_sequence_and_several_one_each(clip):
     with pytest.raises(ConfigError, match=r"frames.folders.1: no such folder \(got 'no\*'\)"):
         opened(clip, 0, folders=("clip", "no*"))
     refusal(ConfigError, opened, clip, 0, folders=(), match="no folders of frames")
+
+
+@pytest.mark.parametrize("place", ["set[1]", "a*b", "plain"])
+def test_brackets_and_stars_in_the_name_of_a_place_are_no_pattern(tmp_path, place):
+    for name in ("seq[2]", "seq3", "other"):
+        (tmp_path / place / name / "image_left").mkdir(parents=True)
+    found = lambda *patterns: [p.name for p in matching_folders(FramesConfig(folders=patterns), tmp_path / place)]
+    assert found("seq[2]") == ["seq[2]"] and found("seq*") == ["seq3", "seq[2]"] and found("seq[[]2]") == ["seq[2]"]
+    with pytest.raises(ConfigError, match="no such folder"):
+        found("nothing*")

@@ -83,3 +83,9 @@ def test_counts_and_time_surfaces(events):
         now = (10_000, 8_000, 20_000)[k]
         assert np.allclose(surface[k].numpy(), np.exp((last - now) / 3_000.0), rtol=1e-6, atol=0)
     assert torch.equal(latest_times(events, latest), latest)
+
+
+def test_windows_without_length_are_empty_voxel_grids(events):
+    for t0, t1 in ((5000, 5000), (torch.full((3,), 5000), torch.full((3,), 5000))):
+        grid = voxel_grid(events, t0, t1, 4)
+        assert grid.shape[1] == 4 and not grid.any()

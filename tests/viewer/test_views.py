@@ -191,3 +191,13 @@ def test_what_is_no_sequence_is_refused(tmp_path, single):
     (damaged / "poses.npz").unlink()
     with pytest.raises(AssetError, match=r"damaged sequence: poses\.npz: missing"):
         SequenceView(damaged)
+
+
+def test_the_last_image_keeps_the_labels_before_it(single, sensor):
+    """Only an image is of the sequence's end: the labels, clouds and boxes of the last label stay."""
+    end = SequenceView(single).end_us
+    before, last = ({one.heading: one for one in sensor.pictures(t, 1000)} for t in (end - 1, end))
+    assert set(before) == set(last) and before["depth"].note == last["depth"].note
+    assert before["frame"].note != last["frame"].note
+    assert np.array_equal(sensor.depth_cloud(end - 1).points, sensor.depth_cloud(end).points)
+    assert len(sensor.bodies(end)) == len(sensor.bodies(end - 1))

@@ -24,6 +24,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.grids import masked
+from blinkgl.events.response import Response
 from blinkgl.gl import GLContext
 from blinkgl.render.cutouts import Cutouts, lattice, mask_of
 from blinkgl.render.frames import Rectangle
@@ -32,6 +33,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
+from blinkgl.scene.waveforms import Waveform
 from blinkgl.sequence import SensorSimulation, SequenceRequest, simulate_sequence
 from blinkgl.timeline.sampling import Pace, bounded_times
 from blinkgl.tools.trade.metrics import EventErrors, SpeedMaps, event_errors, flow_errors
@@ -66,26 +68,38 @@ class FineTiles(Cutouts):
     ):
         super().__init__(gl, scene, tiles, scale, samples)
 
-    def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
-        """Yield times between which nothing in the rectangles moves by more than ``max_px``."""
-        jumps = [at for t in self._renderer.motion.jumps(t0_ns, t1_ns) for at in (t, t + 1)]
-        return bounded_times(self.pace(max_px), 1000, MAX_STEP_NS, t0_ns, t1_ns, exact_ns=jumps)
+    def times(self, max_px: float, t0_ns: int, t1_ns: int, response: Response) -> Iterator[int]:
+        """Yield times between which nothing in the rectangles moves by more than ``max_px``, and no light changes by
+        more than as many thresholds."""
+        span, scene = (t0_ns, t1_ns), self._renderer.scene
+        lights = tuple(scene.waveforms.values())
+        jumps = {*self._renderer.motion.jumps(*span), *(t for light in lights for t in light.jumps(*span))}
+        # The frame at a jump shows what was before it, that a nanosecond later what is after it.
+        exact = {*jumps, *(t + 1 for t in jumps), *(t for light in lights for t in light.corners(*span))}
+        pace = self.pace(max_px, lights, response.gain / response.threshold)
+        stops = () if scene.dynamics is None else scene.dynamics.impacts_ns
+        return bounded_times(pace, 1000, MAX_STEP_NS, *span, stops, sorted(exact))
 
-    def pace(self, max_px: float) -> Pace:
-        """Return the pace of steps in which nothing in the rectangles moves by more than ``max_px``."""
-        return _PaceOfTiles(self._renderer.motion, self._cameras, max_px * self._scale)
+    def pace(self, max_px: float, lights: Sequence[Waveform] = (), gain: float = 1.0) -> Pace:
+        """Return the pace of steps in which nothing in the rectangles moves by more than ``max_px``, and ``gain`` times
+        the logarithm of no light changes by more."""
+        return _PaceOfTiles(self._renderer.motion, self._cameras, max_px * self._scale, lights, gain / max_px)
 
 
 @dataclass(frozen=True)
 class _PaceOfTiles:
-    """The pace (:class:`blinkgl.timeline.sampling.Pace`) of several cameras at one place. max_px : of their px."""
+    """The pace (:class:`blinkgl.timeline.sampling.Pace`) of several cameras at one place. max_px : of their px.
+    per_light : steps for a change of a light by a factor e."""
 
     motion: Motion
     cameras: Sequence[CameraModel]
     max_px: float
+    lights: Sequence[Waveform]
+    per_light: float
 
     def at(self, t_ns: int) -> float:
-        return max(look.largest for look in self._looks(t_ns)) / self.max_px
+        lit = max((light.steepness(t_ns) for light in self.lights), default=0.0) * self.per_light
+        return max(lit, max(look.largest for look in self._looks(t_ns)) / self.max_px)
 
     def hides(self, ta_ns: int, tb_ns: int, steps: float) -> bool:
         looks = zip(self._looks(ta_ns), self._looks(tb_ns), strict=True)
@@ -416,7 +430,8 @@ class Bench:
                 break
             started = time.perf_counter()
             with FineTiles(self.gl, self.reference_scene, self.tiles, scale) as source:
-                times = list(source.times(max_px, self.t0_ns, self.t1_ns))
+                response = emulator_of(self.emulator).response(self.emulator)
+                times = list(source.times(max_px, self.t0_ns, self.t1_ns, response))
                 events, frames = reference_events(
                     source, times, self.emulator, self.height, self.width, self.seed, self.mask
                 )

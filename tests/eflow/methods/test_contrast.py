@@ -84,6 +84,18 @@ def test_known_motions_are_found(field, motion, limit):
     assert length(flow - truth(MOTIONS[motion])).mean() < limit
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_windows_of_two_lengths(share):
+    """MVSEC's, where a frame is missing: the same motion, cut elsewhere."""
+    both = pictured(MOTIONS["translation"])
+    x, y, t, p = (np.concatenate([getattr(w, k) for w in both]) for k in "xytp")
+    middle = round(100_000 * share)
+    old, new = t < middle, t >= middle
+    windows = [Window(x[k], y[k], t[k], p[k], *ends) for k, ends in ((old, (0, middle)), (new, (middle, 100_000)))]
+    expected = truth(MOTIONS["translation"]) * 2 * (1 - share)
+    assert length(make_method("contrast-translation")(*windows, H, W) - expected).mean() < 0.15
+
+
 def test_a_rotating_camera():
     focal = 150.0
 

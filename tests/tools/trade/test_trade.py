@@ -16,6 +16,7 @@ from blinkgl.cli import run
 from blinkgl.config.run import load_run
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError
+from blinkgl.events import emulator_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.tools.trade.matching import match_events
 from blinkgl.tools.trade.measure import Bench, FineTiles, Level, Options
@@ -278,3 +279,31 @@ def test_off_the_sensor_is_refused():
         match_events(train(1, x=W), train(1), H, W, 10)
     with pytest.raises(ValueError, match="limit_us"):
         match_events(train(1), train(1), H, W, 0)
+
+
+@pytest.mark.parametrize(
+    "wave", [{"kind": "sine", "frequency": 100, "depth": 0.5}, {"kind": "pwm", "frequency": 90, "duty": 0.3}], ids=str
+)
+def test_the_reference_sees_lights_that_change(gl, tmp_path, wave):
+    """A camera at rest before a body at rest: between two frames of the reference the light changes by a tenth of a
+    threshold at most, or it jumps, and both sides of the jump have a frame."""
+    scene = {
+        "kind": "explicit",
+        "meshes": {"a": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "a", "position": [3, 0, 0]}],
+        "camera": {"position": [0, 0, 0]},
+        "light": {"over_time": wave},
+    }
+    path = tmp_path / "r.yaml"
+    path.write_text(yaml.safe_dump({"camera": {"width": 48, "height": 36}, "scene": scene, "time": {"duration": 0.2}}))
+    bench = Bench(gl, load_run(path), OPTIONS)
+    response = emulator_of(bench.emulator).response(bench.emulator)
+    with FineTiles(gl, bench.scene, bench.tiles, 1) as source:
+        times = list(source.times(0.1, bench.t0_ns, bench.t1_ns, response))
+    (light,) = bench.scene.waveforms.values()
+    jumps = light.jumps(bench.t0_ns, bench.t1_ns)
+    shown = np.log([light.factor(max(t - 1, bench.t0_ns)) + 1e-9 for t in times])
+    leaps = np.isin(times[:-1], jumps)
+    assert np.abs(np.diff(shown))[~leaps].max(initial=0) <= 0.1001 * response.threshold
+    assert set(jumps) <= set(times) and {t + 1 for t in jumps} <= set(times)
+    assert len(jumps) == 4 if wave["kind"] == "pwm" else len(times) > 100

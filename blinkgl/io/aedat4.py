@@ -145,25 +145,32 @@ class Aedat4Reader:
 
     def _packets(self, kind: str) -> Iterator[Any]:
         number, triggers = self._stream(kind), []
-        with _damage(self.path):
-            packets, sound = iter(_decoder(self.path)), _check_claims(self.path)
-            while True:
-                # Check what this packet claims before the decoder sets memory aside for it.
-                next(sound, None)
-                packet = next(packets, None)
-                if packet is None:
-                    break
-                if packet["stream_id"] == number:
-                    yield packet[kind]
-                elif kind == "events" and "triggers" in packet:
-                    rows = packet["triggers"]
-                    t = rows["t"].astype(np.int64)
-                    triggers.append(np.stack([t, np.zeros_like(t), rows["source"].astype(np.int64)], axis=1))
-        if triggers:
-            self.triggers = np.concatenate(triggers)
-            self.notes = [
-                f"{len(self.triggers):,} triggers are no events: blinkgl convert --triggers FILE.csv writes them"
-            ]
+        try:
+            with _damage(self.path):
+                packets, sound = iter(_decoder(self.path)), _check_claims(self.path)
+                while True:
+                    # Check what this packet claims before the decoder sets memory aside for it.
+                    next(sound, None)
+                    packet = next(packets, None)
+                    if packet is None:
+                        break
+                    if packet["stream_id"] == number:
+                        yield packet[kind]
+                    elif kind == "events" and "triggers" in packet and self._together(packet["stream_id"], number):
+                        rows = packet["triggers"]
+                        t = rows["t"].astype(np.int64)
+                        triggers.append(np.stack([t, np.zeros_like(t), rows["source"].astype(np.int64)], axis=1))
+        finally:
+            if triggers:  # also those before damage
+                self.triggers = np.concatenate(triggers)
+                self.notes = [line for line in self.notes if " triggers are no events: " not in line] + [
+                    f"{len(self.triggers):,} triggers are no events: blinkgl convert --triggers FILE.csv writes them"
+                ]
+
+    def _together(self, a: int, b: int | None) -> bool:
+        """Return whether two streams may be of one camera."""
+        sources = {self._source(a), None if b is None else self._source(b)}
+        return len(sources - {None}) < 2
 
 
 def _descriptions(path: Path) -> dict[int, dict[str, str]]:

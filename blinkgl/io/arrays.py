@@ -343,6 +343,7 @@ class ArrayWriter(CheckedWriter):
 
 
 def _declared(value: np.ndarray, name: str, path) -> int:
-    if value.size != 1 or value.dtype.kind not in "iu":
+    # MATLAB writes all numbers as floats.
+    if value.size != 1 or value.dtype.kind not in "iuf" or not float(value.item()).is_integer():
         raise AssetError(f"'{name}' is no integer", where=str(path), value=f"{value.dtype} {value.shape}")
     return int(value.item())

@@ -62,7 +62,10 @@ def machine_token() -> str:
 def temporary_beside(final: Path) -> Path:
     """Return a new hidden name in ``final``'s folder (hence on its file system) with its suffix, because writers such
     as ffmpeg depend on the ending."""
-    return final.with_name(f".{final.name}.blinkgl-tmp-{machine_token()}-{os.getpid()}-{next(_serial)}{final.suffix}")
+    behind = f".blinkgl-tmp-{machine_token()}-{os.getpid()}-{next(_serial)}{final.suffix}"
+    # File systems take 255 bytes; of a longer name the end is left out.
+    name = final.name.encode()[: 254 - len(behind.encode())].decode(errors="ignore")
+    return final.with_name(f".{name}{behind}")
 
 
 def is_temporary(name: str) -> bool:
@@ -79,8 +82,9 @@ def remove_stale(folder: Path) -> list[Path]:
         match = _PATTERN.match(path.name)
         if not match or match.group(1) != token or _alive(int(match.group(2))) or path.is_symlink():
             continue
-        _remove(path)
-        removed.append(path)
+        with contextlib.suppress(OSError):  # of another user, in a folder where only owners may delete
+            _remove(path)
+            removed.append(path)
     return removed
 
 
@@ -150,7 +154,8 @@ def _appearing(final: Path) -> Iterator[Path]:
     try:
         yield temporary  # the format's own writer converts its errors; reading errors of the body are not handled here
     except BaseException as error:
-        _remove(temporary)
+        with contextlib.suppress(OSError):
+            _remove(temporary)
         if not isinstance(error, BlinkGLError) or str(temporary) not in (error.where or ""):
             raise
         raise type(error)(

@@ -158,8 +158,9 @@ def joined(pieces: Iterable[Events], least: int) -> Iterator[Events]:
             if count >= least:
                 yield Events.concatenate(pending)
                 pending, count = [], 0
-    except AssetError:
-        yield Events.concatenate(pending)
+    except (AssetError, EventDataError):
+        if pending:
+            yield Events.concatenate(pending)
         raise
     if pending:
         yield Events.concatenate(pending)

@@ -428,7 +428,7 @@ def _decode_evt3(words, state, x, y, t, p, triggers, mend):
                 break
         elif kind == 6:
             # The low bits began again without a new TIME_HIGH, which some writers and lost words leave out.
-            if mend and low - (word & 0xFFF) > 1 << 11:
+            if mend and high >= 0 and low - (word & 0xFFF) > 1 << 11:
                 wraps, high, mended = wraps + (high == 0xFFF), (high + 1) & 0xFFF, mended + 1
             low = word & 0xFFF
         elif kind == 8:

@@ -478,7 +478,7 @@ def convert(
         first = next((int(e.t[0]) for e in file.chunks()), 0)
         shift = first if zero_time else 0
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
-        offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
+        whole = file.t_offset_us if file.t_offset_us or file.format == "dsec" else first // 1_000_000 * 1_000_000
         shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
         if file.causes and not FORMATS[kind].causes:
             shifted = (replace(e, cause=None) for e in shifted)
@@ -487,7 +487,7 @@ def convert(
             shifted,
             file.height,
             file.width,
-            t_offset_us=offset,
+            t_offset_us=0 if zero_time else whole,
             write_unit=write_unit,
             overwrite=overwrite,
         )

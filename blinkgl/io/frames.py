@@ -355,16 +355,23 @@ def _ask_for_white(top: int, where: str) -> None:
 
 
 def _by_name(stamps: Stamps, found: Series, where: str) -> Stamps:
-    """Return the times of the files, by their names. Raises EventDataError: a file without."""
-    by_name = {
-        name: t for listed, t in zip(stamps.names or (), stamps.times_ns) for name in (Path(listed).name, listed)
-    }
-    missing = [p.name for p in found.files if p.name not in by_name and p.stem not in by_name]
-    if missing:
-        raise EventDataError(f"no time stamp for image {missing[0]}", where=where)
+    """Return the times of the files, by their names, with the folders that the list gives (those of several cameras).
+    Raises EventDataError: a file without, or with several."""
+    listed: dict[str, list[tuple[str, int]]] = {}
+    for text, t in zip(stamps.names or (), stamps.times_ns):
+        listed.setdefault(Path(text).name, []).append((Path(text).as_posix(), t))
+    times = []
+    for p in found.files:
+        rows, whole = listed.get(p.name) or listed.get(p.stem) or [], Path(os.path.abspath(p))
+        ends = (f"/{whole.as_posix()}", f"/{whole.with_suffix('').as_posix()}")
+        own = {t for text, t in rows if any(end.endswith(f"/{text}") for end in ends)} or {t for _, t in rows}
+        if len(own) != 1:
+            problem = f"{len(own)} time stamps for image {p.name}" if own else f"no time stamp for image {p.name}"
+            raise EventDataError(problem, where=where)
+        times += own
     if left := len(stamps.times_ns) - len(found.files):
         found.notes.append(f"{Path(where).name}: {left} times of images that are not in the folder are left out")
-    return replace(stamps, times_ns=[by_name.get(p.name, by_name.get(p.stem, 0)) for p in found.files])
+    return replace(stamps, times_ns=times)
 
 
 def _video(path: Path, declared: Declared) -> FrameSource:

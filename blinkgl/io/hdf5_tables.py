@@ -116,7 +116,7 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
                 f"dataset '{data.name}' holds no column of numbers", where=str(path), value=f"{data.dtype} {data.shape}"
             )
         data.check()
-    units = next((u for key in ("unit", "units") if (u := columns["t"].attribute(key)) is not None), None)
+    units = _stated(columns["t"])
     place = columns["t"].name.rpartition("/")[0]
     layout: dict[str, object] = {}
     if any(key in holder for key in _MILLISECONDS for holder in (file, group)) and columns["t"].dtype.kind in "iu":
@@ -137,6 +137,13 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
         place=place,
         **({} if isinstance(units, str) else layout),
     )
+
+
+def _stated(t: Data) -> Any:
+    """Return the unit that the times state; None: none."""
+    units = next((u for key in ("unit", "units") if (u := t.attribute(key)) is not None), None)
+    # C, C++ and MATLAB write text of a fixed length.
+    return units.decode("latin-1") if isinstance(units, bytes) else units
 
 
 def _value(holder: Any, name: str) -> np.ndarray | None:
@@ -167,9 +174,9 @@ def _number(holder: object, name: str, path: Path) -> Any:
 def _size(file: Hdf5File, group: Any, path: Path) -> tuple[int, int] | None:
     """Return the (height, width) that a file states, in any of the known ways. Raises AssetError: it is none."""
     for holder in (group, file):
-        height, width = (_number(holder, side, path) for side in ("height", "width"))
-        if isinstance(height, int) and isinstance(width, int):
-            return height, width
+        sides = {side: n for side in ("height", "width") if (n := _number(holder, side, path)) is not None}
+        if len(sides) == 2:
+            return _whole(sides["height"], "height", path), _whole(sides["width"], "width", path)
     places = (holder for holder in (group, group.get("calib"), file) if isinstance(holder, Group))
     for holder, name in itertools.product(places, _SIZES):
         if (value := _value(holder, name)) is None:
@@ -177,11 +184,18 @@ def _size(file: Hdf5File, group: Any, path: Path) -> tuple[int, int] | None:
         if value.dtype.kind in "SUO":
             text = value.item() if isinstance(value.item(), str) else value.item().decode("latin-1")
             value = np.array([int(side) for side in re.findall(r"\d{1,9}", text)])
-        if value.shape != (2,) or value.dtype.kind not in "iu":
+        if value.size != 2 or value.dtype.kind not in "iuf":
             raise AssetError(f"'{name}' is no size", where=str(path), value=str(value), accepted="two numbers of px")
-        first, second = value.tolist()
+        first, second = (_whole(side, name, path) for side in value.ravel().tolist())
         return (first, second) if name == "sensor_resolution" else (second, first)
     return None
+
+
+def _whole(number: float, name: str, path: Path) -> int:
+    """Return a side in px; MATLAB writes all numbers as floats. Raises AssetError: not whole."""
+    if not float(number).is_integer():
+        raise AssetError(f"'{name}' is no size", where=str(path), value=number, accepted="whole numbers of px")
+    return int(number)
 
 
 def is_dsec(file: Hdf5File, reading: EventReading) -> bool:
@@ -193,6 +207,7 @@ def is_dsec(file: Hdf5File, reading: EventReading) -> bool:
         all(isinstance(data, Data) and data.dtype.kind in "iub" for data in columns.values())
         and columns["p"].dtype.kind in "ub"
         and "ms_to_idx" in file
+        and _stated(columns["t"]) in (None, "us")
         and (offset is None or getattr(offset, "shape", None) == ())
         and not (reading.columns or reading.polarity or reading.stream or reading.keep)
         and reading.time_unit in (None, "us")

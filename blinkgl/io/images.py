@@ -356,6 +356,24 @@ def png_problem(data: bytes) -> str | None:
     return f"cannot decode image (corrupt or truncated at byte {at})"
 
 
+def chunks_before_pixels(path: Path) -> dict[bytes, bytes]:
+    """Return the chunks of a PNG file before its pixels, by their types; of large ones (profiles) nothing."""
+    chunks: dict[bytes, bytes] = {}
+    with open(path, "rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8 and len(chunks) < _MOST_CHUNKS:
+            length, kind = struct.unpack(">I4s", head)
+            if kind in (b"IDAT", b"IEND"):
+                break
+            # Content and CRC; beyond the end nothing is left to read.
+            chunks[kind] = file.read(length) if length < _LARGE_CHUNK else b""
+            file.seek(4 if length < _LARGE_CHUNK else length + 4, os.SEEK_CUR)
+    return chunks
+
+
+_LARGE_CHUNK, _MOST_CHUNKS = 1 << 16, 1000
+
+
 def png_chunks(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
     """Yield where each chunk begins, its type, and its content, of which the last one's may be cut."""
     # The signature has 8 bytes; a chunk's length, type and CRC have 4 each.

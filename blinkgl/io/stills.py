@@ -27,7 +27,15 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from blinkgl.errors import AssetError
-from blinkgl.io.images import decode_image, over, png_chunks, png_problem, read_pfm, size_problem
+from blinkgl.io.images import (
+    chunks_before_pixels,
+    decode_image,
+    over,
+    png_chunks,
+    png_problem,
+    read_pfm,
+    size_problem,
+)
 from blinkgl.io.reading import Damage
 from blinkgl.io.records import decoding, input_errors
 
@@ -203,14 +211,12 @@ def open_stills(path: Path) -> Stills:
     if suffix in _TIFF:
         return _tiff(path)
     if suffix in _ANIMATED:
-        head = _bytes(path, 4096 if suffix in (".png", ".apng") else 64)
-        # acTL is a chunk of animated PNG files; bit 1 of a WebP file's flags says that it is animated.
-        animated = (
-            suffix == ".gif" or b"acTL" in head or (head[8:16] == b"WEBPVP8X" and head[20:21] > b"\1" and head[20] & 2)
-        )
-        if animated:
-            return _animated(path)
-        return _png(path, head) if head[:4] == b"\x89PNG" else Stills(path)
+        head = _bytes(path, 64)
+        if head[:4] == b"\x89PNG":
+            return _animated(path) if b"acTL" in (chunks := chunks_before_pixels(path)) else _png(path, chunks)
+        # Bit 1 of a WebP file's flags says that it is animated.
+        animated = suffix == ".gif" or (head[8:16] == b"WEBPVP8X" and head[20:21] > b"\1" and head[20] & 2)
+        return _animated(path) if animated else Stills(path)
     if suffix in (".pbm", ".pgm", ".ppm", ".pnm"):
         head = _bytes(path, 4096)
         heading = re.match(rb"P([1-6])\s+\d+\s+\d+\s+(\d+)?", re.sub(rb"#[^\n]*", b"", head))
@@ -226,11 +232,9 @@ def open_stills(path: Path) -> Stills:
     return Stills(path, transfer="linear" if suffix in (".exr", ".hdr", ".pfm") else None)
 
 
-def _png(path: Path, head: bytes) -> Stills:
-    """Read the chunks before the pixels that say what codes mean (PNG specification, 11.3.2)."""
+def _png(path: Path, chunks: dict[bytes, bytes]) -> Stills:
+    """Read what the chunks before the pixels say of codes (PNG specification, 11.3.2)."""
     stills = Stills(path)
-    before = itertools.takewhile(lambda chunk: chunk[1] not in (b"IDAT", b"IEND"), png_chunks(head))
-    chunks = {kind: body for _, kind, body in before}
     # They come in any order; of curves cICP counts more than sRGB, and that more than gAMA.
     if len(code := chunks.get(b"cICP", b"")) == 4:
         from blinkgl.io.video import TRANSFERS

@@ -245,9 +245,11 @@ def _time_columns(rows: Sequence[Sequence[str]], titles: Sequence[str]) -> list[
         between = [k for k, title in enumerate(titles) if re.search(r"start|begin|end|stop", title, re.I)]
         if len(between) == 2:
             return between
-        called = [k for k, title in enumerate(titles) if re.match(r"(#|.*[_ ])?(time|t|ts|stamp)", title, re.I)]
-        if called:
-            return called[:1]
+        words = r"(time(_?stamps?)?|t|ts|stamps?)(?![a-z])"
+        # A title of these words comes before one that ends with them, such as exposure_time.
+        for before in ("#?", r".*[_ ]"):
+            if called := [k for k, title in enumerate(titles) if re.match(before + words, title, re.I)]:
+                return called[:1]
     numeric = [k for k in range(width) if all(is_number(row[k]) for row in rows)]
     if len(numeric) < 2:
         # One odd line among numbers is named by its line, so the first column stays the time.

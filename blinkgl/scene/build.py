@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.camera import CameraConfig, camera_radius
+from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.lights import LightConfig
 from blinkgl.config.poses import KeyedMotionConfig
 from blinkgl.config.rig import RigSensorConfig, baseline_of
@@ -152,6 +153,7 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
         _check_motion(config.camera, base, "scene.camera")
         for k, item in enumerate(config.objects):
             _check_motion(item, base, f"scene.objects.{k}")
+            _check_animation(item.animation, base, f"scene.objects.{k}.animation")
         for name, mesh in config.meshes.items():
             _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
             if mesh.primitive is not None:
@@ -163,9 +165,15 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
         assert isinstance(config, FileSceneConfig)
         _exists(config.path, base, "scene.path", "a gltf or glb file")
         _check_motion(config.pose, base, "scene.pose")
+        _check_animation(config.animation, base, "scene.animation")
     _exists(panorama_of(config.light), base, "scene.light.environment.map", "a panorama")
     for k, lamp in enumerate(config.light.lights):
         _check_motion(getattr(lamp, "motion", None), base, f"scene.light.lights.{k}.motion")
+
+
+def _check_animation(animation: str | int | AnimationConfig | None, base: Path, where: str) -> None:
+    if (clip := animation_of(animation)) is not None:
+        _exists(clip.file, base, f"{where}.file", "a gltf or glb file")
 
 
 def _check_motion(config: KeyedMotionConfig | None, base: Path, where: str) -> None:

@@ -445,7 +445,9 @@ class Scene:
     @property
     def changing_lights(self) -> Iterator[tuple[str, Waveform, int]]:
         """Yield the lights that change over time: their name, "light" for the sun's and the surroundings', and the
-        number of the scene's part that emits, object by object; -1: none, but a lamp or the surroundings."""
+        number of the scene's part that emits, object by object; -1: none, but a lamp or the surroundings. No two have
+        one name: an object called as a light before it is "NAME (object)"."""
+        names = {"light", *(lamp.name for lamp in self.light.lamps)}
         if self.light.over_time is not None:
             yield "light", self.light.over_time, -1
         for lamp in self.light.lamps:
@@ -455,7 +457,8 @@ class Scene:
         parts = ((obj.name, k, part) for obj in self.objects for k, part in enumerate(obj.parts))
         for number, (name, k, part) in enumerate(parts):
             if (wave := part.material.emission_over_time) is not None:
-                yield f"{name}, part {k}" if k else name, wave, number
+                called = f"{name} (object)" if name in names else name
+                yield f"{called}, part {k}" if k else called, wave, number
 
     @cached_property
     def waveforms(self) -> dict[str, Waveform]:

@@ -162,7 +162,8 @@ class Code(_Steps):
 
     def per_second(self) -> float:
         changes = sum(a != b for a, b in zip(self.bits, self.bits[1:] + self.bits[:1]))
-        return self.rate * changes / len(self.bits) if self.low != 1 else 0.0
+        # Once, it has no more changes than bits.
+        return self.rate * changes / len(self.bits) if self.low != 1 and self.repeat else 0.0
 
 
 @dataclass(frozen=True)
@@ -205,6 +206,8 @@ class Keys:
         for j in pieces:
             if 0 <= j < len(self.times_ns) - 1:
                 a, b = self.factors[j : j + 2]
+                if a == b:  # also where all are 0, of which no part is a change
+                    continue
                 seconds = (self.times_ns[j + 1] - self.times_ns[j]) * 1e-9
                 steepest = max(steepest, abs(b - a) / seconds / max(min(a, b), floor))
         return steepest

@@ -604,3 +604,26 @@ def test_what_a_png_states_comes_in_any_order(tmp_path):
         curve = "pq" if b"cICP" in kinds else None if b"sRGB" in kinds else "linear" if b"gAMA" in kinds else None
         assert (one.white, one.transfer) == (4095 if b"sBIT" in kinds else None, curve), kinds
         np.testing.assert_array_equal(one.read(), pixels)
+
+
+def test_what_a_png_states_behind_a_large_chunk_is_read(tmp_path):
+    """A profile of 5 kB and one of 100 kB before the other chunks; an animation behind one."""
+    pixels = np.arange(12).reshape(3, 4).astype(">u2") * 100
+    body = zlib.compress(b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels))
+    head, end = chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 3, 16, 0, 0, 0, 0)), chunk(b"IEND", b"")
+    for size in (5_000, 100_000):
+        stated = (
+            chunk(b"zTXt", b"x\0\0" + bytes(size)) + chunk(b"sBIT", b"\x0c") + chunk(b"gAMA", struct.pack(">I", 100000))
+        )
+        (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + head + stated + chunk(b"IDAT", body) + end)
+        one = open_stills(tmp_path / "a.png")
+        assert (one.white, one.transfer) == (4095, "linear")
+    frames = [Image.new("RGB", (4, 3), (k * 40,) * 3) for k in range(3)]
+    frames[0].save(
+        tmp_path / "b.png", save_all=True, append_images=frames[1:], duration=50, icc_profile=random_bytes(6000)
+    )
+    assert open_stills(tmp_path / "b.png").pages == 3
+
+
+def random_bytes(count: int) -> bytes:
+    return np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes()

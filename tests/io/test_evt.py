@@ -9,6 +9,8 @@ import pytest
 
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.evt import EvtReader, EvtWriter
+from blinkgl.io.formats import open_events
+from blinkgl.io.reading import EventReading
 from blinkgl.types.events import Events
 
 WORD = {"evt2": "<u4", "evt3": "<u2"}
@@ -255,3 +257,14 @@ def test_triggers_among_random_words(tmp_path, version, block):
     for _ in range(2):
         list(reader.chunks(block))
         assert reader.triggers.tolist() == expected and len(expected) > 100
+
+
+def test_events_before_any_time_get_none_when_they_are_mended(tmp_path):
+    """Low bits that fall before the first TIME_HIGH are no turn of a counter."""
+    words = [0x6FA0, 0x0005, 0x2001, 0x600A, 0x2002, 0x8800, 0x6001, 0x2003]
+    path = tmp_path / "e.raw"
+    path.write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
+    for options in ({}, {"damaged": "keep"}, {"sort": True}):
+        with open_events(path, EventReading.of(**options)) as file:
+            events = file.read()
+            assert events.x.tolist() == [3] and events.t.tolist() == [(0x800 << 12) | 1], options

@@ -284,3 +284,31 @@ def test_units_that_a_list_or_an_array_of_times_states_otherwise_are_said(tmp_pa
     dated = np.array([0, 5], "timedelta64[ms]")
     assert stamps_of_array("t", dated, None, "a.npz").note is None
     assert stamps_of_array("t", dated, "us", "a.npz").note == "the file says ms; --time-unit us is used"
+
+
+def test_one_list_of_two_cameras_gives_each_its_own_times(tmp_path):
+    """Both have pictures of the same names; of a folder that the list does not name it is not known which is meant."""
+    for camera in ("left", "right", "other"):
+        (tmp_path / camera).mkdir()
+        for k in range(3):
+            cv2.imwrite(str(tmp_path / camera / f"{k:03d}.png"), np.full((4, 4), k, np.uint8))
+    rows = [
+        f"{k + first}.000000 {camera}/{k:03d}.png" for camera, first in (("left", 0), ("right", 10)) for k in range(3)
+    ]
+    (tmp_path / "images.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    times = lambda camera: [t // 10**9 for _, t, _ in open_frames(tmp_path / camera)]
+    assert times("left") == [0, 1, 2] and times("right") == [10, 11, 12]
+    with pytest.raises(EventDataError, match="2 time stamps for image 000.png"):
+        times("other")
+
+
+def test_the_column_of_times_is_no_temperature_and_no_exposure(tmp_path):
+    for heading, row in (
+        ("temperature,timestamp_us,name", "{a},{t},{k}.png"),
+        ("exposure_time_us,timestamp_us,name", "{a},{t},{k}.png"),
+        ("type,topic,time_us", "{k},{a},{t}"),
+        ("name,image_time_us", "{k}.png,{t}"),
+    ):
+        rows = [row.format(a=25 + k, t=1000 * k, k=k) for k in range(3)]
+        (tmp_path / "l.csv").write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
+        assert read_timestamps(tmp_path / "l.csv", "us").times_ns == [0, 10**6, 2 * 10**6], heading

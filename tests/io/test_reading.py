@@ -545,3 +545,62 @@ def test_records_of_metavision_are_in_microseconds(tmp_path, place, geometry):
     with open_events(path) as file:
         assert same(file.read(), events)
         assert "read as Metavision's records of events: µs" in file.notes
+
+
+@pytest.mark.parametrize("unit", ["ns", np.bytes_("ns"), np.array("ns", "S4")], ids=["text", "bytes", "padded"])
+def test_a_unit_of_fixed_length_counts(tmp_path, unit):
+    """C, C++ and MATLAB write text so; a table of milliseconds beside the events says nothing else."""
+    events = some_events(50, 0, 10**6, 260, 346)
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        for slot in "xyp":
+            file[f"events/{slot}"] = getattr(events, slot)
+        file["events/t"], file["ms_to_idx"] = events.t * 1000, np.zeros(3, np.int64)
+        file["events/t"].attrs["unit"] = unit
+    with open_events(tmp_path / "e.h5") as file:
+        assert same(file.read(), events)
+
+
+@pytest.mark.parametrize("kind", ["sides", "flat", "row", "npz"])
+def test_sizes_written_as_floats_are_sizes(tmp_path, kind):
+    events, path = some_events(50, 0, 10**6, 100, 120), tmp_path / ("e.npz" if kind == "npz" else "e.h5")
+    columns = {"t_us": events.t, **{slot: getattr(events, slot) for slot in "xyp"}}
+    if kind == "npz":
+        np.savez(path, **columns, height=260.0, width=346.0)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, column in columns.items():
+                file[name] = column
+            if kind == "sides":
+                file["height"], file["width"] = np.array([[260.0]]), np.array([[346.0]])
+            else:
+                file["sensor_resolution"] = np.array([260.0, 346.0]).reshape((1, 2) if kind == "row" else 2)
+    with open_events(path) as file:
+        assert (file.height, file.width) == (260, 346)
+        assert not any("none of t, x, y, p" in line for line in file.notes)
+    if kind == "sides":
+        with h5py.File(path, "a") as file:
+            file["height"][...] = 260.5
+        with pytest.raises(AssetError, match="'height' is no size"):
+            open_events(path)
+
+
+def test_whole_packets_before_a_wrong_time_are_kept(tmp_path):
+    events, path = (
+        Events(*(np.zeros(200_000, np.uint16),) * 2, np.arange(200_000), np.zeros(200_000, np.uint8)),
+        tmp_path / "e.aedat4",
+    )
+    write_events(path, events, 100, 100)
+    data = bytearray(path.read_bytes())
+    at = data.find(struct.pack("<qhhB3x", 199_990, 0, 0, 0))
+    data[at : at + 8] = struct.pack("<q", 2**63 - 1)
+    path.write_bytes(data)
+    kept = open_events(path, EventReading.of(damaged="keep")).read()
+    assert 100_000 < len(kept) < 200_000 and np.array_equal(kept.t, np.arange(len(kept)))
+
+
+def test_a_dsec_file_keeps_its_offset_of_zero(tmp_path):
+    late = Events(*(np.ones(3, np.uint16),) * 2, np.array([5_000_000, 5_000_001, 5_000_002]), np.ones(3, np.uint8))
+    write_events(tmp_path / "a.h5", late, 10, 10, t_offset_us=0)
+    convert(tmp_path / "a.h5", tmp_path / "b.h5")
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert file["t_offset"][()] == 0 and file["events/t"][0] == 5_000_000

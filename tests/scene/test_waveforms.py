@@ -73,3 +73,15 @@ def test_an_edge_has_its_own_nanosecond():
     assert wave.jumps(0, 2 * MS) == [300_000, MS, 1_300_000]
     assert [wave.factor(t) for t in (0, 299_999, 300_000, 999_999, MS)] == [1, 1, 0, 0, 1]
     assert Keys((MS, 2 * MS), (1.0, 0.0), hold=True).jumps(0, 3 * MS) == [2 * MS]
+
+
+def test_keys_that_are_all_zero_are_dark_and_steady():
+    wave = Keys((0, 5 * 10**8), (0.0, 0.0))
+    assert [wave.steepness(t) for t in (0, 10**8, 5 * 10**8, 10**9)] == [0.0] * 4
+    assert Keys((0, 10**9, 2 * 10**9), (0.0, 0.0, 1.0)).steepness(15 * 10**8) > 0
+
+
+def test_a_code_that_is_shown_once_changes_once():
+    once, again = (Code("10", 1e6, repeat=repeat) for repeat in (False, True))
+    assert once.per_second() == 0 and again.per_second() == 1e6
+    assert once.jumps(-10, 10**9) == [0, 1000]

@@ -104,7 +104,7 @@ def explicit_scene(
     if config.physics is not None:
         objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
     light, objects = with_environment(
-        config.light.environment, make_light(config.light, lamp_paths(t0_ns, t1_ns, base)), base, objects
+        config.light.environment, make_light(config.light, lamp_paths(t0_ns, t1_ns, base, log)), base, objects
     )
     return Scene(
         objects,
@@ -265,9 +265,9 @@ def motion_path(
     return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation)
 
 
-def lamp_paths(t0_ns: int, t1_ns: int, base: Path) -> LampPath:
-    """Return what makes the paths of lamps that move in a sequence."""
-    return lambda motion, where: motion_path(motion, t0_ns, t1_ns, where, base, camera=True)
+def lamp_paths(t0_ns: int, t1_ns: int, base: Path, log: list[str]) -> LampPath:
+    """Return what makes the paths of lamps that move in a sequence. log : gets what was guessed."""
+    return lambda motion, where: motion_path(motion, t0_ns, t1_ns, where, base, camera=True, log=log)
 
 
 def trajectory_path(

@@ -42,9 +42,10 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
     path = existing(config.path, base, "scene.path", "a gltf or glb file")
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise ConfigError("not a glTF scene", where="scene.path", value=config.path, accepted="a .gltf or .glb file")
-    camera_path = (
-        None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", base, camera=True)
-    )
+    log: list[str] = []
+    camera_path = None
+    if config.pose is not None:
+        camera_path = motion_path(config.pose, t0_ns, t1_ns, "scene.pose", base, camera=True, log=log)
     own = config.lights == "file"
     with reading("scene", str(path)):
         limits = {"max_faces": config.max_faces, "max_texture": config.max_texture_size}
@@ -58,13 +59,14 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
             intrinsics=config.intrinsics,
             animation=config.animation,
             base=base,
-            light=make_light(config.light, lamp_paths(t0_ns, t1_ns, base)),
+            light=make_light(config.light, lamp_paths(t0_ns, t1_ns, base, log)),
             lights_gain=config.lights_gain if own else None,
         )
     light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
     changes: dict = {"unlit": True} if config.light.unlit else {}
     changes |= {} if config.both_sides is None else {"both_sides": config.both_sides}
-    return dressed(replace(scene, light=light, objects=objects, background=config.background), **changes)
+    scene = replace(scene, light=light, objects=objects, background=config.background, log=(*scene.log, *log))
+    return dressed(scene, **changes)
 
 
 def from_document(

@@ -105,7 +105,7 @@ def random_world(
         rig=Rig.alone(camera, camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
-        light=_light(config, panorama, lamp_paths(t0_ns, t1_ns, base), rng, generator(seed, sequence, Role.LIGHT)),
+        light=_light(config, panorama, lamp_paths(t0_ns, t1_ns, base, log), rng, generator(seed, sequence, Role.LIGHT)),
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import BlinkGLError
+from blinkgl.io import atomic
+from blinkgl.io.atomic import atomic_file, is_temporary, machine_token, remove_stale
 from blinkgl.io.formats import event_writer, open_events
 from blinkgl.types.events import Events
 
@@ -61,3 +63,25 @@ def test_writers(tmp_path, kind, how):
         assert open_events(path).read().t.tolist() == some().t.tolist()
     for again in (writer.abort, writer.abort):
         again()
+
+
+def test_a_name_as_long_as_the_file_system_takes_is_written(tmp_path):
+    for name in ("a" * 251 + ".npz", "ü" * 120 + ".npz", "b" * 40 + ".npz"):
+        with atomic_file(tmp_path / name) as temporary:
+            assert is_temporary(temporary.name) and len(temporary.name.encode()) <= 255
+            temporary.write_bytes(b"x")
+        assert (tmp_path / name).read_bytes() == b"x"
+
+
+def test_leftovers_that_may_not_be_deleted_stop_nobody(tmp_path, monkeypatch):
+    """Of another user's dead process, in a folder where only owners may delete."""
+    left = tmp_path / f".x.npz.blinkgl-tmp-{machine_token()}-999999999-0.npz"
+    left.write_bytes(b"")
+
+    def refused(path):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(atomic, "_remove", refused)
+    assert remove_stale(tmp_path) == [] and left.exists()
+    with atomic_file(tmp_path / "mine.npz") as temporary:
+        temporary.write_bytes(b"x")

@@ -25,6 +25,7 @@ from blinkgl.io import trajectories
 from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.motion.paths import smoothed
 from tests.refusals import refusal
+from tests.scene.gltf_files import arm_file
 
 EPOCH = 1_403_636_579_758_555_392
 RNG = np.random.default_rng
@@ -518,3 +519,32 @@ def test_poses_that_are_not_rigid_are_not_written(tmp_path, what):
     with pytest.raises(ConfigError, match=r"poses\[1\]|poses: "):
         write_trajectory(tmp_path / "t.txt", np.arange(3), poses)
     assert not (tmp_path / "t.txt").exists()
+
+
+def test_what_is_guessed_of_a_trajectory_is_said_wherever_one_moves(tmp_path):
+    """A camera before a file's scene, and lamps in every kind of scene."""
+    (tmp_path / "way.txt").write_text("".join(f"{k * 0.5:.6f} 0 0 0 0 0 0 1\n" for k in range(6)), encoding="utf-8")
+    arm_file().write(tmp_path / "arm.glb")
+    way = {"trajectory": {"file": "way.txt"}}
+    lamp = {"lights": [{"kind": "point", "motion": way}]}
+    box = {"meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a"}], "camera": {}}
+    for scene in (
+        {"kind": "file", "path": "arm.glb", "pose": way},
+        {"kind": "file", "path": "arm.glb", "pose": {}, "light": lamp},
+        {"kind": "explicit", **box, "light": lamp},
+        {"kind": "random", "objects": {"count": 1}, "light": lamp},
+    ):
+        (tmp_path / "r.yaml").write_text(yaml.safe_dump({"scene": scene, "time": {"duration": 0.2}}))
+        made = sequence_scene(load_run(tmp_path / "r.yaml").sequence(0), 0, tmp_path)
+        assert [line for line in made.log if line.startswith("way.txt: read as TUM's")], scene["kind"]
+
+
+@pytest.mark.parametrize("kind", ["explicit", "file"])
+def test_files_of_clips_are_looked_for_before_work_starts(tmp_path, kind):
+    arm_file().write(tmp_path / "arm.glb")
+    clip = {"clip": 0, "file": "gone.glb"}
+    world = {"meshes": {"a": {"file": "arm.glb"}}, "objects": [{"mesh": "a", "animation": clip}], "camera": {}}
+    scene = {"kind": kind, **(world if kind == "explicit" else {"path": "arm.glb", "animation": clip})}
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump({"scene": scene}))
+    with pytest.raises(ConfigError, match=r"animation.file: no such file \(got 'gone.glb'"):
+        check_assets(load_run(tmp_path / "r.yaml").sequence(0).scene, tmp_path)

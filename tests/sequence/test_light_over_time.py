@@ -227,3 +227,16 @@ def test_many_changes_are_said_before_anything_is_drawn(tmp_path):
 )
 def test_what_no_light_can_do_is_one_line(scene, words):
     assert words in refusal(ConfigError, lambda: sequence_scene(config_of(scene), 0))
+
+
+@pytest.mark.parametrize("name", ["light", "lights[0]", "other"])
+def test_a_body_may_be_called_as_a_light_is(name):
+    """Each of the three that change keeps its own waveform, jumps and events."""
+    lamp = {"kind": "point", "position": [1, 0, 2], "over_time": SINE}
+    glowing = {"m": {"emission": [0.3] * 3, "emission_over_time": SINE}}
+    body = {**WALL, "material": "m", "name": name}
+    config = config_of({"light": {"over_time": PWM, "lights": [lamp]}, "materials": glowing, "objects": [body]})
+    *_, sequence = events_of(config)
+    assert len(sequence.lights()["jump_t_ns"]) > 5
+    names = list(sequence.scene.waveforms)
+    assert len(names) == 3 and names[0] == "light" and names[2] == (name if name == "other" else f"{name} (object)")

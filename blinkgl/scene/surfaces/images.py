@@ -224,7 +224,7 @@ def _blocks(height: int, width: int) -> list[slice]:
 
 def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, float]:
     """Return an equirectangular image as light: (h, w, 3) float32 linear radiance as in the file, and the factor by
-    which :func:`load_image` exposes it (1 for 8-bit images).
+    which :func:`panorama_picture` exposes it (1 for 8-bit images).
 
     Raises :class:`AssetError` for what :func:`load_image` refuses, and where it is not a panorama: not twice as wide as
     high, with pixels that are not radiance (NaN, infinite, negative), or black."""
@@ -248,6 +248,18 @@ def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, flo
     if not image.max() > 0:
         raise AssetError("the panorama is black", where=where)
     return image, factor
+
+
+def panorama_picture(path: Path) -> np.ndarray:
+    """Return an equirectangular image as it is drawn: as :func:`load_image`, but an HDR image exposed as its light is
+    (:func:`exposure`), so that both are one. Raises :class:`AssetError`."""
+    data = contents(Path(path), "image", str(path))
+    if not data.startswith(_HDR):
+        return load_image(path)
+    with reading("image", str(path)):
+        image = _radiance(data, str(path))
+        image *= np.float32(exposure(image))
+        return np.clip(image, 0, HDR_WHITE, out=image)
 
 
 def exposure(image: np.ndarray) -> float:

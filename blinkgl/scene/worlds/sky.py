@@ -22,8 +22,8 @@ from blinkgl.scene.surfaces.images import (
     SKY_SIDES,
     content_hash,
     cube_faces,
-    load_image,
     load_panorama,
+    panorama_picture,
     shrink,
 )
 from blinkgl.scene.types import FARTHEST, Light, Material, Mesh, Part, SceneObject, Texture
@@ -74,7 +74,7 @@ def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture
 
 
 def panorama_light(file: Path, angle: float, brightness: float, light: Light, where: str) -> Light:
-    """Return ``light`` with a panorama instead of its sun and sky, as bright as :func:`load_image` shows it times
+    """Return ``light`` with a panorama instead of its sun and sky, as bright as :func:`panorama_picture` shows it times
     ``brightness``. angle : rotation, rad, from +x towards +y. Raises AssetError."""
     radiance, exposure = load_panorama(file, where)
     return lit_by(turned(environment(radiance), angle), exposure * brightness, light)
@@ -92,7 +92,7 @@ def with_environment(
     file = existing(config.map, base, where, "an equirectangular image")
     light = panorama_light(file, np.radians(config.heading), config.strength, light, f"{where}: {config.map}")
     if config.visible:
-        image = shrink(load_image(file), 4096)
+        image = shrink(panorama_picture(file), 4096)
         # A panorama's columns are azimuth, so turning it about z moves them; it decreases to the right.
         image = np.roll(image, -round(config.heading / 360 * image.shape[1]), axis=1)
         textures = panorama_textures(image, file.stem, content_hash(contents(file, "image"), repr(config).encode()))
@@ -136,7 +136,7 @@ def drawn_panorama(
             accepted="more panoramas, or another scene.textures.test_fraction",
         )
     digest, file = mine[int(rng.integers(len(mine)))]
-    image = shrink(load_image(file), 4096)
+    image = shrink(panorama_picture(file), 4096)
     # Turned by whole columns, so that no pixel is interpolated.
     columns = int(rng.integers(image.shape[1]))
     sides = panorama_textures(np.roll(image, columns, axis=1), file.stem, digest)

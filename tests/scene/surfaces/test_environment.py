@@ -13,7 +13,14 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.lights import ambient
 from blinkgl.scene.surfaces import gloss
 from blinkgl.scene.surfaces.environment import FINER, environment, pixel_directions, quartic, turned
-from blinkgl.scene.surfaces.images import MAX_HDR_PIXELS, cube_faces, load_image, load_panorama
+from blinkgl.scene.surfaces.images import (
+    HDR_WHITE,
+    MAX_HDR_PIXELS,
+    cube_faces,
+    load_image,
+    load_panorama,
+    panorama_picture,
+)
 from tests.refusals import refusal
 from tests.shared_data import shared
 from tests.videos import put_exr
@@ -234,3 +241,14 @@ def test_looks_are_shares_of_one_whole():
     cells = gloss.looks()
     assert cells.shape == (*gloss.energy().shape[:2], 5)
     assert (cells >= 0).all() and (cells[..., 4] <= 1).all() and (cells[..., [1, 3]] <= 1).all()
+
+
+def test_the_drawn_sky_is_as_bright_as_its_light(tmp_path):
+    """An evenly blue sky over dark ground: both are scaled by the luminance of nine tenths of the solid angle."""
+    image = np.tile(np.array([0.1, 0.2, 2.0], np.float32), (32, 64, 1))
+    image[20:] = 0.05
+    radiance, factor = load_panorama(written(tmp_path / "a.hdr", image))
+    drawn = panorama_picture(tmp_path / "a.hdr")
+    np.testing.assert_allclose(drawn, np.clip(radiance * factor, 0, HDR_WHITE), rtol=1e-6)
+    grey = written(tmp_path / "a.png", np.full((4, 8, 3), 188, np.uint8))
+    np.testing.assert_array_equal(panorama_picture(grey), load_image(grey))

@@ -130,20 +130,21 @@ def _of_columns(file: Any, group: Any, columns: dict[str, Any], heading: str, pa
     return table_of_columns(
         columns,
         str(path),
-        heading=f"t [{units}]" if isinstance(units, str) else heading,
+        heading=heading if units is None else f"t [{units}]",
         offset=next((n for holder in (group, file) if (n := _number(holder, "t_offset", path))), 0),
         notes=[*_notes(file, group, columns["t"]), *not_columns(others)],
         size=_size(file, group, path),
         place=place,
-        **({} if isinstance(units, str) else layout),
+        **(layout if units is None else {}),
     )
 
 
-def _stated(t: Data) -> Any:
+def _stated(t: Data) -> str | None:
     """Return the unit that the times state; None: none."""
     units = next((u for key in ("unit", "units") if (u := t.attribute(key)) is not None), None)
     # C, C++ and MATLAB write text of a fixed length.
-    return units.decode("latin-1") if isinstance(units, bytes) else units
+    units = units.decode("latin-1") if isinstance(units, bytes) else units
+    return units if isinstance(units, str) else None
 
 
 def _value(holder: Any, name: str) -> np.ndarray | None:

@@ -221,7 +221,7 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray) -> 
     valid pixels that the format could not hold (.png: beyond -256 ... 255.99 px), which are stored as invalid.
 
     Raises OutputError: unknown ending, or it cannot be written."""
-    ending, lost = Path(path).suffix, 0
+    ending, lost = Path(path).suffix.lower(), 0
     if ending not in ENDINGS:
         raise OutputError("unknown flow file ending", where=str(path), value=ending, accepted=", ".join(ENDINGS))
     if ending == ".png":

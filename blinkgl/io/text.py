@@ -81,6 +81,9 @@ class TextReader:
         rows = rows[:-1] if len(rows) > 1 else rows
         rows = [row.strip() for row in rows if row.strip() and row.lstrip()[:1] not in (b"#", b"%")]
         if reading.columns and not reading.named:
+            if self._order and self._order != tuple(reading.columns[: len(self._order)]):
+                named = ",".join(self._order)
+                self.notes.append(f"the heading names the columns {named}; --columns is used")
             self._order = reading.columns
         elif reading.named and not set("txyp") <= set(self._order):
             raise AssetError(

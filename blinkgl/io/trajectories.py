@@ -176,6 +176,9 @@ def _form(path: Path, text: str) -> str | None:
         return "nerf"
     if re.search(r"^# *IMAGE_ID, QW", text[:2000], re.M):
         return "colmap"
+    # A heading that names a pose is believed first, also that of twelve columns.
+    if _roles(titles_of(read_rows(text, 100)[0])):
+        return None
     row = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
     count = len(re.split(r"[\s,;]+", row.strip()))
     # A place and a quaternion are seven numbers, three rows of a 4x4 matrix twelve.

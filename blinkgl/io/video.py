@@ -259,7 +259,8 @@ class VideoReader:
             )
         if damage or self._lost:
             lost = f", {self._lost} damaged ones left out" if self._lost else ""
-            self.notes.append(f"kept: {count} frames that are whole{lost}{_because(damage)}")
+            line = f"kept: {count} frames that are whole{lost}{_because(damage)}"
+            self.notes += [] if line in self.notes else [line]  # once, however often it is read
 
     def _square(self, width: int, height: int) -> tuple[int, int]:
         """Return the (width, height) of a picture whose pixels are as wide as high. Raises AssetError: an aspect that

@@ -71,6 +71,7 @@ LINES = {
     "{} frames state no delay: {} ms each, as browsers show them (--fps)",
     "left out: the interval between pages, {} '{}', of an unknown unit (--fps)",
     "left out: {}, whose meaning is not known (--size, --time-unit, --origin)",
+    "the heading names the columns {}; --columns is used",
     "{}: the heading names the columns otherwise; columns: {} is used",
     "{}: the heading names the columns otherwise than form: {}, and is used",
     "{}: {}'s axes ({}) turned to OpenCV's (axes: opencv if they are already)",

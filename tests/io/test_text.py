@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError
+from blinkgl.io.formats import open_events
 from blinkgl.io.reading import EventReading
 from blinkgl.io.text import TextReader, TextWriter
 from blinkgl.types.events import Events
@@ -195,3 +196,11 @@ def test_a_row_that_is_not_of_the_event_camera_datasets_layout(tmp_path, odd):
         (tmp_path / "e.txt").write_text(few * 9)
         with pytest.raises(AssetError, match="no heading names the columns; try --columns"):
             TextReader(tmp_path / "e.txt")
+
+
+def test_columns_that_the_heading_names_otherwise_are_said(tmp_path):
+    (tmp_path / "e.csv").write_text("t_us,x,y,p\n10,1,2,1\n20,3,4,0\n", encoding="utf-8")
+    for columns, said in (("t,x,y,p", False), ("t,y,x,p", True), (None, False)):
+        file = open_events(tmp_path / "e.csv", EventReading.of(columns=columns, time_unit="us"))
+        assert ("the heading names the columns t,x,y,p; --columns is used" in file.notes) == said
+        assert file.read().x.tolist() == ([2, 4] if said else [1, 3])

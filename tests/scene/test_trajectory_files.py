@@ -548,3 +548,11 @@ def test_files_of_clips_are_looked_for_before_work_starts(tmp_path, kind):
     (tmp_path / "r.yaml").write_text(yaml.safe_dump({"scene": scene}))
     with pytest.raises(ConfigError, match=r"animation.file: no such file \(got 'gone.glb'"):
         check_assets(load_run(tmp_path / "r.yaml").sequence(0).scene, tmp_path)
+
+
+def test_a_heading_of_twelve_columns_is_no_kitti(tmp_path):
+    heading = "# timestamp[s] tx ty tz qx qy qz qw vx vy vz m\n"
+    rows = "".join(f"{k * 0.1:.6f} {k * 0.01} 0 0 0 0 0 1 0 0 0 1\n" for k in range(6))
+    (tmp_path / "p.txt").write_text(heading + rows, encoding="utf-8")
+    t_ns, T = trajectories.read_trajectory(tmp_path / "p.txt")
+    assert t_ns.tolist() == [k * 10**8 for k in range(6)] and T[5, 0, 3] == pytest.approx(0.05)

@@ -169,3 +169,42 @@ def test_a_recording_of_frames_alone(tmp_path, capsys):
     assert run(["convert", str(path), str(tmp_path / "none.h5")]) == 2
     assert capsys.readouterr().err.endswith("frames.aedat4: no events in the recording\n")
     assert not (tmp_path / "none.h5").exists()
+
+
+def two_cameras(monkeypatch, reading: EventReading, broken: bool = False) -> Aedat4Reader:
+    """Streams 0 and 1 are events and triggers of camera A, 2 and 3 of camera B; a fault ends the recording."""
+    row = lambda kind, t: np.array([(t, kind)], [("t", "<u8"), ("source", "u1")])
+    event = np.array([(5, 1, 2, True)], [("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])
+    packets = [{"stream_id": n, "events": event} for n in (0, 2)]
+    packets[1:1] = [{"stream_id": 1, "triggers": row(7, 11)}, {"stream_id": 3, "triggers": row(9, 12)}]
+    types = dict(zip(range(4), ("events", "triggers", "events", "triggers"), strict=True))
+
+    class Decoder:
+        def __init__(self, path):
+            pass
+
+        def id_to_stream(self):
+            return {n: {"type": kind, "height": 4, "width": 4} for n, kind in types.items()}
+
+        def __iter__(self):
+            yield from packets
+            if broken:
+                raise RuntimeError("cut")
+
+    monkeypatch.setitem(sys.modules, "aedat", SimpleNamespace(Decoder=Decoder))
+    monkeypatch.setattr(aedat4, "_check_claims", lambda path: iter(()))
+    monkeypatch.setattr(aedat4, "_descriptions", lambda path: {n: {"source": "AABB"[n]} for n in range(4)})
+    return Aedat4Reader("e.aedat4", reading)
+
+
+@pytest.mark.parametrize("broken", [False, True], ids=["whole", "cut"])
+@pytest.mark.parametrize(("stream", "expected"), [("0", [[11, 0, 7]]), ("2", [[12, 0, 9]])])
+def test_triggers_are_those_of_the_events_camera_also_before_damage(monkeypatch, stream, expected, broken):
+    reader = two_cameras(monkeypatch, EventReading.of(stream=stream), broken)
+    for _ in range(2):
+        try:
+            list(reader.chunks())
+        except AssetError:
+            assert broken
+        assert reader.triggers.tolist() == expected
+        assert reader.notes == ["1 triggers are no events: blinkgl convert --triggers FILE.csv writes them"]

@@ -180,7 +180,7 @@ def test_a_memory_limit_ends_a_command_in_one_line(tmp_path):
     """simulate of frames that do not fit into what 'ulimit -v' leaves."""
     np.lib.format.open_memmap(tmp_path / "frames.npy", "w+", np.uint8, (2, 30_000, 30_000))[:1, :1, :1] = 1
     command = (
-        f"ulimit -v 3000000; exec {sys.executable} -m blinkgl.cli simulate {tmp_path}/frames.npy --fps 100 -o "
+        f"ulimit -v 3000000; exec {sys.executable} -m blinkgl simulate {tmp_path}/frames.npy --fps 100 -o "
         f"{tmp_path}/e.npz"
     )
     done = subprocess.run(

@@ -246,6 +246,18 @@ vec4 label_position()
         return out
 
 
+class Counted(Position):
+    dtype, channels = np.uint16, None
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.uint16])
+def test_numbers_of_a_label_are_stored_in_its_type_or_refused(dtype):
+    label, value = Counted(), np.full((2, 3), 7, dtype)
+    assert label.wrong(value, 2, 3) is None and label.own(value).dtype == np.uint16
+    wide = np.array([[0, 65_536]])
+    assert label.wrong(wide, 1, 2) == "0 to 65536 and not 0 to 65535" and label.wrong(-wide, 1, 2)
+
+
 PLAIN = {**SMALL, "events": {"emulator": "esim"}, "labels": {"position": True, "depth": True}}
 
 

@@ -92,8 +92,8 @@ class BrightnessTimeline(_AdaptiveTimeline):
         95.0,
         gt=0,
         le=100,
-        description="percentile of |dL/dt| over the changing pixels, and of the speeds of edges; 100 bounds every "
-        "sampled pixel",
+        description="percentile of |dL/dt| over the changing pixels; 100 bounds every sampled pixel; edges count by "
+        "the fastest",
     )
 
 

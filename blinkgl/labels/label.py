@@ -271,6 +271,10 @@ class Label:
         if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
             kind_words = f" {np.dtype(self.dtype)}" if kind else ""
             return f"{array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{kind_words}"
+        if kind in ("u", "i") and array.dtype != self.dtype and array.size:
+            limits = np.iinfo(str(np.dtype(self.dtype)))
+            if int(array.min()) < limits.min or int(array.max()) > limits.max:
+                return f"{array.min()} to {array.max()} and not {limits.min} to {limits.max}"
         return None
 
     def read(self, path: Path, form: Form, height: int, width: int) -> Any:
@@ -285,7 +289,7 @@ class Label:
     def own(self, value: Any) -> Any:
         """Return a copy of a value, as it is written."""
         array = np.array(value)
-        return array.astype(self.dtype, copy=False) if array.dtype.kind == "f" and self.dtype is not None else array
+        return array if self.dtype is None else array.astype(self.dtype, copy=False)
 
     # ---- files ---------------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from blinkgl.render.frames import Frame, Memory, Rectangle, merged
 from blinkgl.render.passes.base import ScenePass
 
 if TYPE_CHECKING:
-    from blinkgl.camera import PinHole
+    from blinkgl.camera import CameraModel, PinHole
     from blinkgl.render.draw_items import DrawItem
     from blinkgl.render.painter import Painter
     from blinkgl.render.passes.base import Pass, Shot
@@ -28,7 +28,7 @@ class Canvas(Memory):
     """The target of one pass of one renderer. width, height : of the image, px."""
 
     def __init__(self, pass_: Pass, painter: Painter, width: int, height: int):
-        self.pass_ = pass_
+        self.pass_, self._width = pass_, width
         target = target_of(pass_, painter, width, height)
         super().__init__(painter, target, pass_.outputs, type(pass_).__name__)
         self._used: dict[str, Frame] = {}  # inputs of the last frame
@@ -47,6 +47,11 @@ class Canvas(Memory):
         """Return the handle of the frame that has just been drawn."""
         self.number += 1
         return Frame(self, self.number, shot.moment, changed)
+
+    def _update(self, i: int, picture: np.ndarray | None, stale: list[Rectangle] | None) -> np.ndarray:
+        # Rectangles are in px of the image, the target may be finer.
+        finer = self.target.width // self._width
+        return super()._update(i, picture, None if stale is None else [r.scaled(finer) for r in stale])
 
     def _changed(self, shot: Shot) -> list[Rectangle] | None:
         if not self.pass_.pointwise or not self._used:
@@ -78,6 +83,7 @@ class StillCanvas(Canvas):
     whole last frame. It also keeps the picture of the static objects and the rectangles of moving ones."""
 
     _picture: Target | None = None
+    _place: tuple[CameraModel, bytes] | None = None  # camera and pose that the picture was drawn from
     _covered: tuple[Rectangle, ...] = ()  # by moving objects, in the last frame
 
     def draw(self, shot: Shot) -> Frame:
@@ -91,9 +97,11 @@ class StillCanvas(Canvas):
                 if rectangle is not None:
                     movers.append((item, rectangle))
         covered = [rectangle for _, rectangle in movers]
-        # The first frame draws the static part, once.
-        if self._picture is None:
-            self._picture = target_of(pass_, painter, camera.width, camera.height)
+        # The first frame draws the static part, once; so does one that is seen from elsewhere.
+        place = camera, moment.T_world_cam.tobytes()
+        if self._picture is None or place != self._place:
+            self._picture = self._picture or target_of(pass_, painter, camera.width, camera.height)
+            self._place = place
             still = replace(shot, target=self._picture)
             pass_.begin(painter, still)
             pass_.paint(painter, still, [item for item in visible if not item.moves])

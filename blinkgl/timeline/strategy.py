@@ -44,16 +44,16 @@ class Ranked(NamedTuple):
 STILL = Ranked(0, 0.0, 0.0)
 
 
-def speeds_of_edges(drawn: Drawn, luminance: np.ndarray, response: Response, percent: float) -> Ranked:
-    """Return the statistics of the lengths of (h, w, 2) float32 vectors where neighbouring pixels of the (h, w)
-    luminance differ by a threshold or more."""
+def speeds_of_edges(drawn: Drawn, luminance: np.ndarray, response: Response) -> float:
+    """Return the largest length of (h, w, 2) float32 vectors where neighbouring pixels of the (h, w) luminance differ
+    by a threshold or more; 0 where none do."""
     signal, edge = response.signal(luminance), np.zeros(luminance.shape, bool)
     for s, on in ((signal, edge), (signal.T, edge.T)):
         step = np.abs(np.diff(s, axis=0)) >= response.threshold
         # Both pixels beside a step are on its edge.
         on[1:] |= step
         on[:-1] |= step
-    return ranked(np.linalg.norm(drawn.read(), axis=-1)[edge], percent) if edge.any() else STILL
+    return ranked(np.linalg.norm(drawn.read(), axis=-1)[edge], 100).largest if edge.any() else 0.0
 
 
 def ranked(values: np.ndarray, percent: float) -> Ranked:
@@ -288,8 +288,8 @@ class Brightness(Timeline):
         luminance, rate = picture[..., 0], picture[..., 1]
         seen = ranked(np.abs(self.response.change(luminance, rate)), c.percentile)
         moving = self.scene.velocity_of_movers(t_ns, c.sample_every)
-        edges = speeds_of_edges(moving, luminance, self.response, c.percentile)
-        return max(seen.percentile / self.response.threshold, edges.largest) / c.max_fraction_of_threshold
+        fastest = speeds_of_edges(moving, luminance, self.response)
+        return max(seen.percentile / self.response.threshold, fastest) / c.max_fraction_of_threshold
 
 
 _KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness}

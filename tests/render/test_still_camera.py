@@ -195,3 +195,32 @@ def test_speed_is_a_bound_and_exact_where_nothing_is_hidden(gl):
     with Renderer(gl, alone, PLAIN) as quick, full_redraw(gl, alone) as slow:
         moved = [largest_speed(renderer.velocity_of_movers(SECOND // 2).read()) for renderer in (quick, slow)]
         assert moved[0] == pytest.approx(moved[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("first", ["camera", "elsewhere"])
+def test_a_moment_seen_from_elsewhere_has_its_own_picture(gl, first):
+    """Before and after frames of the camera, which stands still: what stands still is drawn anew for another place."""
+    world, plain = mixed_scene(camera_moves=False), RenderConfig(antialiasing="none")
+
+    def pictures(renderer):
+        def elsewhere():
+            moment = renderer.moment(0)
+            T = moment.T_world_cam.copy()
+            T[:3, 3] += 0.3 * T[:3, 0]
+            return renderer.luminance(moment.from_place(moment.view, T)).read().copy()
+
+        of_camera = lambda: renderer.luminance(0).read().copy()
+        order = (of_camera, elsewhere, of_camera) if first == "camera" else (elsewhere, of_camera, elsewhere)
+        return [draw() for draw in order]
+
+    with Renderer(gl, world, plain) as renderer, Renderer(gl, world, plain, whole=True) as whole:
+        for mine, anew in zip(pictures(renderer), pictures(whole), strict=True):
+            np.testing.assert_array_equal(mine, anew)
+
+
+def test_a_view_of_a_finer_pass_is_what_is_read(gl):
+    """Its target has four values a pixel; only what has changed is copied."""
+    with Renderer(gl, mixed_scene(camera_moves=False), RenderConfig(antialiasing="none")) as renderer:
+        for t_ns in (0, SECOND // 4, SECOND // 2):
+            frame = renderer.draw(Luminance(samples_of("ssaa2")), t_ns)
+            np.testing.assert_array_equal(frame.view().copy(), frame.read())

@@ -8,6 +8,7 @@ morph targets, one for a time, as few as straight lines in between allow. A part
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -34,6 +35,18 @@ NOT_EXPORTED = "glTF_not_exported"
 """Blender's exporter leaves out objects in a collection of that name, and keeps their children."""
 
 
+class Refused(Exception):
+    """A line for the user: what is wrong, and what would be accepted."""
+
+    def __init__(self, problem: str, accepted: str | None = None):
+        super().__init__(problem)
+        self.problem, self.accepted = problem, accepted
+
+
+_LARGEST_RATIO, _LAST_FRAME = 900, 1_048_574
+"""Largest number of Blender's time remapping, and its last frame; beyond them it takes these without a word."""
+
+
 class Clock:
     """The scene's time. first, last : frames.   fps : of the file.   per : key frames per frame.
     simulated : whether only whole frames in their order mean something.   here : the frame that the file shows.
@@ -52,9 +65,16 @@ class Clock:
         self.stretch(per)
 
     def stretch(self, per: int) -> None:
-        """Set the scene to ``per`` key frames per frame: its time is stretched."""
+        """Set the scene to ``per`` key frames per frame: its time is stretched. Raises Refused: by more than Blender
+        can."""
         self.per = per
-        self.scene.render.frame_map_old, self.scene.render.frame_map_new = self.map[0], self.map[1] * per
+        common = math.gcd(self.map[0], self.map[1] * per)
+        old, new = self.map[0] // common, self.map[1] * per // common
+        if max(old, new) > _LARGEST_RATIO or max(abs(self.first), abs(self.last)) * per > _LAST_FRAME:
+            raise Refused(
+                f"{per} key frames per frame of this scene are more than Blender counts", "a smaller --keys-per-frame"
+            )
+        self.scene.render.frame_map_old, self.scene.render.frame_map_new = old, new
         self.scene.frame_start, self.scene.frame_end = self.first * per, self.last * per
         for marker, frame in self.markers:
             marker.frame = frame * per

@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from baking import FURTHEST, SEEN, Clock, Track, bake, keep_out, sample, write_keys
+from baking import FURTHEST, SEEN, Clock, Refused, Track, bake, keep_out, sample, write_keys
 from glb import read, write
 from rates import rate_of
 
@@ -33,14 +33,6 @@ NO_MATERIAL = (
 UNKNOWN = {
     "VOLUME": "volumes", "POINTCLOUD": "point clouds", "CURVES": "hair", "GREASEPENCIL": "grease pencil",
 }  # fmt: skip
-
-
-class Refused(Exception):
-    """A line for the user: what is wrong, and what would be accepted."""
-
-    def __init__(self, problem: str, accepted: str | None = None):
-        super().__init__(problem)
-        self.problem, self.accepted = problem, accepted
 
 
 def names(objs: Iterable[Blender], limit: int = 3) -> str:
@@ -189,7 +181,8 @@ def left_out(objs: list[Blender], clock: Clock) -> list[str]:
     say("orthographic and panoramic cameras are not drawn; left out", others)
     say("cameras with a keyed lens keep that of the first frame", (one for one in cameras if one.data.animation_data))
     say("the shift of the lens is left out", (one for one in cameras if one.data.shift_x or one.data.shift_y))
-    cuts = sorted((m.frame, m.camera.name) for m in scene.timeline_markers if m.camera is not None)
+    # The file's own frames: the markers stand where the stretched time has them.
+    cuts = sorted((frame, marker.camera.name) for marker, frame in clock.markers if marker.camera is not None)
     if len(cuts) > 1:
         shots = ", ".join(f"'{name}' from frame {frame}" for frame, name in cuts[:8])
         lines.append(f"the scene cuts between cameras ({shots}): import one shot, --frames FIRST LAST")
@@ -288,7 +281,7 @@ def export(clock: Clock, out: Path, clips: bool, tracks: list[Track]) -> dict[st
     for part in ("object", "armature", "shapekeys"):  # the exporter's own limit of 1e-4 would remove slow motions
         import_module(f"io_scene_gltf2.blender.exp.animation.sampled.{part}.keyframes").fcurve_is_constant = is_constant
     out.unlink(missing_ok=True)
-    clock.scene.frame_set(clock.here)  # its pose becomes the nodes' rest
+    clock.go(clock.here)  # its pose becomes the nodes' rest
     render, base = clock.scene.render, clock.scene.render.fps_base
     render.fps_base = clock.per / base  # the exporter divides frames by fps times base, where Blender has fps over base
     bpy.ops.export_scene.gltf(
@@ -399,6 +392,8 @@ def run(job: dict, out: Path, say: Callable[..., None]) -> dict:
         if job["scene"] not in bpy.data.scenes:
             raise Refused(f"the file has no scene '{job['scene']}'", f"one of: {names(bpy.data.scenes, 20)}")
         bpy.context.window.scene = bpy.data.scenes[job["scene"]]
+        if job["fps"] is not None:  # the scene that the file shows has it already
+            set_rate(bpy.context.scene, job["fps"])
     scene = bpy.context.scene
     objs, lines = rendered()
     if (

@@ -28,7 +28,7 @@ class Canvas(Memory):
     """The target of one pass of one renderer. width, height : of the image, px."""
 
     def __init__(self, pass_: Pass, painter: Painter, width: int, height: int):
-        self.pass_, self._width = pass_, width
+        self.pass_ = pass_
         target = target_of(pass_, painter, width, height)
         super().__init__(painter, target, pass_.outputs, type(pass_).__name__)
         self._used: dict[str, Frame] = {}  # inputs of the last frame
@@ -47,11 +47,6 @@ class Canvas(Memory):
         """Return the handle of the frame that has just been drawn."""
         self.number += 1
         return Frame(self, self.number, shot.moment, changed)
-
-    def _update(self, i: int, picture: np.ndarray | None, stale: list[Rectangle] | None) -> np.ndarray:
-        # Rectangles are in px of the image, the target may be finer.
-        finer = self.target.width // self._width
-        return super()._update(i, picture, None if stale is None else [r.scaled(finer) for r in stale])
 
     def _changed(self, shot: Shot) -> list[Rectangle] | None:
         if not self.pass_.pointwise or not self._used:
@@ -122,6 +117,11 @@ class StillCanvas(Canvas):
         painter.gl.ctx.scissor = None
         painter.stats.frames += 1
         return self.frame(shot, stale)
+
+    def _update(self, i: int, picture: np.ndarray | None, stale: list[Rectangle] | None) -> np.ndarray:
+        # Rectangles are in px of the image, the target may be finer.
+        finer = self.pass_.samples.grid
+        return super()._update(i, picture, None if stale is None else [r.scaled(finer) for r in stale])
 
     def release(self) -> None:
         if self._picture is not None:

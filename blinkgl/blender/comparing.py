@@ -33,10 +33,12 @@ Difference = tuple[float, float]
 large."""
 
 
-def compare(glb: Path, seen: Path | None, per: int = 1) -> tuple[dict[str, Difference], int, tuple[str, ...]]:
+def compare(
+    glb: Path, seen: Path | None, per: int = 1, finest: int = MOST_PER_FRAME
+) -> tuple[dict[str, Difference], int, tuple[str, ...]]:
     """Return how ``glb``, which has ``per`` key frames per frame, differs from ``seen`` (None: from nothing):
-    (differences by name; by how much more key frames per frame would mend the figures that differ between frames only;
-    lines of what is not drawn). Raises AssetError if it cannot be loaded."""
+    (differences by name; by how much more key frames per frame, up to ``finest``, would mend the figures that differ
+    between frames only; lines of what is not drawn). Raises AssetError if it cannot be loaded."""
     document = gltf.read(glb, max_faces=1 << 31, max_texture=16384)
     clips = clip_names(document)
     shown = [node for node in document.nodes.values() if node.mesh is not None]
@@ -66,7 +68,7 @@ def compare(glb: Path, seen: Path | None, per: int = 1) -> tuple[dict[str, Diffe
         # The error of straight lines goes down with the square of their number.
         factor = 2 ** math.ceil(math.log2(max(between / BETWEEN, 1.0)) / 2)
         other = name in changing or len(mine) > len(those)
-        if name in deforming and factor * per <= MOST_PER_FRAME and at <= AT_FRAMES and not other:
+        if name in deforming and factor * per <= min(finest, MOST_PER_FRAME) and at <= AT_FRAMES and not other:
             denser = max(denser, factor)
         elif other or at > AT_FRAMES or between > BETWEEN:
             share = float((error > np.where(table["whole"], AT_FRAMES, BETWEEN)).mean())

@@ -175,7 +175,7 @@ def _run(
                 progress(words["doing"])
             # Blender waits for this answer before it bakes or ends.
             if "compare" in words:
-                compared = differences(folder / "seen.npz", words["compare"])
+                compared = differences(folder / "seen.npz", words["compare"], words["finest"])
                 blender.tell({"differs": list(compared[0]), "denser": compared[1]})
             report = words.get("report", report)
         status = blender.status()

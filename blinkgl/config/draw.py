@@ -64,8 +64,8 @@ def _shares(node: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
     if is_distribution(node):
         kind, spec = next(iter(node.items()))
         yield from (path,) if kind == "shares" else ()
-        parts = [part.get("value") if isinstance(part, dict) and kind == "shares" else part for part in spec]
-        for value in parts if kind in ("shares", "choice") else ():
+        for part in spec if kind in ("shares", "choice") and isinstance(spec, list) else ():
+            value = part.get("value") if kind == "shares" and isinstance(part, dict) else part
             yield from _shares(value, _within(path, value))
     else:
         items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()

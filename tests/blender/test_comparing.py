@@ -38,6 +38,16 @@ def test_a_difference_is_named_with_how_much_and_how_long(tmp_path, name, change
     assert list(differs) == [name] and differs[name] == pytest.approx(words, rel=0.3)
 
 
+@pytest.mark.parametrize(("finest", "answer"), [(8, ([], 2)), (2, ([], 2)), (1, (["Thick"], 1))])
+def test_what_more_key_frames_would_mend_is_baked_alone_where_there_can_be_no_more(tmp_path, finest, answer):
+    table = dict(np.load(GOLDEN / "unsaid.npz"))
+    which = [k for k, (obj, _) in enumerate(json.loads(str(table["things"]))) if obj == "Thick"]
+    table[f"arr_{which[0]}"] = table[f"arr_{which[0]}"] + 4e-3 * ~table["whole"][:, None, None]
+    np.savez(tmp_path / "seen.npz", **table)
+    differs, denser, _ = compare(GOLDEN / "unsaid.glb", tmp_path / "seen.npz", 1, finest)
+    assert (list(differs), denser) == answer
+
+
 def test_changing_faces_and_what_is_too_many_are_named(tmp_path):
     table = dict(np.load(GOLDEN / "unsaid.npz"))
     objs = json.loads(str(table["things"]))

@@ -152,7 +152,7 @@ import numpy as np
 at = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1.0]])
 np.savez(folder / "seen.npz", at + [[[0, 0, 0]], [[0.1, 0, 0]]], times=[0, 0.5], whole=[True, True],
          things=json.dumps([["A", False]]))
-(folder / "scene.glb").write_bytes(glb); say(compare=1)
+(folder / "scene.glb").write_bytes(glb); say(compare=1, finest=8)
 answer = json.loads(sys.stdin.readline())
 say(report=REPORT | {"left_out": [json.dumps(answer)]})
 """)
@@ -203,7 +203,7 @@ def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
         ),
         ("(folder / 'scene.glb').write_bytes(glb[:-4]); say(report=REPORT)", r"what Blender wrote cannot be read"),
         (
-            "(folder / 'scene.glb').write_bytes(glb[:-4]); say(compare=1); time.sleep(600)",
+            "(folder / 'scene.glb').write_bytes(glb[:-4]); say(compare=1, finest=8); time.sleep(600)",
             r"what Blender wrote cannot be",
         ),
     ],

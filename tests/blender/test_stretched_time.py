@@ -65,9 +65,23 @@ def test_what_blender_cannot_count_is_refused(inside):
     scenes["S"].render.frame_map_old = 101
     with pytest.raises(exporting.Refused, match="10 key frames per frame of this scene are more than Blender counts"):
         exporting.clock_of([1, 10], 10)
+    assert exporting.clock_of([1, 10], 8).per == 8  # the remedy, a smaller number
     scenes["S"].render.frame_map_old = 100
     with pytest.raises(exporting.Refused, match="more than Blender counts"):
         exporting.clock_of([300_000, 300_100], 4)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "last", "finest"),
+    [(100, 100, 10, 512), (101, 113, 10, 4), (897, 899, 10, 1), (100, 100, 300_000, 2)],
+)
+def test_no_more_key_frames_are_added_than_blender_counts(inside, old, new, last, finest):
+    """Of a scene's own time map and last frame; whoever asked for one per frame is not told to ask for fewer."""
+    exporting, scenes = inside
+    scenes["S"].render.frame_map_old, scenes["S"].render.frame_map_new = old, new
+    clock = exporting.clock_of([last - 9, last], 1)
+    assert clock.finest() == finest
+    clock.stretch(clock.finest())
 
 
 def test_cuts_between_cameras_have_the_files_own_frames(inside):

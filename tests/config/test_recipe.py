@@ -108,6 +108,11 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
             "events.shares: in group 'a': not a list of shares",
         ),
         ({"events": {"shares": [{"share": 1.0}]}}, "events.shares: in group 'a': not a list of shares"),
+        ({"events": {"shares": None}}, "events.shares: in group 'a': not a list of shares"),
+        ({"events": {"shares": 5}}, "events.shares: in group 'a': not a list of shares"),
+        ({"events": {"choice": 5}}, "events.choice: in group 'a': not a list of choices"),
+        ({"camera": {"width": {"uniform": 5}}}, "camera.width.uniform: in group 'a': not a range"),
+        ({"camera": {"width": {"weighted": [1]}}}, "camera.width.weighted: in group 'a': not a table of weights"),
         (
             {
                 "events": {

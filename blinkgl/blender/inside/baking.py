@@ -67,17 +67,32 @@ class Clock:
     def stretch(self, per: int) -> None:
         """Set the scene to ``per`` key frames per frame: its time is stretched. Raises Refused: by more than Blender
         can."""
-        self.per = per
-        common = math.gcd(self.map[0], self.map[1] * per)
-        old, new = self.map[0] // common, self.map[1] * per // common
-        if max(old, new) > _LARGEST_RATIO or max(abs(self.first), abs(self.last)) * per > _LAST_FRAME:
+        if not self.counts(per):
             raise Refused(
                 f"{per} key frames per frame of this scene are more than Blender counts", "a smaller --keys-per-frame"
             )
-        self.scene.render.frame_map_old, self.scene.render.frame_map_new = old, new
+        self.per = per
+        self.scene.render.frame_map_old, self.scene.render.frame_map_new = self._ratio(per)
         self.scene.frame_start, self.scene.frame_end = self.first * per, self.last * per
         for marker, frame in self.markers:
             marker.frame = frame * per
+
+    def counts(self, per: int) -> bool:
+        """Return whether Blender can count ``per`` key frames per frame. One, the file's own time, it can."""
+        return per == 1 or (
+            max(self._ratio(per)) <= _LARGEST_RATIO and max(abs(self.first), abs(self.last)) * per <= _LAST_FRAME
+        )
+
+    def finest(self) -> int:
+        """Return the largest number of key frames per frame that doubling leads to; simulations have no more."""
+        per = self.per
+        while not self.simulated and self.counts(2 * per):
+            per *= 2
+        return per
+
+    def _ratio(self, per: int) -> tuple[int, int]:
+        common = math.gcd(self.map[0], self.map[1] * per)
+        return self.map[0] // common, self.map[1] * per // common
 
     def seconds(self, frame: float) -> float:
         return (frame - self.first) / self.fps

@@ -6,10 +6,10 @@ It needs only ``bpy`` and NumPy and imports nothing of BlinkGL, since Blender is
 job.json: source (absolute path), shown (as the user wrote it), scene (name or null), frames ([first, last] or null),
 fps (or null), keys_per_frame, clips, bake_mb. ``blinkgl.blender.importing`` writes it.
 
-Standard output has one JSON object per line: ``{"blender"}``, ``{"doing"}`` for progress, ``{"compare"}`` when
-scene.glb and seen.npz are to be compared, after which a line of standard input has ``{"differs", "denser"}``;
-``{"report"}`` when scene.glb is complete, or ``{"error", "where", "accepted"}``. Blender's own output goes to standard
-error.
+Standard output has one JSON object per line: ``{"blender"}``, ``{"doing"}`` for progress, ``{"compare", "finest"}``
+(present and largest number of key frames per frame) when scene.glb and seen.npz are to be compared, after which a line
+of standard input has ``{"differs", "denser"}``; ``{"report"}`` when scene.glb is complete, or ``{"error", "where",
+"accepted"}``. Blender's own output goes to standard error.
 """
 
 from __future__ import annotations

@@ -368,10 +368,10 @@ def written(
             raise Refused("the scene has no surface", "a scene with a rendered mesh that has faces")
         if job["clips"] or not owners:
             break
-        say(compare=clock.per)
+        say(compare=clock.per, finest=clock.finest())
         verdict = json.loads(sys.stdin.readline())
         differ = {owner for name in verdict["differs"] for owner in owners.get(name, {name})} - tried
-        denser = 1 if clock.simulated else verdict["denser"]
+        denser = verdict["denser"]
         if number == ROUNDS - 1 or not (differ or denser > 1):
             break
         clock.stretch(clock.per * denser)

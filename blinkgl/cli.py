@@ -386,3 +386,7 @@ def run(arguments: list[str]) -> int:
 def main() -> None:
     """The console script."""
     safe_main(run)
+
+
+if __name__ == "__main__":
+    main()

@@ -74,3 +74,27 @@ def test_modules_that_docstrings_name_exist():
                 if not any(p.is_dir() or p.with_suffix(".py").is_file() for p in (place, tool)):
                     gone.append(f"{path.relative_to(ROOT)}: {module}")
     assert gone == []
+
+
+PROGRAM = re.compile(r"""-m(?:",\s*"|[ ])((?:blinkgl|eflow)(?:\.\w+)*)""")
+"""``python -m MODULE`` of a shell, a page or a list of words."""
+
+
+def test_modules_that_are_run_are_programs():
+    """Python runs a module that is no program without a word, and its status is 0."""
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    if not tracked:
+        pytest.skip("not a git checkout")
+    texts = {name: (ROOT / name).read_bytes().decode("utf-8", "replace") for name in tracked if (ROOT / name).is_file()}
+    named = {module for text in texts.values() for module in PROGRAM.findall(text)}
+    assert {"blinkgl", "blinkgl.cli", "eflow.cli", "blinkgl.dataset.worker", "blinkgl.tools.bench"} <= named
+    files = {
+        module: [f"{place}{end}" for end in (".py", "/__main__.py")]
+        for module in named
+        for place in [re.sub(r"^blinkgl/(tools/|tools$)", r"\1", module.replace(".", "/"))]
+    }
+    assert not {
+        module
+        for module, places in files.items()
+        if not any('if __name__ == "__main__":' in texts.get(place, "") for place in places)
+    }

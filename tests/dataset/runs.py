@@ -80,11 +80,12 @@ def temporaries(out: Path) -> list[Path]:
     return [p for p in out.rglob(".*blinkgl-tmp-*") if p.is_dir()] if out.is_dir() else []
 
 
-def wait_for(condition, timeout_s: float = 600.0):
-    """The first true value of ``condition()``."""
+def wait_for(condition, driver: subprocess.Popen | None = None, timeout_s: float = 600.0):
+    """The first true value of ``condition()``, which a driver that has ended cannot bring about any more."""
     deadline = time.monotonic() + timeout_s
     while not (value := condition()):
         assert time.monotonic() < deadline, "it did not come to that"
+        assert driver is None or driver.poll() is None, f"it ended first: {driver.communicate()[0]}"
         time.sleep(0.005)
     return value
 

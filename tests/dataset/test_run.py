@@ -97,7 +97,7 @@ def in_the_middle(out: Path) -> bool:
 def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
     recipe, out = recipe_file(tmp_path), tmp_path / "out"
     driver = start(recipe, "--out", out, "--workers", 2)
-    wait_for(lambda: in_the_middle(out))
+    wait_for(lambda: in_the_middle(out), driver)
     workers = children(driver.pid)
     driver.kill()
     driver.communicate()
@@ -122,7 +122,7 @@ def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
 def test_ctrl_c_stops_the_workers_and_leaves_only_whole_sequences(reference, tmp_path):
     recipe, out = recipe_file(tmp_path), tmp_path / "out"
     driver = start(recipe, "--out", out, "--workers", 2)
-    wait_for(lambda: in_the_middle(out))
+    wait_for(lambda: in_the_middle(out), driver)
     workers = children(driver.pid)
     driver.send_signal(signal.SIGINT)
     said, _ = driver.communicate()

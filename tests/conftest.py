@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from blinkgl.machine import command_line, plugins
+from blinkgl.machine import command_line, heartbeat, plugins
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -99,9 +99,11 @@ class _Lender:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_line_about_compiling():
-    """Which command of the tests is the first to need a kernel depends on their order; its errors do not."""
+def _no_line_that_depends_on_the_machine():
+    """Which command of the tests is the first to need a kernel depends on their order, and which is at work for half a
+    minute on what else the machine does; their errors do not."""
     command_line.announced_compiling = lambda say: contextlib.nullcontext()
+    heartbeat.EVERY_S = 86_400.0
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -146,7 +146,7 @@ def evaluate(
     from eflow.data.sources import open_source, refuse_of_mvsec
     from eflow.evaluate import evaluate as score, show
 
-    model = answerer(checkpoint, options, refine=refine)
+    model = answerer(checkpoint, options, refine=refine or None)
     console = plain_console(stderr=True)
     of_mvsec = {"dt": dt, "protocol": protocol, "frames": ranges_of(frames), "dense": dense}
     if dataset.endswith((".yaml", ".yml")):
@@ -188,7 +188,7 @@ def predict(
     asked: WindowsAsked,
     declared: Declared,
     options: Answering,
-    refine: Refine = True,
+    refine: Refine = None,
 ) -> None:
     """Compute the flow of any event file. Networks do this, and methods without training.
 
@@ -204,7 +204,7 @@ def predict(
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
     name, events = [AUTO, *names][-2:]
     chooses = name == AUTO and not Path(AUTO).exists()
-    model = None if chooses else answerer(name, options)
+    model = None if chooses else answerer(name, options, refine=refine)
     file = infer.open_sized(events, declared.reading())
     height, width = infer.sensor_of(file)
     for line in infer.doubts(next(iter(file.chunks()), Events.empty()), height, width):
@@ -214,7 +214,9 @@ def predict(
         typer.echo(f"network: {why}")
         model = answerer(name, options)
     views = options.views or infer.default_views(name)
-    predictor = infer.Predictor(model, height, width, warm_start=options.warm_start, refine=refine, views=views)
+    predictor = infer.Predictor(
+        model, height, width, warm_start=options.warm_start, refine=refine is not False, views=views
+    )
     show_flows(file, predictor, asked, outputs, typer.echo)
     for line in file.notes:
         typer.echo(f"{events}: {line}", err=True)

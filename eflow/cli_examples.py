@@ -5,7 +5,7 @@ from __future__ import annotations
 EFLOW: dict[str, tuple[str, ...]] = {
     "train": (
         "configs/eflow/smoke.yaml --out out/smoke --resume",
-        "--model ev_flownet-tiny --data out/demo --minutes 10 -o out/n",
+        "--model ev_flownet-tiny --data out/mine/train --minutes 9 -o out/n",
     ),
     "evaluate": ("out/net out/mine/test --out out/scores", "real_small /data/mvsec --dt 4 --dense"),
     "submit": ("out/net /data/dsec/test --out flow.zip", "eraft_dsec.safetensors /data/dsec/test --out flow.zip"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +66,14 @@ def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | 
                 "a size the network cannot train on",
                 where=where,
                 value=tuple(size),
-                accepted=f"multiples of {model.divisor}, at least {model.least} px: set data.crop",
+                accepted=f"multiples of {model.divisor}, at least {model.least} px{_proposed(model, size)}",
             )
+
+
+def _proposed(model: FlowModel, size: Sequence[int]) -> str:
+    """Return the largest crop of samples of this (height, width) that the network takes, as an option to paste."""
+    height, width = (side // model.divisor * model.divisor for side in size)
+    return f": --set data.crop=[{height},{width}]" if min(height, width) >= model.least else ""
 
 
 def validation_sets(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:

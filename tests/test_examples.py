@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 from pathlib import Path
@@ -69,6 +70,16 @@ def test_notebook(monkeypatch, capsys, book_of, said):
         exec(compile(cell, f"{path.name}, code cell {number}", "exec"), names)
     plt.close("all")
     assert said in capsys.readouterr().out
+
+
+def test_what_notebooks_import_is_there():
+    """Also where nobody runs the slow one."""
+    pytest.importorskip("torch")
+    code = "\n".join(cell for path in EXAMPLES.glob("*.ipynb") for cell in example_docs.cells(path))
+    named = re.findall(r"^from ((?:blinkgl|eflow)\S*) import (.+)$", code, re.M)
+    assert len(named) >= 4
+    for module, names in named:
+        assert not [name for name in names.split(", ") if not hasattr(importlib.import_module(module), name)]
 
 
 def test_readme_hello_world(tmp_path, monkeypatch):

@@ -22,12 +22,17 @@ SCENES = {"moderngl", "glcontext", "trimesh", "fcl", "skimage", "mujoco", "matpl
 CODECS = {"hdf5plugin", "av", "imageio", "imageio_ffmpeg", "tifffile", "lxml", "mapbox_earcut", "mujoco"}
 """What does not fit beside a card (tools/gpu_wheels.txt), and what is not needed there."""
 GUARD = """
-import sys
+import importlib.metadata, sys
 class Forbidden:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in FORBIDDEN:
             raise ModuleNotFoundError(f"{name} is forbidden here")
 sys.meta_path.insert(0, Forbidden())
+def version(name, installed=importlib.metadata.version):
+    if name in FORBIDDEN:
+        raise importlib.metadata.PackageNotFoundError(name)
+    return installed(name)
+importlib.metadata.version = version
 """
 
 

@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from importlib import resources
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -246,12 +246,20 @@ def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProx
         **_code(),
         "python": platform.python_version(),
         "machine": platform.machine(),
-        **{name: version(name) for name in NUMERICS},
+        **{name: _version(name) for name in NUMERICS},
         "opencv": cv2.__version__,
         "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used",
         **libraries,
         **plugin_versions(),
     }
+
+
+def _version(library: str) -> str:
+    """Return the version installed, "none" for one that a gzip set without a preview does without."""
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "none"
 
 
 def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:

@@ -224,8 +224,9 @@ class VideoReader:
             notes.append(f"the video states the curve {self.transfer} (--gamma for another)")
         if frame.interlaced_frame:
             notes.append("interlaced video: both fields, which are of different times, are taken as one frame")
-        if self._scan.times_ns and self._scan.times_ns[0] and not self._zero_time:
-            notes.append(f"the first frame is at {self._scan.times_ns[0] / 1e9:.6g} s of the file (--zero-time: at 0)")
+        begin_ns = self._scan.times_ns[before] if before < len(self._scan.times_ns) else 0
+        if begin_ns and not self._zero_time:
+            notes.append(f"the first frame is at {begin_ns / 1e9:.6g} s of the file (--zero-time: at 0)")
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, int | None]]:
         pts, at, count = self._scan.pts, 0, 0

@@ -55,7 +55,7 @@ class FrameChecks:
             clipped = (self._codes[0] + self._codes[top:].sum()) / self._codes.sum()
             if clipped > _CLIPPED:
                 yield f"{100 * clipped:.0f} % of the codes are at an end: what moves there makes no events"
-            if (different := int(np.count_nonzero(self._codes))) <= _FEW_CODES:
+            if 1 < (different := int(np.count_nonzero(self._codes))) <= _FEW_CODES:
                 yield f"frames of {different} different codes: each step from one to the next makes events at once"
         if count > 4 and _REPEATED[0] < self._repeated / (count - 1) < _REPEATED[1]:
             yield (
@@ -65,7 +65,8 @@ class FrameChecks:
         # The second difference of a steady change is 0; of brightness that goes up and down by one factor it is twice
         # the logarithm of that factor.
         jumps = np.diff(np.log(np.maximum(self._brightness, 1e-6)), 2)
-        if len(jumps) >= 3 and np.median(np.abs(jumps)) > _FLICKER:
+        to_and_fro = len(jumps) >= 3 and abs(np.sign(jumps).mean()) < 0.5  # a fade has one sign
+        if to_and_fro and np.median(np.abs(jumps)) > _FLICKER:
             yield (
                 "the whole picture flickers, by a factor of "
                 f"{min(np.exp(np.median(np.abs(jumps)) / 2), 1e6):.3g} from frame to frame, and that makes events as "

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +60,12 @@ def looked_at(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Itera
             yield from file.notes
     except BlinkGLError as error:
         yield f"missing: {error}"
-        yield from _text(path)
+        yield from (text := list(_text(path)))
+        unit = re.search(r"--time-unit (\w+)", str(error))
+        if unit and not text and reading.time_unit is None:
+            # Arrays cannot be shown as they lie: their rows as the proposal has them tell whether it is right.
+            yield f"with --time-unit {unit[1]}:"
+            yield from itertools.islice(looked_at(path, replace(reading, time_unit=unit[1])), 1, None)
 
 
 def _text(path: Path) -> Iterator[str]:

@@ -471,4 +471,5 @@ def refuse_of_mvsec(*, dt: int, protocol: str, frames: tuple[tuple[int, int], ..
     options = {"dt": (dt, 1), "protocol": (protocol, "all"), "frames": (frames, ()), "dense": (dense, False)}
     for name, (value, default) in options.items():
         if value != default:
-            raise ConfigError("only for MVSEC", where=name, value=value, accepted="a data set in the layout of MVSEC")
+            typed = ", ".join(f"{first}-{end - 1}" for first, end in frames) if name == "frames" else value
+            raise ConfigError("only for MVSEC", where=name, value=typed, accepted="a data set in the layout of MVSEC")

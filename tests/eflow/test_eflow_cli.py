@@ -293,6 +293,7 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
         ),
         (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is not a network (got True)"),
         (["contrast-affine", "E", "--views", "4"], "error: --views: contrast-affine is not a network (got 4)"),
+        (["contrast-affine", "E", "--no-refine"], "error: --no-refine: contrast-affine is not a network (got True)"),
         (["NETWORK", "E", "--views", "3"], "error: --views: unknown choice (got '3'); expected 1, 4, 8"),
         (["NETWORK", "E", "--focal", "200"], "error: --focal: only a rotation uses it (got 200.0); expected contrast-"),
         (
@@ -385,7 +386,7 @@ def test_submit_blinkflow(network, tmp_path):
         (["SET", "--dt", "4"], "dt: only for MVSEC (got 4); expected a data set in the layout of MVSEC"),
         (["r.yaml", "--dt", "4"], "dt: only for MVSEC (got 4)"),
         (["r.yaml", "--protocol", "e-raft"], "protocol: only for MVSEC (got 'e-raft')"),
-        (["r.yaml", "--frames", "1-2"], "frames: only for MVSEC (got ((1, 3),))"),
+        (["r.yaml", "--frames", "1-2"], "frames: only for MVSEC (got '1-2')"),
         (["r.yaml", "--dense"], "dense: only for MVSEC (got True)"),
     ],
 )

@@ -301,7 +301,11 @@ def test_data_parallel_equals_one_process(tmp_path, data):
         ),
         (TINY, [132, 128], "multiples of 8"),
         (FAST, [64, 72], "multiples of 16"),
-        (TINY, None, r"data\.crop is not set, train/seq_000000/000000: a size .* \(got \(128, 132\)\)"),
+        (
+            TINY,
+            None,
+            r"data\.crop is not set, train/seq_000000/000000.*\(got \(128, 132\)\); .*: --set data\.crop=\[128,128\]",
+        ),
     ],
 )
 def test_sizes_are_refused_before_anything_is_written(tmp_path, model, crop, message):

@@ -245,6 +245,14 @@ def test_frames_with_a_caveat(tmp_path, capsys, frames, said):
     assert ("warning:" in out) == ("warning:" in said or "at an end" in said)
 
 
+@pytest.mark.parametrize("levels", [np.arange(20, 200, 16), np.array([0, 13, 25, 38, 51, 64, 76, 89, 102]), [7] * 5])
+def test_a_fade_and_a_blank_picture_have_no_caveat(tmp_path, capsys, levels):
+    """Brightness that only rises is no flicker; one code has no step to another."""
+    np.save(tmp_path / "v.npy", np.ones((1, 24, 32), np.uint8) * np.asarray(levels, np.uint8)[:, None, None])
+    assert run(["simulate", str(tmp_path / "v.npy"), "--fps", "100", "--out", str(tmp_path / "e.h5")]) == 0
+    assert "flickers" not in (out := capsys.readouterr().out) and "of 1 different codes" not in out
+
+
 @pytest.mark.parametrize(("more", "dark"), [(0.1, 0.8), (0.5, 0.5), (0.84, 0.15), (0.9, 0.02), (0.02, 0.8)])
 def test_how_much_the_picture_flickers(tmp_path, capsys, more, dark):
     """The brighter frames over the darker ones, for small factors and for large ones."""

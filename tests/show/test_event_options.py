@@ -120,6 +120,14 @@ def test_a_look_prints_what_is_stated_and_the_options_to_paste(ns, tmp_path, cap
     assert run(["convert", ns]) == 2 and "OUT: no output; expected an event file, or --look" in capsys.readouterr().err
 
 
+def test_a_look_at_arrays_shows_rows_as_the_proposal_has_them(tmp_path, capsys):
+    rows = {"x": [1, 2], "y": [3, 4], "t": [0.000709, 0.0998], "p": [0, 1]}
+    np.savez(tmp_path / "e.npz", **{name: np.array(values) for name, values in rows.items()})
+    assert run(["convert", str(tmp_path / "e.npz"), "--look"]) == 0
+    out = capsys.readouterr().out
+    assert "missing: " in out and "with --time-unit s:\n" in out and "\n709 1 3 0\n99800 2 4 1\n" in out
+
+
 def test_calibrate_notes_what_it_took(ns, tmp_path, capsys):
     arguments = ["calibrate", ns, "--still", "--out", str(tmp_path / "s.yaml"), "--starts", "1", *OPTIONS]
     assert run(arguments) == 0

@@ -183,8 +183,10 @@ def left_out(objs: list[Blender], clock: Clock) -> list[str]:
     say("the shift of the lens is left out", (one for one in cameras if one.data.shift_x or one.data.shift_y))
     # The file's own frames: the markers stand where the stretched time has them.
     cuts = sorted((frame, marker.camera.name) for marker, frame in clock.markers if marker.camera is not None)
-    if len(cuts) > 1:
-        shots = ", ".join(f"'{name}' from frame {frame}" for frame, name in cuts[:8])
+    shown = [cut for cut in cuts if cut[0] <= clock.first][-1:]
+    shown += [cut for cut in cuts if clock.first < cut[0] <= clock.last]
+    if len(shown) > 1:
+        shots = ", ".join(f"'{name}' from frame {frame}" for frame, name in shown[:8])
         lines.append(f"the scene cuts between cameras ({shots}): import one shot, --frames FIRST LAST")
     strands = ("OBJECT", "COLLECTION")
     say("particles and hair are left out", (

@@ -264,7 +264,7 @@ def answerer(name: str, options: Answering, *, refine: bool | None = None) -> Fl
         "--iterations": options.iterations,
         "--warm-start": options.warm_start,
         "--views": options.views,
-        "--refine" if refine else "--no-refine": refine is not None,
+        "--refine": refine,
     }
     for option, value in of_networks.items():
         if value:

@@ -293,7 +293,7 @@ def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
         ),
         (["contrast-affine", "E", "--warm-start"], "error: --warm-start: contrast-affine is not a network (got True)"),
         (["contrast-affine", "E", "--views", "4"], "error: --views: contrast-affine is not a network (got 4)"),
-        (["contrast-affine", "E", "--no-refine"], "error: --no-refine: contrast-affine is not a network (got True)"),
+        (["contrast-affine", "E", "--refine"], "error: --refine: contrast-affine is not a network (got True)"),
         (["NETWORK", "E", "--views", "3"], "error: --views: unknown choice (got '3'); expected 1, 4, 8"),
         (["NETWORK", "E", "--focal", "200"], "error: --focal: only a rotation uses it (got 200.0); expected contrast-"),
         (

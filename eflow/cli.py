@@ -146,7 +146,7 @@ def evaluate(
     from eflow.data.sources import open_source, refuse_of_mvsec
     from eflow.evaluate import evaluate as score, show
 
-    model = answerer(checkpoint, options, refine=refine or None)
+    model = answerer(checkpoint, options, refine=refine)
     console = plain_console(stderr=True)
     of_mvsec = {"dt": dt, "protocol": protocol, "frames": ranges_of(frames), "dense": dense}
     if dataset.endswith((".yaml", ".yml")):
@@ -204,7 +204,7 @@ def predict(
         raise ConfigError("more than a network and a file", value=names, accepted="eflow predict [NETWORK] EVENTS")
     name, events = [AUTO, *names][-2:]
     chooses = name == AUTO and not Path(AUTO).exists()
-    model = None if chooses else answerer(name, options, refine=refine)
+    model = None if chooses else answerer(name, options, refine=refine is True)
     file = infer.open_sized(events, declared.reading())
     height, width = infer.sensor_of(file)
     for line in infer.doubts(next(iter(file.chunks()), Events.empty()), height, width):

@@ -61,7 +61,7 @@ Refined = Annotated[bool, typer.Option("--refine", help=_REFINE)]
 WarmStart = Annotated[
     bool, typer.Option("--warm-start", help="Start the refinement of each window from the previous flow.")
 ]
-Refine = Annotated[bool | None, typer.Option("--refine/--no-refine", help=f"{_REFINE} On unless you say otherwise.")]
+Refine = Annotated[bool | None, typer.Option("--refine/--no-refine", help=f"{_REFINE} Default: on.")]
 
 
 def _known_views(views: int | None) -> int | None:
@@ -250,10 +250,10 @@ class Sampling:
     )
 
 
-def answerer(name: str, options: Answering, *, refine: bool | None = None) -> FlowModel | Method:
+def answerer(name: str, options: Answering, *, refine: bool = False) -> FlowModel | Method:
     """Return the method of that name, or the trained network, on a GPU if there is one.
 
-    refine : what is asked of a network's flow, if anything.
+    refine : whether the flow of a network is asked to be refined.
     Raises ConfigError: it lacks one of the options. AssetError: no such network."""
     network = name not in METHODS or Path(name).exists()
     if options.focal is not None and (network or name != ROTATION):

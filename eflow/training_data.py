@@ -71,7 +71,8 @@ def check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | 
 
 
 def _proposed(model: FlowModel, size: Sequence[int]) -> str:
-    """Return the largest crop of samples of this (height, width) that the network takes, as an option to paste."""
+    """Return the largest crop of samples of this (height, width) that the network takes, as an option to paste; empty:
+    there is none."""
     height, width = (side // model.divisor * model.divisor for side in size)
     return f": --set data.crop=[{height},{width}]" if min(height, width) >= model.least else ""
 

@@ -9,6 +9,7 @@ not affect it, and a run may be interrupted at any point and continued.
 from __future__ import annotations
 
 import contextlib
+import signal
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.machine.interrupts import STOPS, interruptible
+from blinkgl.machine.interrupts import STOPS, interruptible, uninterrupted
 from blinkgl.sequence_files.index import INDEX, write_index
 
 ATTEMPTS = 3
@@ -107,12 +108,14 @@ def run_dataset(
             keep_logs = True
             raise
         finally:
-            executor.close()
-            if not folder.begun and not keep_logs:
-                folder.take_back_logs()
-            elif folder.begun and folder.in_place:
-                _leave(plan, folder, outcome, assets, num)
-            listener.end(outcome)
+            # A second signal would leave what the workers were writing.
+            with uninterrupted(signal.SIGINT, *STOPS):
+                executor.close()
+                if not folder.begun and not keep_logs:
+                    folder.take_back_logs()
+                elif folder.begun and folder.in_place:
+                    _leave(plan, folder, outcome, assets, num)
+                listener.end(outcome)
         if outcome.set_aside and not (outcome.made or outcome.found):
             folder.forget(plan, keep_logs=outcome.surprises > 0)
             reason, others = next(iter(outcome.set_aside.values())), ""

@@ -16,7 +16,7 @@ class Heartbeat:
     """When a command last showed something, and where it is."""
 
     def __init__(self) -> None:
-        self._shown, self._place = time.monotonic(), ""
+        self._shown, self._place, self._done = time.monotonic(), "", threading.Event()
 
     def heard(self) -> None:
         """Note that a line was shown just now."""
@@ -26,11 +26,15 @@ class Heartbeat:
         """Note where the command is: "sequence 340 of 2,000"."""
         self._place = place
 
+    def rest(self) -> None:
+        """Print no more lines: from now on the command waits for somebody who looks at a page."""
+        self._done.set()
+
     @contextlib.contextmanager
     def beating(self, quiet: bool) -> Iterator[None]:
         """Print the line to standard error, every 30 s in which nothing else was shown; not at all where ``quiet``, or
         on a terminal."""
-        done, began = threading.Event(), time.monotonic()
+        self._done, began = (done := threading.Event()), time.monotonic()
         self._place = ""
         self.heard()
 

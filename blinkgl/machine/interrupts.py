@@ -83,7 +83,8 @@ def uninterrupted(*numbers: int) -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
+    ours = [number for number in numbers if signal.getsignal(number) is not None]  # None: a C library's
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in ours}
     try:
         yield
     finally:

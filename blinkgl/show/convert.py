@@ -61,11 +61,13 @@ def looked_at(path: str | os.PathLike, reading: EventReading = AS_FILE) -> Itera
     except BlinkGLError as error:
         yield f"missing: {error}"
         yield from (text := list(_text(path)))
-        unit = re.search(r"--time-unit (\w+)", str(error))
-        if unit and not text and reading.time_unit is None:
-            # Arrays cannot be shown as they lie: their rows as the proposal has them tell whether it is right.
-            yield f"with --time-unit {unit[1]}:"
-            yield from itertools.islice(looked_at(path, replace(reading, time_unit=unit[1])), 1, None)
+        # Arrays cannot be shown as they lie: their rows as the proposal has them tell whether it is right.
+        proposed = re.search(r"try ((?:--columns (\S+) ?)?(?:--time-unit (\w+))?) if that is right", str(error))
+        if proposed and not text:
+            columns = tuple(proposed[2].split(",")) if proposed[2] else reading.columns
+            unit = proposed[3] or reading.time_unit
+            yield f"with {proposed[1]}:"
+            yield from itertools.islice(looked_at(path, replace(reading, columns=columns, time_unit=unit)), 1, None)
 
 
 def _text(path: Path) -> Iterator[str]:

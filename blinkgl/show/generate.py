@@ -24,6 +24,7 @@ from blinkgl.dataset.work import report_of
 from blinkgl.errors import ConfigError
 from blinkgl.io.records import named
 from blinkgl.layouts.export import refuse_plan
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.terminal import causes_line, clock, plain_column, plain_console, say, size
 from blinkgl.sequence_files.index import made_folders
 from blinkgl.show import export
@@ -95,6 +96,7 @@ def _shown(view: bool, out: Path, display: Listener) -> Iterator[Listener]:
         yield Watched(page, out, display)
         if page.folders:
             say(console, f"{server.url}  (Ctrl-C ends it)")
+            heartbeat.rest()
             try:
                 drawing.join()
             except KeyboardInterrupt:

@@ -11,6 +11,7 @@ from rich.console import Console
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.atomic import refuse_file
 from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.machine.terminal import plain_console, say
 
 
@@ -37,6 +38,7 @@ def run(sequences: Sequence[str], *, port: int | None = None, save: str | None =
         if page.sequence is None and page.problem is not None:
             raise page.problem
         say(console, f"{server.url}  (open it in a browser; Ctrl-C ends it)")
+        heartbeat.rest()
         page.run()
     except KeyboardInterrupt:
         say(console, "")

@@ -299,6 +299,11 @@ def test_what_gltf_cannot_say_is_baked(imported):
     assert max(times) == pytest.approx(came.report.duration_s, rel=1e-6) == pytest.approx(7 * 1.001 / 30)
 
 
+@pytest.mark.parametrize("shot", [(1, 3), (4, 8)])
+def test_cuts_outside_the_range_are_none(imported, shot):
+    assert not [line for line in imported("named.blend", frames=shot).report.left_out if "cuts between" in line]
+
+
 def test_what_cannot_be_baked_is_named(imported, scenes, tmp_path, capsys):
     came = imported("named.blend", bake_mb=1.0)
     wrong, left = came.report.wrong, "\n".join(came.report.left_out)

@@ -4,7 +4,9 @@ import io
 import itertools
 import json
 import os
+import shutil
 import signal
+import subprocess
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +25,7 @@ from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError, OutputError
+from blinkgl.io.atomic import machine_token
 from blinkgl.machine.terminal import plain_console, size
 from blinkgl.sequence_files.index import read_index
 from blinkgl.show import generate as display_module
@@ -119,6 +122,31 @@ def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
     assert run(["generate", str(recipe), "--out", str(out), "--resume", "--quiet"]) == 0
     assert_same(out, reference)
     assert verify_dataset(out, deep=1).clean
+
+
+def test_a_second_signal_does_not_cut_the_tidying(reference, tmp_path):
+    """It comes while the executor closes: what was being written is gone all the same, and the index is there."""
+
+    class Hasty(Inline):
+        def close(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            super().close()
+
+    template, out, whole = load_run(recipe_file(tmp_path)), tmp_path / "out", []
+
+    def stop(name, message):
+        whole.extend(path for path in out.rglob("fly_*") if path.is_dir())
+        ended = subprocess.Popen(["true"])  # a worker that was killed
+        ended.wait()
+        left = f".fly_000002.blinkgl-tmp-{machine_token()}-{ended.pid}-0"
+        shutil.copytree(whole[0], whole[0].with_name(left))
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_dataset(template, out, Hasty(), listener=Listener(stop, "progress", NAMES[1]))
+    assert whole and temporaries(out) == [] and (out / "index.jsonl").is_file()
+    run_dataset(template, out, resume=True)
+    assert_same(out, reference)
 
 
 @pytest.mark.slow

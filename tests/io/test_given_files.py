@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 
 import numpy as np
@@ -143,6 +144,12 @@ def test_frames(name, declared, ticks, said):
     pictures, times, notes = frames(name, declared)
     assert len(pictures) == (ticks if isinstance(ticks, int) else len(ticks)) and said in " ".join(notes)
     assert isinstance(ticks, int) or np.allclose(np.array(times) / 1e9 * 30, ticks, atol=1e-3)
+
+
+def test_the_first_frame_is_the_first_that_decodes():
+    _, times, notes = frames("21_open_gop_cut.mkv")
+    stated = re.search(r"the first frame is at (\S+) s of the file", " ".join(notes))
+    assert times[0] > 0 and float(stated[1]) == pytest.approx(times[0] / 1e9, rel=1e-5)
 
 
 @pytest.mark.parametrize(

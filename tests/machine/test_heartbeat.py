@@ -31,6 +31,15 @@ def test_it_says_where_it_is(capsys, monkeypatch):
     assert beaten(capsys, monkeypatch, during)[-1] == "still at work: 0:00:00, sequence 3 of 20"
 
 
+def test_who_waits_for_somebody_is_not_at_work(capsys, monkeypatch):
+    def during(beat, lines):
+        beat.rest()
+        capsys.readouterr()
+        time.sleep(0.1)
+
+    assert beaten(capsys, monkeypatch, during) == []
+
+
 def test_quietly_there_is_no_thread(capsys, monkeypatch):
     def during(beat, lines):
         time.sleep(0.1)

@@ -126,6 +126,9 @@ def test_a_look_at_arrays_shows_rows_as_the_proposal_has_them(tmp_path, capsys):
     assert run(["convert", str(tmp_path / "e.npz"), "--look"]) == 0
     out = capsys.readouterr().out
     assert "missing: " in out and "with --time-unit s:\n" in out and "\n709 1 3 0\n99800 2 4 1\n" in out
+    np.save(tmp_path / "e.npy", np.column_stack([rows["t"], rows["x"], rows["y"], rows["p"]]))
+    assert run(["convert", str(tmp_path / "e.npy"), "--look"]) == 0
+    assert "with --columns t,x,y,p --time-unit s:\n" in (out := capsys.readouterr().out) and "\n709 1 3 0\n" in out
 
 
 def test_calibrate_notes_what_it_took(ns, tmp_path, capsys):

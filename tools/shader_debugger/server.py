@@ -11,13 +11,12 @@ import ipaddress
 import json
 import socket
 import threading
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from urllib.parse import urlsplit
 
 from blinkgl.errors import BlinkGLError, GLError
-from blinkgl.machine.heartbeat import EVERY_S, heartbeat
+from blinkgl.machine.heartbeat import heartbeat
 from blinkgl.tools.shader_debugger.inspector import ROUTES, Inspector, Worker, read_query
 from blinkgl.tools.shader_debugger.session import Subject, When, open_folder
 
@@ -215,8 +214,7 @@ def serve(subject: Subject, when: When, shaders: str | None, host: str, port: in
         if host not in LOCAL:
             print("anybody who reaches this address can look: there is no password", flush=True)
         try:
-            while True:  # a page that nobody looks at is no work
-                heartbeat.heard()
-                time.sleep(EVERY_S / 2)
+            heartbeat.rest()
+            threading.Event().wait()
         except KeyboardInterrupt:
             print()

@@ -298,7 +298,7 @@ def test_the_command_says_where_and_ends_on_interrupt(config):
     )
     try:
         line = child.stdout.readline()
-        assert line.startswith("http://127.0.0.1:") and "Ctrl-C" in line, child.communicate()
+        assert line.startswith("http://127.0.0.1:") and "Ctrl-C" in line, (child.kill(), child.communicate())
         host, port = line.split()[0].removeprefix("http://").rstrip("/").split(":")
         connection = http.client.HTTPConnection(host, int(port), timeout=600)
         connection.request("GET", "/state")
